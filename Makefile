@@ -1,0 +1,45 @@
+# make demo   sets up .venv once, then plans and executes an episode of each task with the shipped checkpoint
+# make test   sets up what the tests need once, then runs the checks and the tests
+# make clean  removes .venv and what tools leave behind
+#
+# PYTHON is the interpreter that .venv is made with: make test PYTHON=/path/to/python3.10
+PYTHON ?= $(shell for python in python3.11 python3.10; do \
+	"$$python" -c 'import ensurepip, venv' >/dev/null 2>&1 && { command -v "$$python"; break; }; done)
+
+bin := .venv/bin
+install := $(bin)/python -m pip install --disable-pip-version-check --no-input --constraint constraints.txt
+# Each marker is written when its installation has succeeded and removed before the next one begins, so that
+# what a broken installation left behind is thrown away, never used.
+installed := .venv/installed
+installed_for_tests := .venv/installed-for-tests
+
+.PHONY: demo test clean
+
+demo: $(installed)
+	$(bin)/python -m cavin_pyro.demo
+
+test: $(installed_for_tests)
+	$(bin)/ruff check .
+	$(bin)/ruff format --check .
+	$(bin)/mypy
+	$(bin)/lint-imports
+	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2
+
+$(installed): pyproject.toml constraints.txt
+	$(if $(PYTHON),,$(error Python 3.11 or 3.10 with its venv module is needed and neither was found; install it, or say where it is: make PYTHON=/path/to/python3.11))
+	@"$(PYTHON)" -c 'import sys; (3, 10) <= sys.version_info[:2] <= (3, 11) or sys.exit("$(PYTHON) is Python %d.%d; 3.11 or 3.10 is needed: make PYTHON=/path/to/python3.11" % sys.version_info[:2])'
+	@echo "Setting up .venv with $(PYTHON): this once, for a few minutes"
+	"$(PYTHON)" -m venv $(if $(wildcard $@),,--clear) .venv
+	@rm -f $(installed) $(installed_for_tests)
+	$(install) pip setuptools
+	$(install) --no-build-isolation --editable .
+	@touch $@
+
+$(installed_for_tests): $(installed)
+	@rm -f $(installed) $(installed_for_tests)
+	$(install) --no-build-isolation --editable '.[test]'
+	@touch $(installed) $@
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,126 @@
+"""Checkpoints: one safetensors file with the weights, and in its header the configuration and the provenance.
+
+One file, so that weights and configuration can never be parted or half-written. Nothing in it can run code: the
+header is JSON, and the classes that it names must come from this program's packages, or from a module that the user
+names in `trust`.
+"""
+
+from __future__ import annotations
+
+import json
+import sysconfig
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from cavin_pyro.errors import UserError
+from cavin_pyro.files import replacing
+
+FORMAT = "cavin_pyro checkpoint"
+FORMAT_VERSION = 1
+OWN_MODULES = ("models", "guides")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Weights and what they belong to.
+
+    Attributes:
+        config: how to build the parts. provenance: where the weights come from. tensors: by `part.parameter`.
+    """
+
+    config: dict[str, Any]
+    provenance: dict[str, Any]
+    tensors: dict[str, Tensor]
+
+    def load_into(self, part: str, module: nn.Module, where: str | Path) -> None:
+        """Copy one part's weights into a module.
+
+        Raises:
+            UserError: the weights are of another architecture.
+        """
+        prefix = f"{part}."
+        weights = {name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)}
+        wanted = module.state_dict()
+        for name in sorted(set(wanted) | set(weights)):
+            have, want = weights.get(name), wanted.get(name)
+            if have is None or want is None or have.shape != want.shape:
+                shapes = [None if value is None else list(value.shape) for value in (have, want)]
+                raise UserError(
+                    f"checkpoint {where} is of another architecture: {part}.{name} has shape {shapes[0]} in the file "
+                    f"and {shapes[1]} in {type(module).__name__}: use the configuration that it was trained with"
+                )
+        module.load_state_dict(weights)
+
+
+def save_checkpoint(
+    path: Path, *, parts: Mapping[str, nn.Module], config: Mapping[str, Any], provenance: Mapping[str, Any]
+) -> None:
+    """Write the parts' weights atomically, with configuration and provenance in the header."""
+    tensors = {
+        f"{part}.{name}": value.detach().contiguous()
+        for part, module in parts.items()
+        for name, value in module.state_dict().items()
+    }
+    header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
+    header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata=header)
+
+
+def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
+    """Read and check a checkpoint.
+
+    Args:
+        trust: further modules whose classes the checkpoint may name.
+
+    Raises:
+        UserError: missing, truncated or foreign file, another version, or a class of an untrusted module.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path} is a safetensors file of another program, not a checkpoint of cavin_pyro")
+    if header.get("version") != str(FORMAT_VERSION):
+        raise UserError(
+            f"checkpoint {path} has format version {header.get('version')}, this program reads {FORMAT_VERSION}"
+        )
+    try:
+        config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
+    except (KeyError, ValueError) as error:
+        raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
+    _check_targets(config, path, (*OWN_MODULES, *trust))
+    return Checkpoint(config, provenance, tensors)
+
+
+def default_checkpoint() -> Path:
+    """The shipped checkpoint: in a checkout's `checkpoints/`, else where the installed package keeps its data."""
+    name = "cascaded.safetensors"
+    checkout = Path(__file__).resolve().parent.parent / "checkpoints" / name
+    installed = Path(sysconfig.get_path("data")) / "share" / "cavin_pyro" / "checkpoints" / name
+    return installed if installed.exists() and not checkout.exists() else checkout
+
+
+def _check_targets(config: Any, path: Path, allowed: tuple[str, ...]) -> None:
+    if isinstance(config, dict):
+        target = config.get("_target_")
+        if target is not None and str(target).split(".")[0] not in allowed:
+            raise UserError(
+                f"checkpoint {path} asks to run {target}, which is not part of this program: "
+                f"if you trust that module, pass trust=[{str(target).split('.')[0]}]"
+            )
+        config = list(config.values())
+    for entry in config if isinstance(config, list) else ():
+        _check_targets(entry, path, allowed)

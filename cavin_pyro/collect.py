@@ -1,0 +1,45 @@
+"""Collect pushing episodes: `python -m cavin_pyro.collect transitions=100000 output=DIR workers=2 seed=0`."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from cavin_pyro.command import command
+
+
+@command("collect")
+def main(config: DictConfig) -> None:
+    """Collect random pushes by the heuristic policy into a dataset folder; resumes what was interrupted."""
+    from cavin_pyro.collection import CollectionSettings, collect, repair
+    from cavin_pyro.errors import UserError, at_least
+    from cavin_pyro.files import output_folder
+    from cavin_pyro.worlds import check_world, object_ranges
+    from envs.workspace import MAXIMUM_OBJECTS
+
+    for name in ("transitions", "workers", "steps", "hold", "minimum_objects", "episodes_per_shard"):
+        at_least(name, config[name], 1)
+    at_least("seed", config.seed, 0)
+    if not config.minimum_objects <= config.maximum_objects <= MAXIMUM_OBJECTS:
+        raise UserError(
+            f"maximum_objects must be between minimum_objects={config.minimum_objects} and {MAXIMUM_OBJECTS}, "
+            f"not {config.maximum_objects}"
+        )
+    check_world(config.env)
+    settings = CollectionSettings(
+        seed=config.seed,
+        steps=config.steps,
+        hold=config.hold,
+        minimum_objects=config.minimum_objects,
+        maximum_objects=config.maximum_objects,
+        episodes_per_shard=config.episodes_per_shard,
+        ranges=object_ranges(config.env),
+    )
+    folder = output_folder(config.output)
+    if config.repair:
+        print(f"{repair(settings, folder)} files collected again")
+    metadata = collect(settings, folder, transitions=config.transitions, workers=config.workers)
+    print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""What all commands share: Hydra for the words, one line for bad input, exit status 2.
+
+    @command("plan")
+    def main(config: DictConfig) -> None: ...
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import importlib.util
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import OverrideType
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from cavin_pyro.errors import UserError
+
+CONFIGURATION = "pkg://cavin_pyro.conf"
+PACKAGES = ("models", "guides", "planning", "envs")
+BAD_INPUT = 2  # exit status
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG}
+
+Body = Callable[[DictConfig], None]
+
+
+def command(name: str) -> Callable[[Body], Callable[[], None]]:
+    """Make a Hydra application of `body`, configured by `conf/<name>.yaml`."""
+
+    def decorate(body: Body) -> Callable[[], None]:
+        def main() -> None:
+            # Third parties' deprecations are for developers, whose tests turn them into errors.
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            guarded(lambda: _check_words(name))
+            hydra.main(version_base="1.3", config_path=CONFIGURATION, config_name=name)(
+                lambda config: guarded(lambda: _run(body, config))
+            )()
+
+        main.__doc__ = body.__doc__
+        return main
+
+    return decorate
+
+
+def guarded(action: Callable[[], None]) -> None:
+    """Run; bad input, a full or forbidden disk and an interruption end in one line instead of a traceback."""
+    try:
+        action()
+    except UserError as error:
+        _stop(str(error), BAD_INPUT)
+    except OSError as error:
+        if error.errno not in _DISK_ERRORS:
+            raise
+        where = f" at {error.filename}" if error.filename else ""
+        _stop(f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR", 2)
+    except KeyboardInterrupt:
+        _stop("interrupted; where the command can resume, the same command goes on", 130)
+
+
+def _stop(line: str, status: int) -> None:
+    print(f"error: {' '.join(line.split())}", file=sys.stderr, flush=True)
+    raise SystemExit(status)
+
+
+def _run(body: Body, config: DictConfig) -> None:
+    check_packages()
+    body(config)
+
+
+def check_packages() -> None:
+    """Make sure that the packages with common names are ours.
+
+    Raises:
+        UserError: a foreign package of the same name comes first on the path.
+    """
+    home = Path(__file__).resolve().parent.parent
+    for package in PACKAGES:
+        found = importlib.util.find_spec(package)
+        places = [] if found is None else list(found.submodule_search_locations or [found.origin or ""])
+        if not any(Path(place).resolve() == home / package for place in places):
+            where = places[0] if places else "nowhere"
+            raise UserError(
+                f"the package {package!r} of this program is hidden by {where}: "
+                "run from another folder, or rename or uninstall that package"
+            )
+
+
+def _check_words(name: str) -> None:
+    """Compose the configuration before Hydra's own application does, to explain what is wrong in one line."""
+    overrides = [word for word in sys.argv[1:] if not word.startswith("-")]
+    with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
+        try:
+            hydra.compose(name, overrides=overrides, return_hydra_config=False)
+        except MissingConfigException as error:
+            raise UserError(_explain_choice(error)) from error
+        except (HydraException, OmegaConfBaseException) as error:
+            raise UserError(_explain_override(name, overrides, error)) from error
+        finally:
+            GlobalHydra.instance().clear()
+
+
+def _explain_choice(error: MissingConfigException) -> str:
+    group, _, choice = (error.missing_cfg_file or "").rpartition("/")
+    options = ", ".join(error.options or ()) or "none"
+    return f"unknown {group or 'configuration'} {choice!r}: choose from {options}"
+
+
+def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
+    known = hydra.compose(name)
+    for override in OverridesParser.create().parse_overrides(_parsable(overrides)):
+        key = override.key_or_group
+        if override.package or key.startswith("hydra") or override.type is not OverrideType.CHANGE or "@" in key:
+            continue
+        parent, _, last = key.rpartition(".")
+        section: Any = OmegaConf.select(known, parent) if parent else known
+        if not OmegaConf.is_dict(section):
+            return f"unknown override {key!r}: {_valid(parent.rpartition('.')[0], known)}"
+        if last not in section and not last.startswith("_"):
+            close = difflib.get_close_matches(last, [str(word) for word in section], n=1)
+            hint = f"did you mean {close[0]}? " if close else ""
+            return f"unknown override {key!r}: {hint}{_valid(parent, known)}"
+    first = str(error).splitlines()[0].rstrip(".")
+    return f"{first}: write overrides as name=value"
+
+
+def _parsable(overrides: list[str]) -> list[str]:
+    kept = []
+    for word in overrides:
+        try:
+            OverridesParser.create().parse_override(word)
+        except HydraException:
+            continue
+        kept.append(word)
+    return kept
+
+
+def _valid(parent: str, known: DictConfig) -> str:
+    section: Any = OmegaConf.select(known, parent) if parent else known
+    words = ", ".join(sorted(str(word) for word in section))
+    return f"valid under {parent} are {words}" if parent else f"valid are {words}"

@@ -1,0 +1,148 @@
+"""Closing the loop: observe, plan, push T times, and again (paper, Algorithm 1, lines 3, 4, 11 and 12)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from envs.pushing import ObservationDict, PushingEnv
+from models.pointnet import PointNet
+from models.state import State
+from planning import Plan, Planner
+
+OUTCOMES = ("success", "violation", "fall", "timeout")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One plan, and what it was made from.
+
+    Attributes:
+        step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
+        milliseconds: from the observation to the plan. photograph: [height, width, 3] for figures, if wanted.
+    """
+
+    step: int
+    centers: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    plan: Plan
+    milliseconds: float
+    photograph: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
+class Push:
+    """One executed push: the action [4], what followed, and where the objects [M, 3] were seen afterwards.
+
+    subgoal_distance: metres, the mean over objects from where they are to where the plan's first subgoal wanted them;
+    NaN before a segment's last push and for planners without subgoals.
+    """
+
+    step: int
+    action: NDArray[np.float32]
+    reward: float
+    success: bool
+    violation: bool
+    fall: bool
+    unsafe: bool
+    ineffective: bool
+    centers: NDArray[np.float32]
+    subgoal_distance: float
+
+
+@dataclass
+class Episode:
+    """What happened in one episode. outcome: one of `OUTCOMES`."""
+
+    seed: int
+    outcome: str = "timeout"
+    decisions: list[Decision] = field(default_factory=list)
+    pushes: list[Push] = field(default_factory=list)
+
+    @property
+    def total_reward(self) -> float:
+        """The episode's return."""
+        return sum(push.reward for push in self.pushes)
+
+
+@torch.inference_mode()
+def observed_state(observation: ObservationDict, pointnet: PointNet) -> State:
+    """The planner's state, a batch of one, from what the camera saw.
+
+    Args:
+        observation: as of `envs.pushing.PushingEnv`, [M, ...].
+    """
+    centers = torch.from_numpy(observation["centers"])
+    clouds = torch.from_numpy(observation["clouds"]) - centers[:, None]
+    mask = torch.from_numpy(observation["mask"].astype(np.bool_))
+    return State(centers[None], pointnet(clouds)[None], mask[None])
+
+
+def run_episode(
+    env: PushingEnv,
+    planner: Planner,
+    pointnet: PointNet,
+    *,
+    seed: int,
+    photograph: bool = False,
+    on_decision: Callable[[Decision], None] | None = None,
+) -> Episode:
+    """Run one episode from depth images alone.
+
+    Args:
+        seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
+        photograph: keep a picture with every decision.
+        on_decision: called after every plan, before its pushes.
+    """
+    episode = Episode(seed)
+    generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]))
+    observation, _ = env.reset(seed=seed)
+    ended = False
+    while not ended:
+        began = time.perf_counter()
+        state = observed_state(observation, pointnet)
+        plan = planner.plan(state, [generator])
+        decision = Decision(
+            step=len(episode.pushes),
+            centers=observation["centers"],
+            mask=observation["mask"].astype(np.bool_),
+            plan=plan,
+            milliseconds=1e3 * (time.perf_counter() - began),
+            photograph=env.render() if photograph else None,
+        )
+        episode.decisions.append(decision)
+        if on_decision is not None:
+            on_decision(decision)
+        actions = plan.actions[0].numpy()
+        for number, action in enumerate(actions):
+            action = np.clip(action, -1.0, 1.0).astype(np.float32)
+            observation, reward, terminated, truncated, info = env.step(action)
+            last = number == len(actions) - 1
+            episode.pushes.append(
+                Push(
+                    step=info["steps"],
+                    action=action,
+                    reward=float(reward),
+                    centers=observation["centers"],
+                    subgoal_distance=_subgoal_distance(decision, observation["centers"]) if last else float("nan"),
+                    **{name: info[name] for name in ("success", "violation", "fall", "unsafe", "ineffective")},
+                )
+            )
+            ended = terminated or truncated
+            if ended:
+                episode.outcome = next((name for name in OUTCOMES[:3] if info[name]), "timeout")
+                break
+    return episode
+
+
+def _subgoal_distance(decision: Decision, centers: NDArray[np.float32]) -> float:
+    subgoals = decision.plan.subgoals.centers[0]
+    if len(subgoals) == 0:
+        return float("nan")
+    distance = np.linalg.norm(subgoals[0].numpy() - centers, axis=-1)
+    return float(distance[decision.mask].mean())

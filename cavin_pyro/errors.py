@@ -1,0 +1,32 @@
+"""Bad input, as opposed to a bug: one clear line, exit status 2."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class UserError(Exception):
+    """What was wrong with the input, where, and what would be right: one line, shown without a traceback."""
+
+
+@contextmanager
+def user_input() -> Iterator[None]:
+    """Turn a ValueError raised while the user's choices are read into a `UserError`.
+
+    Wrap only the building of parts from configuration, so that a ValueError anywhere else stays a bug with a traceback.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
+
+
+def at_least(name: str, value: float, minimum: float) -> None:
+    """Check a number from the command line.
+
+    Raises:
+        UserError: the number is not a number or smaller than the minimum.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value >= minimum:
+        raise UserError(f"{name} must be at least {minimum:g}, not {value}")

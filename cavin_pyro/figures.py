@@ -1,0 +1,169 @@
+"""Pictures of plans and of training. Every function writes one image, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from cavin_pyro.episodes import Episode
+from cavin_pyro.figures_panel import RETURNS, counted, draw_decision, legend
+from cavin_pyro.files import replacing
+from envs.camera import Camera
+from envs.layouts import Layout
+from models.pointnet import PointNetAutoencoder
+
+DOTS_PER_INCH = 120
+PANELS = 6  # decisions shown
+COLORS = {"training": "#0072B2", "validation": "#D55E00"}
+SEEN, DRAWN = "#9A9A9A", "#E69F00"  # points of a cloud, and of its reconstruction
+
+
+def draw_plan(path: Path, episode: Episode, layout: Layout, camera: Camera) -> None:
+    """The paper's qualitative figure: what was considered, chosen and done over an episode, seen from above.
+
+    At most six decisions, evenly spread, in temporal order. Parts that a planner does not have are left out.
+
+    Args:
+        episode: its decisions hold photographs, or an empty table is drawn.
+        camera: that took the photographs, in any resolution.
+
+    Raises:
+        ValueError: the episode holds no decision.
+    """
+    if not episode.decisions:
+        raise ValueError("the episode holds no decision to draw: run it first")
+    chosen = (
+        np.linspace(0, len(episode.decisions) - 1, min(PANELS, len(episode.decisions))).round().astype(int)
+    )
+    decisions = [episode.decisions[index] for index in chosen]
+    columns = {1: 1, 2: 2, 4: 2}.get(len(decisions), 3)
+    rows = -(-len(decisions) // columns)
+    size = (max(8.4, 4.4 * columns), 0.9 + (5.3 if columns == 1 else 2.95) * rows)  # inches
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    returns = [decision.plan.candidate_returns[0].numpy() for decision in decisions]
+    scale = _scale(np.concatenate(returns))
+    for panel, decision in zip(axes.flat, decisions, strict=False):
+        draw_decision(panel, decision, layout, camera, scale)
+    for panel in axes.flat[len(decisions) :]:
+        panel.set_axis_off()
+    if scale is not None:
+        bar = figure.colorbar(ScalarMappable(scale, RETURNS), ax=axes, fraction=0.02, pad=0.01, aspect=30)
+        bar.set_label("return of a candidate", fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+    title = f"{layout.task}, seed {episode.seed}: {episode.outcome} after {counted(len(episode.pushes))}"
+    figure.suptitle(title, fontsize=12)
+    handles = legend(layout, decisions, candidates=scale is not None)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
+    _save(figure, path)
+
+
+def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None:
+    """The loss and each term of the objective over training steps.
+
+    Args:
+        rows: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and `validation_<term>`;
+            empty cells are skipped.
+
+    Raises:
+        ValueError: there is no row.
+    """
+    if not rows:
+        raise ValueError("there is no row of metrics to draw: train first")
+    terms = [key for key in rows[0] if key.startswith("validation_") and key != "validation_loss"]
+    small = -(-len(terms) // 2)  # columns of small panels, in two rows
+    figure = Figure(figsize=(5.0 + 2.9 * small, 4.2), dpi=DOTS_PER_INCH, layout="constrained")
+    grid = figure.add_gridspec(2, 1 + small, width_ratios=[1.7, *[1.0] * small])
+    loss = figure.add_subplot(grid[:, 0])
+    curves = {name: _curve(rows, f"{name}_loss") for name in COLORS}
+    _draw_curves(loss, curves)
+    loss.set_title("loss", fontsize=11)
+    loss.legend(fontsize=9, frameon=False)
+    loss.set_xlabel("training step", fontsize=9)
+    for number, term in enumerate(terms):
+        row, column = divmod(number, small)
+        panel = figure.add_subplot(grid[row, 1 + column])
+        _draw_curves(panel, {"validation": _curve(rows, term)})
+        panel.set_title(term.removeprefix("validation_").replace("_", " "), fontsize=10)
+    _save(figure, path)
+
+
+@torch.inference_mode()
+def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: NDArray[np.float32]) -> None:
+    """What the decoder makes of clouds' features, from above and from the side.
+
+    Args:
+        clouds: [8, 256, 3] metres from their centres; any other number of them will do.
+
+    Raises:
+        ValueError: there is no cloud.
+    """
+    if len(clouds) == 0:
+        raise ValueError("there is no cloud to draw: give at least one [256, 3]")
+    drawn = autoencoder(torch.from_numpy(np.ascontiguousarray(clouds, dtype=np.float32))).numpy()
+    figure = Figure(figsize=(0.8 + 1.6 * len(clouds), 4.1), dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(2, len(clouds), squeeze=False, sharex=True, sharey=True)
+    reach = 1.1 * 100 * max(np.abs(clouds).max(), np.abs(drawn).max())  # centimetres
+    for column, pair in enumerate(zip(clouds, drawn, strict=True)):
+        for row, vertical in enumerate((1, 2)):
+            panel = axes[row, column]
+            for points, color, size in zip(pair, (SEEN, DRAWN), (5, 9), strict=True):
+                panel.scatter(
+                    100 * points[:, 0], 100 * points[:, vertical], s=size, color=color, linewidths=0
+                )
+            panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+            panel.tick_params(labelsize=8)
+    for row, label in enumerate(("from above\ny (cm)", "from the side\nz (cm)")):
+        axes[row, 0].set_ylabel(label, fontsize=9)
+    for panel in axes[1]:
+        panel.set_xlabel("x (cm)", fontsize=9)
+    handles = [
+        Line2D([], [], color=SEEN, marker="o", markersize=4, linestyle="", label="seen"),
+        Line2D([], [], color=DRAWN, marker="o", markersize=4, linestyle="", label="drawn again"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=9, frameon=False)
+    _save(figure, path)
+
+
+def _scale(returns: NDArray[np.float32]) -> Normalize | None:
+    """A colour scale for the returns [n] that are finite; None where none is."""
+    finite = returns[np.isfinite(returns)]
+    if len(finite) == 0:
+        return None
+    low, high = float(finite.min()), float(finite.max())
+    # Lower than the lowest, so that no dot is white and lost.
+    spread = max(high - low, 1.0)
+    return Normalize(low - 0.2 * spread, low + spread)
+
+
+def _curve(rows: Sequence[Mapping[str, str | float]], key: str) -> NDArray[np.float64]:
+    """Steps and values [n, 2] of the rows that have a finite value."""
+    cells = [(float(row["step"]), float(row[key])) for row in rows if row.get(key, "") not in ("", None)]
+    curve = np.array(cells, dtype=np.float64).reshape(-1, 2)
+    return curve[np.isfinite(curve).all(axis=1)]
+
+
+def _draw_curves(panel: Axes, curves: Mapping[str, NDArray[np.float64]]) -> None:
+    for name, curve in curves.items():
+        marker = "o" if len(curve) == 1 else None
+        panel.plot(*curve.T, color=COLORS[name], linewidth=1.4, marker=marker, label=name)
+    values = np.concatenate([curve[:, 1] for curve in curves.values()])
+    if len(values) and values.min() > 0 and values.max() > 20 * values.min():
+        panel.set_yscale("log")  # the first steps would flatten all that follow
+    panel.grid(color="#DDDDDD", linewidth=0.6)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.tick_params(labelsize=8)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, facecolor="white")

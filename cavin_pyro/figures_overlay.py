@@ -1,0 +1,114 @@
+"""What is drawn over a photograph of the table, in pixels: tiles, and what a decision considered, chose and does.
+
+Figures and videos draw the same things with different tools, so that what they share stands here. All pixels are
+(column, row), as of `Camera.project`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavin_pyro.episodes import Decision
+from envs.camera import Camera
+from envs.layouts import Layout, Tile
+from envs.workspace import TILE_SIDE, push_endpoints, tile_center
+
+Pixels = NDArray[np.float64]  # [..., 2]
+
+# Told apart by the colour-blind too (Okabe and Ito), and by shape besides.
+SUBGOAL_COLOR = "#E69F00"  # orange, as in the paper
+PREDICTION_COLOR = "#007A5A"  # green
+PUSH_COLOR = "#1A1A1A"
+GOAL_COLOR = "#F2C200"  # gold
+
+TARGET_RADIUS = 0.07  # metres; of the circle that marks the target
+MOVING = 0.01  # metres; objects that are to move less are left out
+
+
+class TileGroup(NamedTuple):
+    """Tiles that mean the same: their name for a legend, colour, how opaque they are filled, and where they lie."""
+
+    name: str
+    color: str
+    opacity: float
+    tiles: tuple[Tile, ...]
+
+
+_REGIONS = {  # what `Layout.region` means to each task
+    "clearing": ("to clear", "#0072B2", 0.25),
+    "insertion": ("keep out", "#C2272D", 0.30),
+    "crossing": ("bridge", "#5A5A5A", 0.0),
+}
+
+
+def tile_groups(layout: Layout) -> list[TileGroup]:
+    """The task's region, and the goal where there is one."""
+    groups = [
+        TileGroup(*_REGIONS[layout.task], layout.region),
+        TileGroup("goal", GOAL_COLOR, 0.45, layout.goal),
+    ]
+    return [group for group in groups if group.tiles]
+
+
+def tile_corners(tile: Tile, camera: Camera) -> Pixels:
+    """[4, 2], in order around the tile."""
+    around = TILE_SIDE / 2 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    return on_table(np.array(tile_center(tile)) + around, camera)
+
+
+def on_table(points: NDArray[np.floating], camera: Camera) -> Pixels:
+    """Pixels [..., 2] of points (x, y) [..., 2] metres at the table's height."""
+    return camera.project(np.concatenate([points, np.zeros_like(points[..., :1])], axis=-1))
+
+
+def observed_centers(decision: Decision, camera: Camera) -> Pixels:
+    """[objects, 2] of the real objects; the target's comes first if it was seen."""
+    return camera.project(decision.centers[decision.mask])
+
+
+def subgoal_chains(decision: Decision, camera: Camera) -> list[Pixels]:
+    """Where the chosen subgoals lead each object: one [1 + segments, 2] per object that moves, from where it is."""
+    return _paths(decision, decision.plan.subgoals.centers[0].numpy(), int(decision.plan.segments[0]), camera)
+
+
+def predicted_paths(decision: Decision, camera: Camera) -> list[Pixels]:
+    """Where f predicts that the planned pushes move each object, until the chosen plan ends: one [1 + steps, 2] each."""
+    steps = int(decision.plan.segments[0]) * decision.plan.actions.shape[1]
+    return _paths(decision, decision.plan.predicted_centers[0].numpy(), steps, camera)
+
+
+def pushes(decision: Decision, camera: Camera) -> Pixels:
+    """Start and end [T, 2, 2] of the pushes that will be carried out."""
+    return on_table(np.stack(push_endpoints(decision.plan.actions[0].numpy()), axis=1), camera)
+
+
+def candidate_subgoals(
+    decision: Decision, layout: Layout, camera: Camera, *, count: int
+) -> tuple[Pixels, NDArray[np.float32]]:
+    """Some of the subgoals that were considered, of the target alone or, in clearing, of every real object.
+
+    Returns:
+        Pixels [n, 2] and returns [n] of their plans with n at most `count`, best last.
+    """
+    plan = decision.plan
+    centers, returns = plan.candidate_centers[0].numpy(), plan.candidate_returns[0].numpy()
+    objects = np.flatnonzero(decision.mask) if layout.task == "clearing" else np.array([0])
+    points = centers[:, :, objects]  # [N, K, objects, 3]
+    every = np.broadcast_to(returns[:, None, None], points.shape[:-1]).ravel()
+    points = points.reshape(-1, 3)
+    finite = np.flatnonzero(np.isfinite(every) & np.isfinite(points).all(axis=-1))
+    # Drawn, not every so many-th: those would be the same segment of every plan.
+    chosen = np.random.default_rng(0).permutation(finite)[:count]
+    chosen = chosen[np.argsort(every[chosen], kind="stable")]
+    return camera.project(points[chosen]), every[chosen]
+
+
+def _paths(decision: Decision, centers: NDArray[np.float32], steps: int, camera: Camera) -> list[Pixels]:
+    """`centers`: [steps or more, M, 3] metres -> the paths of the real objects that move."""
+    ways = np.concatenate([decision.centers[None], centers[:steps]])
+    distance = np.linalg.norm(ways[..., :2] - ways[:1, :, :2], axis=-1)
+    moving = decision.mask & (distance.max(axis=0) > MOVING)  # never true of NaN
+    return [camera.project(ways[:, index]) for index in np.flatnonzero(moving)]

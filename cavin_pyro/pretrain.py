@@ -1,0 +1,54 @@
+"""Pretrain PointNet: `python -m cavin_pyro.pretrain data=DIR output=DIR seed=0`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from cavin_pyro.command import command
+
+
+@command("pretrain")
+def main(config: DictConfig) -> None:
+    """Train PointNet to draw a dataset's clouds again, and write it as a checkpoint."""
+    import numpy as np
+    import torch
+    from hydra.utils import instantiate
+
+    from cavin_pyro.checkpoint import save_checkpoint
+    from cavin_pyro.errors import at_least
+    from cavin_pyro.features import sample_clouds
+    from cavin_pyro.figures import draw_reconstructions
+    from cavin_pyro.files import output_folder, write_json
+    from cavin_pyro.pretraining import pretrain
+    from cavin_pyro.provenance import provenance
+    from cavin_pyro.runs import write_config
+
+    for name in ("clouds", "steps", "batch_size"):
+        at_least(name, config[name], 1)
+    clouds = sample_clouds(Path(config.data), count=config.clouds, generator=np.random.default_rng(config.seed))
+    folder = output_folder(config.output)
+    settings = write_config(folder, config)
+    torch.manual_seed(config.seed)
+    autoencoder = instantiate(config.autoencoder)
+    losses = pretrain(
+        autoencoder,
+        clouds,
+        steps=config.steps,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        seed=config.seed,
+        log=folder / "metrics.csv",
+    )
+    record = {**provenance(), "clouds": len(clouds), "losses": losses}
+    parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}
+    save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=settings, provenance=record)
+    write_json(folder / "metrics.json", record)
+    draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
+    print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")
+    print(f"written: {folder / 'pointnet.safetensors'}")
+
+
+if __name__ == "__main__":
+    main()

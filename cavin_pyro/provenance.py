@@ -1,0 +1,50 @@
+"""Where a result comes from: command, date, versions and machine, to be kept beside it."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import shlex
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro import __version__
+
+
+def provenance() -> dict[str, Any]:
+    """A record of this run, JSON-ready."""
+    return {
+        "program": f"cavin_pyro {__version__}",
+        "revision": _revision(),
+        "command": " ".join(["python -m", _module(), *(shlex.quote(word) for word in sys.argv[1:])]),
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def _module() -> str:
+    return f"cavin_pyro.{Path(sys.argv[0]).stem.removeprefix('cavin-')}"
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _revision() -> str:
+    """The checkout's commit, with a plus if files have changed since; empty where there is no checkout."""
+    folder = Path(__file__).resolve().parent
+    if not (folder.parent / ".git").exists():
+        return ""
+    try:
+        words = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        return subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""

@@ -1,0 +1,55 @@
+"""A run's folder: the configuration that made it, so that it can be read, repeated and resumed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from cavin_pyro.errors import UserError
+from cavin_pyro.files import replacing
+
+
+def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
+    """Write `config.yaml` and return the configuration as plain data."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    with replacing(folder / "config.yaml") as temporary:
+        temporary.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    return {str(name): value for name, value in plain.items()}
+
+
+def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...]) -> None:
+    """Make sure that a folder with an earlier run in it may be resumed with this configuration.
+
+    Args:
+        ignore: words (dotted) that may differ.
+
+    Raises:
+        UserError: the earlier run had another configuration; the first word that differs is named.
+    """
+    path = folder / "config.yaml"
+    if not path.exists():
+        return
+    try:
+        earlier = _flat(OmegaConf.to_container(OmegaConf.load(path)))
+    except (OSError, OmegaConfBaseException, ValueError) as error:
+        raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
+    now = _flat(OmegaConf.to_container(config, resolve=True))
+    for name in sorted(set(now) | set(earlier)):
+        if name not in ignore and now.get(name) != earlier.get(name):
+            raise UserError(
+                f"{folder} holds a run with {name}={earlier.get(name)}, not {now.get(name)}: "
+                "resume with the same words, or choose another output=DIR"
+            )
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix.rstrip("."): value}
+    flat: dict[str, Any] = {}
+    for name, entry in value.items():
+        flat |= _flat(entry, f"{prefix}{name}.")
+    return flat

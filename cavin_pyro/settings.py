@@ -1,0 +1,44 @@
+"""From the words of `train` to checked settings."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from cavin_pyro.errors import UserError, at_least
+from cavin_pyro.training import SCHEDULES, TrainerSettings
+from cavin_pyro.windows import WindowSettings
+
+
+def trainer_settings(config: DictConfig) -> TrainerSettings:
+    """The section `trainer`.
+
+    Raises:
+        UserError: a number out of range or an unknown schedule.
+    """
+    trainer = config.trainer
+    for name in ("steps", "batch_size", "validate_every", "validation_windows", "patience"):
+        at_least(f"trainer.{name}", trainer[name], 1)
+    at_least("seed", config.seed, 0)
+    for name in ("learning_rate", "clip_norm"):
+        if not isinstance(trainer[name], int | float) or not trainer[name] > 0:
+            raise UserError(f"trainer.{name} must be a positive number, not {trainer[name]}")
+    if trainer.schedule not in SCHEDULES:
+        raise UserError(f"unknown trainer.schedule {trainer.schedule!r}: choose from {', '.join(SCHEDULES)}")
+    return TrainerSettings(**{str(name): value for name, value in trainer.items()}, seed=config.seed)
+
+
+def window_settings(config: DictConfig) -> WindowSettings:
+    """The section `windows`, for the model's T.
+
+    Raises:
+        UserError: a number out of range.
+    """
+    windows = config.windows
+    for name in ("validation_fraction", "quiet_fraction"):
+        if not isinstance(windows[name], int | float) or not 0 <= windows[name] <= 1:
+            raise UserError(f"windows.{name} must be between 0 and 1, not {windows[name]}")
+    for name in ("maximum_step", "minimum_move", "maximum_move"):
+        at_least(f"windows.{name}", windows[name], 0)
+    at_least("model.segment_length", config.model.segment_length, 1)
+    sizes = {str(name): value for name, value in windows.items()}
+    return WindowSettings(segment_length=config.model.segment_length, seed=config.seed, **sizes)

@@ -1,0 +1,145 @@
+"""From episodes on disk to windows for training: what counts, the split, and batches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cavin_pyro.dataset import Arrays, iterate_shards, read_metadata
+from cavin_pyro.errors import UserError
+from cavin_pyro.features import fingerprint, shard_features
+from cavin_pyro.progress import progress_bar
+from models.pointnet import PointNet
+from models.state import State, Window
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Which windows and transitions teach what (reference.md, "Training as published").
+
+    Attributes:
+        segment_length: T. validation_fraction: of the episodes. seed: of the split.
+        maximum_step: metres; a transition counts for f if every object moved less.
+        minimum_move, maximum_move: metres; a window counts for h and g if some object moved more than the first, none
+            more than the second, and every push was safe.
+        quiet_fraction: share of the other windows that is kept, for f to learn what pushes do not do.
+    """
+
+    segment_length: int = 3
+    validation_fraction: float = 0.1
+    seed: int = 0
+    maximum_step: float = 0.2
+    minimum_move: float = 0.1
+    maximum_move: float = 0.5
+    quiet_fraction: float = 0.25
+
+
+class WindowTable:
+    """All states and pushes of a dataset, and where its windows start.
+
+    A window is looked up when a batch needs it, so overlapping windows share their memory.
+
+    Attributes:
+        training, validation: numbers of windows, for `batch`.
+    """
+
+    def __init__(self, states: State, actions: Tensor, transition_mask: Tensor, settings: WindowSettings) -> None:
+        """States, actions and transition_mask have leading dimension [P], positions in time, episode after episode."""
+        self._states, self._actions, self._transition_mask = states, actions, transition_mask
+        self._steps = torch.arange(settings.segment_length + 1)
+        self.starts = torch.empty(0, dtype=torch.int64)
+        self.sequence_mask = torch.empty(0, dtype=torch.bool)
+        self.training = torch.empty(0, dtype=torch.int64)
+        self.validation = torch.empty(0, dtype=torch.int64)
+
+    def batch(self, numbers: Tensor) -> Window:
+        """The windows with these numbers [B]."""
+        positions = self.starts[numbers, None] + self._steps
+        return Window(
+            states=self._states.map(lambda field: field[positions]),
+            actions=self._actions[positions[:, :-1]],
+            transition_mask=self._transition_mask[positions[:, :-1]],
+            sequence_mask=self.sequence_mask[numbers],
+        )
+
+
+def load_windows(
+    folder: Path, pointnet: PointNet, settings: WindowSettings, *, skip_corrupt: bool = False
+) -> WindowTable:
+    """Read a dataset, compute the features that are not there yet, and find its windows.
+
+    Raises:
+        UserError: no dataset, a corrupt shard, or no window to learn from.
+    """
+    mark, shards = fingerprint(pointnet), []
+    metadata = read_metadata(folder)
+    names = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")
+    with progress_bar("reading", total=metadata["shards"], unit="file") as bar:
+        for number, arrays in iterate_shards(folder, names, skip_corrupt=skip_corrupt):
+            arrays["features"] = shard_features(folder, number, pointnet, mark)
+            shards.append(arrays)
+            bar.update()
+    episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in shards[0]}
+    return _find_windows(episodes, settings, folder)
+
+
+def _find_windows(episodes: Arrays, settings: WindowSettings, folder: Path) -> WindowTable:
+    count, positions = episodes["visible"].shape[:2]
+    if settings.segment_length >= positions:
+        raise UserError(
+            f"dataset {folder} has {positions - 1} pushes per episode, too few for windows of "
+            f"T={settings.segment_length}: collect with steps of at least that many"
+        )
+    mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
+    seen = (episodes["visible"] | ~mask[:, None]).all(axis=-1)  # [E, S+1]
+    counts = _transitions_that_count(episodes, seen, settings.maximum_step)
+
+    T = settings.segment_length
+    first, last = slice(0, positions - T), slice(T, None)
+    moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(axis=-1)
+    flawed = episodes["unsafe"] | episodes["fallen"]
+    sound = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
+    informative = sound & seen[:, first] & seen[:, last]
+    informative &= (moved > settings.minimum_move) & (moved < settings.maximum_move)
+    exists = np.arange(positions - T)[None] + T <= length[:, None]
+
+    # The split hangs on an episode's own number, so that more data does not reshuffle what was held out before.
+    draws = np.array([np.random.default_rng([settings.seed, int(number)]).random() for number in episodes["episode"]])
+    validation = np.broadcast_to((draws < settings.validation_fraction)[:, None], exists.shape)
+    turn = np.random.default_rng(settings.seed).random(exists.shape)
+    chosen = exists & (informative | (turn < settings.quiet_fraction))
+
+    flat = {name: torch.from_numpy(episodes[name]).flatten(0, 1) for name in ("centers", "features")}
+    padded = np.pad(episodes["actions"], ((0, 0), (0, 1), (0, 0)))
+    states = State(flat["centers"], flat["features"], torch.from_numpy(np.repeat(mask, positions, axis=0)))
+    table = WindowTable(
+        states,
+        torch.from_numpy(padded).flatten(0, 1),
+        torch.from_numpy(np.pad(counts, ((0, 0), (0, 1)))).flatten(),
+        settings,
+    )
+    episode, start = np.nonzero(chosen)
+    table.starts = torch.from_numpy(episode * positions + start)
+    table.sequence_mask = torch.from_numpy(informative[chosen])
+    table.training = torch.from_numpy(np.flatnonzero(~validation[chosen]))
+    table.validation = torch.from_numpy(np.flatnonzero(validation[chosen]))
+    for name in ("training", "validation"):
+        if not table.sequence_mask[getattr(table, name)].any():
+            raise UserError(
+                f"dataset {folder} has no {name} window in which an object moved more than "
+                f"{settings.minimum_move:g} m: collect more transitions"
+            )
+    return table
+
+
+def _transitions_that_count(episodes: Arrays, seen: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:
+    """Which pushes [E, S] the dynamics f learns from."""
+    step = np.linalg.norm(np.diff(episodes["centers"], axis=1), axis=-1)
+    small = (np.where(episodes["mask"][:, None], step, 0.0) < maximum_step).all(axis=-1)
+    made = np.arange(step.shape[1])[None] < episodes["length"][:, None]
+    return made & small & ~episodes["fallen"] & seen[:, :-1] & seen[:, 1:]

@@ -1,0 +1,48 @@
+"""From the words `env.*` to the parts of the world."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from omegaconf import DictConfig, OmegaConf
+
+from cavin_pyro.errors import UserError
+from envs.objects import ObjectRanges
+from envs.shapes import BUILTIN_NAMES
+
+CHOICES = {"robot": ("stick",), "objects": ("builtin",), "camera": ("ideal",), "segmentation": ("mask",)}
+
+
+def check_world(env: DictConfig) -> None:
+    """Check the parts that have names.
+
+    Raises:
+        UserError: unknown part; the valid ones are named.
+    """
+    for word, valid in CHOICES.items():
+        if env[word] not in valid:
+            raise UserError(f"unknown env.{word} {env[word]!r}: choose from {', '.join(valid)}")
+
+
+def object_ranges(env: DictConfig) -> ObjectRanges:
+    """Object parameters' ranges.
+
+    Raises:
+        UserError: unknown shape, or a range that is not two increasing positive numbers.
+    """
+    ranges = OmegaConf.to_container(env.ranges)
+    assert isinstance(ranges, dict)
+    names = ranges.pop("names") or BUILTIN_NAMES
+    unknown = [name for name in names if name not in BUILTIN_NAMES]
+    if unknown:
+        raise UserError(f"unknown object {unknown[0]!r} in env.ranges.names: choose from {', '.join(BUILTIN_NAMES)}")
+    for name in ("scale", "mass", "friction"):
+        value = ranges[name]
+        numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
+        if not numbers or not 0 < value[0] <= value[1]:
+            raise UserError(f"env.ranges.{name} must be two positive numbers, low then high, not {value}")
+    if not isinstance(ranges["clearance"], int | float) or not ranges["clearance"] >= 0:
+        raise UserError(f"env.ranges.clearance must be at least 0 metres, not {ranges['clearance']}")
+    assert set(ranges) | {"names"} == {field.name for field in fields(ObjectRanges)}
+    as_tuples = {name: tuple(value) if isinstance(value, list) else value for name, value in ranges.items()}
+    return ObjectRanges(names=tuple(names), **as_tuples)

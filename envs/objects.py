@@ -1,0 +1,123 @@
+"""Which objects lie on the table, and how they get there: random shapes, sizes, masses, friction and poses.
+
+Source: paper section 4.1 and reference.md, "Workspace" (what is randomised per object).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from envs.shapes import BUILTIN_NAMES, builtin_shape
+from envs.workspace import TABLE_HIGH, TABLE_LOW
+
+ATTEMPTS = 400  # whole arrangements tried before an area counts as too small
+
+
+@dataclass(frozen=True)
+class ObjectRanges:
+    """From where object parameters are drawn, uniformly.
+
+    Attributes:
+        names: shapes to choose from. scale: factor on size. mass: factor on the published mass.
+        friction: Coulomb coefficient against the table. clearance: metres between neighbouring centres at the start.
+    """
+
+    names: tuple[str, ...] = BUILTIN_NAMES
+    scale: tuple[float, float] = (0.8, 1.2)
+    mass: tuple[float, float] = (0.5, 2.0)
+    friction: tuple[float, float] = (0.5, 0.9)
+    clearance: float = 0.15
+
+
+@dataclass(frozen=True)
+class ObjectParameters:
+    """One object as drawn: what it is, how it behaves, and the pose from which it is dropped.
+
+    Attributes:
+        name: shape. scale: factor. mass: kilograms. friction: coefficient.
+        position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
+    """
+
+    name: str
+    scale: float
+    mass: float
+    friction: float
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+
+
+Area = Sequence[tuple[tuple[float, float], tuple[float, float]]]
+"""A union of rectangles, each ((low x, low y), (high x, high y)) in metres."""
+
+WHOLE_TABLE: Area = (((TABLE_LOW[0] + 0.1, TABLE_LOW[1] + 0.1), (TABLE_HIGH[0] - 0.1, TABLE_HIGH[1] - 0.1)),)
+
+
+def _point_in(area: Area, generator: np.random.Generator) -> NDArray[np.float64]:
+    low, high = area[generator.integers(len(area))]
+    return generator.uniform(low, high)
+
+
+def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Planar positions [M, 2] in metres, one in each area, no two closer than `clearance`.
+
+    Raises:
+        ValueError: no arrangement was found.
+    """
+    for _ in range(ATTEMPTS):
+        chosen: list[NDArray[np.float64]] = []
+        for area in areas:
+            free = [
+                point
+                for point in (_point_in(area, generator) for _ in range(20))
+                if all(np.linalg.norm(point - other) >= clearance for other in chosen)
+            ]
+            if not free:
+                break
+            chosen.append(free[0])
+        if len(chosen) == len(areas):
+            return np.stack(chosen)
+    raise ValueError(
+        f"no room for {len(areas)} objects at least {clearance:g} m apart where the layout starts them: "
+        "use fewer objects, more start tiles, or a smaller env.ranges.clearance"
+    )
+
+
+def draw_objects(
+    areas: Sequence[Area], ranges: ObjectRanges, generator: np.random.Generator
+) -> list[ObjectParameters]:
+    """Draw one object per area, in random orientation, low above the table and clear of its neighbours.
+
+    Args:
+        areas: where each object may start; the first is the target.
+
+    Raises:
+        ValueError: the areas are too small for so many objects.
+    """
+    positions = arrange(areas, ranges.clearance, generator)
+    orientations = Rotation.random(len(areas), random_state=generator).as_quat()
+    drawn: list[ObjectParameters] = []
+    circles: list[tuple[NDArray[np.float64], float, float]] = []  # planar centre, radius, top
+    for position, orientation in zip(positions, orientations, strict=True):
+        shape = builtin_shape(ranges.names[generator.integers(len(ranges.names))])
+        scale = generator.uniform(*ranges.scale)
+        radius = scale * shape.radius
+        # Long neighbours may overlap in the plan view: the later one then falls from above the earlier one.
+        below = [top for center, other, top in circles if np.linalg.norm(position - center) < radius + other]
+        height = max([0.005, *(top + 0.005 for top in below)]) + radius
+        circles.append((position, radius, height + radius))
+        drawn.append(
+            ObjectParameters(
+                name=shape.name,
+                scale=float(scale),
+                mass=float(shape.mass * generator.uniform(*ranges.mass)),
+                friction=float(generator.uniform(*ranges.friction)),
+                position=(float(position[0]), float(position[1]), float(height)),
+                orientation=tuple(float(value) for value in orientation),  # type: ignore[arg-type]
+            )
+        )
+    return drawn

@@ -1,0 +1,222 @@
+"""The only file that calls PyBullet: bodies, steps, contacts and images of one simulated world.
+
+Bodies are integers. Objects fall, slide and collide. The tool follows a prescribed path: its pose *and* velocity are
+set before every step, so that contacts are solved as with an arm too strong to be slowed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.camera import FAR, NEAR, Camera
+from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
+
+
+@contextmanager
+def _quiet(descriptor: int) -> Iterator[None]:
+    """Keep what Bullet prints at import and on connecting out of the streams that carry the program's own words."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = os.dup(descriptor)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), descriptor)
+    try:
+        yield
+    finally:
+        os.dup2(kept, descriptor)
+        os.close(kept)
+
+
+with _quiet(2):
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
+
+TIME_STEP = 1.0 / 240.0  # seconds
+SOLVER_ITERATIONS = 20  # per step; 50 move objects to the same places within a millimetre and cost twice the time
+GRAVITY = 9.81  # metres per second squared
+TABLE_FRICTION = 1.0  # Bullet multiplies both bodies' coefficients, so the object's own value is what counts
+TOOL_FRICTION = 0.3
+TOOL_MASS = 100.0  # kilograms; so heavy that no contact changes its velocity within a step
+ROLLING_FRICTION = 0.003  # metres; stops cans and cups that lie on their side, as a cloth does
+SPINNING_FRICTION = 0.003  # metres
+ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera sees.
+
+    Attributes:
+        depth: [height, width] metres along the optical axis.
+        bodies: [height, width] body number per pixel, -1 where there is none.
+        color: [height, width, 3] uint8.
+    """
+
+    depth: NDArray[np.float64]
+    bodies: NDArray[np.int64]
+    color: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where bodies are, in truth. positions: [M, 3] metres; orientations: [M, 4] unit quaternions (x, y, z, w)."""
+
+    positions: NDArray[np.float64]
+    orientations: NDArray[np.float64]
+
+
+class PhysicsWorld:
+    """One PyBullet world in DIRECT mode with a table in it.
+
+    Every `reset` starts from an empty simulation, because Bullet's contact caches would otherwise carry the history
+    of earlier scenes into the next one, and equal seeds would not give equal states.
+    """
+
+    def __init__(self) -> None:
+        with _quiet(1):
+            self._bullet = BulletClient(pybullet.DIRECT)
+        self.reset()
+
+    def close(self) -> None:
+        """Disconnect; the world cannot be used afterwards. Closing twice is harmless."""
+        if self._bullet.isConnected():
+            self._bullet.disconnect()
+
+    def reset(self) -> None:
+        """Empty the world and put the table into it."""
+        bullet = self._bullet
+        bullet.resetSimulation()
+        bullet.setGravity(0.0, 0.0, -GRAVITY)
+        bullet.setTimeStep(TIME_STEP)
+        bullet.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
+        half = [(high - low) / 2 for low, high in zip(TABLE_LOW, TABLE_HIGH, strict=True)] + [TABLE_THICKNESS / 2]
+        table = bullet.createMultiBody(
+            baseMass=0.0,
+            baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half),
+            baseVisualShapeIndex=bullet.createVisualShape(
+                pybullet.GEOM_BOX, halfExtents=half, rgbaColor=(0.80, 0.77, 0.72, 1.0)
+            ),
+            basePosition=(*TABLE_CENTER, -TABLE_THICKNESS / 2),
+        )
+        bullet.changeDynamics(table, -1, lateralFriction=TABLE_FRICTION)
+
+    def add_object(
+        self,
+        mesh: Path,
+        *,
+        scale: float,
+        mass: float,
+        friction: float,
+        position: Sequence[float],
+        orientation: Sequence[float],
+        color: Sequence[float],
+    ) -> int:
+        """Add a free body; every group of the mesh file becomes one convex part of its collision shape.
+
+        Args:
+            mesh: a Wavefront file, metres, origin at the centre of mass. scale: factor on its size.
+            mass: kilograms. friction: Coulomb coefficient against the table.
+            position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w). color: red, green, blue in [0, 1].
+        """
+        bullet, size = self._bullet, [scale] * 3
+        body = bullet.createMultiBody(
+            baseMass=mass,
+            baseCollisionShapeIndex=bullet.createCollisionShape(
+                pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size
+            ),
+            baseVisualShapeIndex=bullet.createVisualShape(
+                pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size, rgbaColor=(*color, 1.0)
+            ),
+            basePosition=position,
+            baseOrientation=orientation,
+        )
+        bullet.changeDynamics(
+            body,
+            -1,
+            lateralFriction=friction,
+            rollingFriction=ROLLING_FRICTION,
+            spinningFriction=SPINNING_FRICTION,
+            angularDamping=ANGULAR_DAMPING,
+            restitution=0.0,
+        )
+        return int(body)
+
+    def add_tool(self, *, radius: float, length: float, position: Sequence[float]) -> int:
+        """Add an upright cylinder (metres) that moves only where `place` puts it."""
+        bullet = self._bullet
+        body = bullet.createMultiBody(
+            baseMass=TOOL_MASS,
+            baseCollisionShapeIndex=bullet.createCollisionShape(
+                pybullet.GEOM_CYLINDER, radius=radius, height=length
+            ),
+            baseVisualShapeIndex=bullet.createVisualShape(
+                pybullet.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=(0.2, 0.2, 0.22, 1.0)
+            ),
+            basePosition=position,
+        )
+        bullet.changeDynamics(body, -1, lateralFriction=TOOL_FRICTION, restitution=0.0)
+        return int(body)
+
+    def place(self, body: int, position: Sequence[float], velocity: Sequence[float]) -> None:
+        """Set an upright body's position (metres) and velocity (metres per second)."""
+        self._bullet.resetBasePositionAndOrientation(body, position, (0.0, 0.0, 0.0, 1.0))
+        self._bullet.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
+
+    def step(self) -> None:
+        """Advance by one `TIME_STEP`."""
+        self._bullet.stepSimulation()
+
+    def overlaps(self, body: int, other: int) -> bool:
+        """Whether two bodies interpenetrate where they stand now."""
+        return len(self._bullet.getClosestPoints(body, other, 0.0)) > 0
+
+    def rest(self, bodies: Sequence[int]) -> None:
+        """Put bodies to sleep where they are: they cost no time and cannot creep until something touches them."""
+        for body in bodies:
+            for state in (pybullet.ACTIVATION_STATE_ENABLE_SLEEPING, pybullet.ACTIVATION_STATE_SLEEP):
+                self._bullet.changeDynamics(body, -1, activationState=state)
+
+    def poses(self, bodies: Sequence[int]) -> Poses:
+        """True poses of the bodies; for physics and tests, never for a planner."""
+        found = [self._bullet.getBasePositionAndOrientation(body) for body in bodies]
+        return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
+
+    def fastest(self, bodies: Sequence[int]) -> float:
+        """Largest speed among the bodies, in metres per second; a turn of 1 rad/s counts as 0.05 m/s."""
+        speeds = [0.0]
+        for body in bodies:
+            linear, angular = self._bullet.getBaseVelocity(body)
+            speeds += [float(np.linalg.norm(linear)), 0.05 * float(np.linalg.norm(angular))]
+        return max(speeds)
+
+    def render(self, camera: Camera) -> Rendering:
+        """Depth, body numbers and colour as the camera sees them, by PyBullet's software renderer."""
+        x, y, z = camera.position
+        # An intrinsic matrix written as the frustum that OpenGL's conventions want, column by column.
+        width, height, focal = camera.width, camera.height, camera.focal_length
+        frustum = np.zeros((4, 4))
+        frustum[0, 0], frustum[1, 1] = 2 * focal / width, 2 * focal / height
+        frustum[2, 2], frustum[2, 3] = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
+        frustum[3, 2] = -1.0
+        image = self._bullet.getCameraImage(
+            width,
+            height,
+            viewMatrix=pybullet.computeViewMatrix((x, y, z), (x, y, 0.0), (1.0, 0.0, 0.0)),
+            projectionMatrix=frustum.T.ravel().tolist(),
+            renderer=pybullet.ER_TINY_RENDERER,
+            shadow=0,
+            lightDirection=(0.4, 0.3, 1.0),
+        )
+        buffer = np.asarray(image[3], dtype=np.float64).reshape(height, width)
+        depth = FAR * NEAR / (FAR - (FAR - NEAR) * buffer)
+        bodies = np.asarray(image[4], dtype=np.int64).reshape(height, width)
+        color = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[..., :3]
+        return Rendering(depth, bodies, color)

@@ -1,0 +1,100 @@
+"""The heuristic pushing policy that collects data: random pushes that are likely to move something.
+
+Source: paper section 3.3 ("a heuristic policy that randomly samples actions that are likely to have plausible
+effects") and reference.md, "Heuristic pushing policy".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.robots import STICK_RADIUS
+from envs.scene import Observation
+from envs.workspace import push_endpoints
+
+CANDIDATES = 2048  # pushes drawn at once
+SPREAD = np.radians(45.0)  # radians; how far a push may turn from the base angle, either way
+NOISE = 0.3  # on each normalised motion component
+START_CLEARANCE = 0.05  # metres from every object's centre to a push's start
+CLOUD_CLEARANCE = 0.005  # metres between the tool and every visible point where it comes down
+NEAR = 0.01  # metres; margin between the tool and the target object along the push
+CENTRAL_FRACTION = 0.7  # of pushes aim at the middle of the target; the others may just graze it
+CENTRAL = 0.03  # metres between a push's path and the target's centre that count as aiming at its middle
+REDRAWS = 20  # targets and angles tried before a uniformly random push is made instead
+
+
+@dataclass
+class Intent:
+    """What a run of pushes holds on to, so that they add up to one effect. angle: radians."""
+
+    target: int
+    angle: float
+
+
+class HeuristicPushingPolicy:
+    """Pushes one object in about one direction for `hold` pushes, then chooses another object and direction.
+
+    Args:
+        generator: all of the policy's randomness. hold: pushes that share a target and a base angle.
+    """
+
+    def __init__(self, generator: np.random.Generator, *, hold: int = 5) -> None:
+        self._generator, self._hold = generator, hold
+        self._left = 0
+        self.intent = Intent(0, 0.0)
+
+    def act(self, observation: Observation) -> NDArray[np.float64]:
+        """Choose the next normalised push [4] from what the camera sees."""
+        if self._left == 0:
+            self._new_intent(observation)
+        for _ in range(REDRAWS):
+            action = self._propose(observation)
+            if action is not None:
+                self._left -= 1
+                return action
+            self._new_intent(observation)
+        return self._generator.uniform(-1.0, 1.0, size=4)
+
+    def _new_intent(self, observation: Observation) -> None:
+        target = int(self._generator.choice(np.flatnonzero(observation.mask)))
+        self.intent = Intent(target, float(self._generator.uniform(-np.pi, np.pi)))
+        self._left = self._hold
+
+    def _propose(self, observation: Observation) -> NDArray[np.float64] | None:
+        generator, target = self._generator, self.intent.target
+        starts = generator.uniform(-1.0, 1.0, size=(CANDIDATES, 2))
+        angles = self.intent.angle + generator.uniform(-SPREAD, SPREAD, size=CANDIDATES)
+        motions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        motions = np.clip(motions + generator.uniform(-NOISE, NOISE, size=motions.shape), -1.0, 1.0)
+        actions = np.concatenate([starts, motions], axis=-1)
+        start, end = push_endpoints(actions)
+
+        centers = observation.centers[observation.mask, :2]
+        clear = (np.linalg.norm(start[:, None] - centers, axis=-1) >= START_CLEARANCE).all(axis=-1)
+        cloud = observation.clouds[target, ::4, :2]
+        center = observation.centers[target, :2]
+        extent = np.linalg.norm(cloud - center, axis=-1).max()
+        reach = STICK_RADIUS + NEAR
+        central = generator.random() < CENTRAL_FRACTION
+        close = clear & (_distance_to_path(center, start, end) <= (CENTRAL if central else extent + reach))
+        scene = observation.clouds[observation.mask][:, ::4, :2].reshape(-1, 2)
+        for candidate in np.flatnonzero(close):  # in the order drawn: the first that passes is a fair draw
+            path = start[None, candidate], end[None, candidate]
+            touches = _distance_to_path(cloud[:, None], *path).min() <= reach
+            safe = np.linalg.norm(scene - start[candidate], axis=-1).min() >= STICK_RADIUS + CLOUD_CLEARANCE
+            if touches and safe:
+                return actions[candidate]
+        return None
+
+
+def _distance_to_path(
+    points: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Planar metres from points [..., 2] to the straight lines from start [..., 2] to end [..., 2]."""
+    line = end - start
+    length = np.maximum((line**2).sum(axis=-1), 1e-12)
+    along = np.clip(((points - start) * line).sum(axis=-1) / length, 0.0, 1.0)
+    return np.linalg.norm(points - (start + along[..., None] * line), axis=-1)

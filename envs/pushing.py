@@ -1,0 +1,170 @@
+"""The Gymnasium environment: a scene, a task's reward, and when an episode ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from envs.camera import Camera
+from envs.layouts import Layout, Tile, load_layout
+from envs.objects import Area, ObjectRanges
+from envs.scene import Observation, Scene
+from envs.tasks import GOAL_REWARD, TIME_REWARD, VIOLATION_REWARD, Outcome, TaskReward
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
+
+EPISODE_STEPS = 60
+TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
+OBSTACLE_JITTER = TILE_SIDE / 2  # metres; obstacles start anywhere on their tiles
+VIDEO_SIZE = (512, 424)  # pixels
+
+ObservationDict = dict[str, NDArray[Any]]
+
+
+class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
+    """Push objects on a table until a task's goal is reached, seen by a depth camera from above.
+
+    Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is the
+    target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
+
+    `info` of a step: `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and `terms`, the named parts
+    of the reward. An episode terminates at success, violation or fall and is truncated after `maximum_steps`.
+
+    Args:
+        task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout.
+        reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
+        maximum_steps: pushes per episode.
+
+    Raises:
+        ValueError: an argument is out of its range, or the layout has no room for the objects.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        *,
+        task: str = "crossing",
+        layout: int | str | Path | Layout = 0,
+        tiles: Mapping[str, Any] | None = None,
+        reward: str = "sparse",
+        objects: int = 3,
+        ranges: ObjectRanges | None = None,
+        maximum_steps: int = EPISODE_STEPS,
+        camera: Camera | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if not 1 <= objects <= MAXIMUM_OBJECTS:
+            raise ValueError(f"objects must be 1 to {MAXIMUM_OBJECTS}, not {objects}")
+        if maximum_steps < 1:
+            raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        self.layout = layout if isinstance(layout, Layout) else load_layout(task, layout, tiles)
+        self.reward = TaskReward(self.layout, reward=reward)
+        self.objects, self.maximum_steps, self.render_mode = objects, maximum_steps, render_mode
+        self.ranges = ranges or ObjectRanges()
+        self.scene = Scene(camera=camera)
+        shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                "clouds": gymnasium.spaces.Box(-10.0, 10.0, shape, np.float32),
+                "centers": gymnasium.spaces.Box(-10.0, 10.0, (MAXIMUM_OBJECTS, 3), np.float32),
+                "mask": gymnasium.spaces.MultiBinary(MAXIMUM_OBJECTS),
+                "visible": gymnasium.spaces.MultiBinary(MAXIMUM_OBJECTS),
+            }
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self._seen: Observation | None = None
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObservationDict, dict[str, Any]]:
+        """Draw a scene in which the episode has not ended before it began.
+
+        Raises:
+            ValueError: the layout has no room for the objects.
+        """
+        super().reset(seed=seed)
+        (scene_generator,) = self.np_random.spawn(1)
+        target = _areas(self.layout.target_start, TARGET_JITTER)
+        obstacle = _areas(self.layout.obstacle_start, OBSTACLE_JITTER)
+        areas = [target, *[obstacle] * (self.objects - 1)]
+        self._seen = self.scene.draw(areas, self.ranges, scene_generator, acceptable=self._can_start)
+        self._steps = 0
+        return _as_dict(self._seen), {"steps": 0}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
+        """Push, wait until the objects rest, look, and judge.
+
+        Raises:
+            ValueError: the action is not four finite numbers.
+            RuntimeError: called before `reset`.
+        """
+        if self._seen is None:
+            raise RuntimeError("call reset() before step()")
+        report = self.scene.push(np.asarray(action))
+        seen = self.scene.observe()
+        outcome = self._judge(self._seen, seen)
+        fallen = report.fallen or bool(outcome.fall)
+        success, violation = bool(outcome.success) and not fallen, bool(outcome.violation) and not fallen
+        terms = {
+            "goal": GOAL_REWARD * success,
+            "violation": VIOLATION_REWARD * (violation or fallen),
+            "time": TIME_REWARD,
+            "progress": float(outcome.progress) if self.reward.dense else 0.0,
+        }
+        self._seen = seen
+        self._steps += 1
+        info = {
+            "steps": self._steps,
+            "unsafe": report.unsafe,
+            "ineffective": report.ineffective,
+            "success": success,
+            "violation": violation,
+            "fall": fallen,
+            "terms": terms,
+        }
+        terminated = success or violation or fallen
+        truncated = not terminated and self._steps >= self.maximum_steps
+        return _as_dict(seen), sum(terms.values()), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """A colour image of the table [424, 512, 3] in mode rgb_array."""
+        if self.render_mode != "rgb_array":
+            return None
+        return self.scene.photograph(self.scene.camera.resized(*VIDEO_SIZE))
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self.scene.close()
+
+    def _judge(self, before: Observation, after: Observation) -> Outcome:
+        previous, centers = (torch.from_numpy(seen.centers) for seen in (before, after))
+        return self.reward(previous, centers, torch.from_numpy(after.mask))
+
+    def _can_start(self, seen: Observation) -> bool:
+        outcome = self._judge(seen, seen)
+        return not bool(outcome.success | outcome.failure)
+
+
+def _areas(tiles: tuple[Tile, ...], jitter: float) -> Area:
+    centers = [tile_center(tile) for tile in tiles]
+    return [((x - jitter, y - jitter), (x + jitter, y + jitter)) for x, y in centers]
+
+
+def _as_dict(seen: Observation) -> ObservationDict:
+    return {
+        "clouds": seen.clouds,
+        "centers": seen.centers,
+        "mask": seen.mask.astype(np.int8),
+        "visible": seen.visible.astype(np.int8),
+    }

@@ -1,0 +1,114 @@
+"""What a task rewards: one implementation for the real environment and for imagined states.
+
+Pure functions on tensors with any leading dimensions, written from the paper's section 4.1 and its appendix "Task
+Details": +100 at the goal, -100 for a violation, -1 per step, and for dense rewards the target's progress in metres.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from envs.layouts import Layout
+from envs.tiles import TileSet, table_distance
+
+GOAL_REWARD = 100.0
+VIOLATION_REWARD = -100.0
+TIME_REWARD = -1.0
+REWARD_NAMES = ("dense", "sparse")
+
+
+class Outcome(NamedTuple):
+    """What one step of a task came to; every field is [...].
+
+    Attributes:
+        progress: metres towards the goal, the dense term. success, violation, fall: bool, at most one is true.
+        reward: the sum of the terms.
+    """
+
+    reward: Tensor
+    progress: Tensor
+    success: Tensor
+    violation: Tensor
+    fall: Tensor
+
+    @property
+    def failure(self) -> Tensor:
+        """Whether the step ended the episode badly: [...] bool."""
+        return self.violation | self.fall
+
+
+class TaskReward:
+    """The reward function of one task in one layout.
+
+    Args:
+        layout: tiles and task. reward: dense or sparse.
+        margin: metres by which to be stricter than the task itself, for those who plan under uncertainty: goals
+            shrink and forbidden places grow. An object that starts within the margin may stay, not go further out.
+
+    Raises:
+        ValueError: unknown kind of reward, or a negative margin.
+    """
+
+    def __init__(self, layout: Layout, *, reward: str = "sparse", margin: float = 0.0) -> None:
+        if reward not in REWARD_NAMES:
+            raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARD_NAMES)}")
+        if not margin >= 0.0:
+            raise ValueError(f"margin must be at least 0 metres, not {margin}")
+        self.layout, self.dense, self.margin = layout, reward == "dense", margin
+        self._region = TileSet(layout.region)
+        self._goal = TileSet(layout.goal) if layout.goal else None
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
+        """Judge one step.
+
+        Args:
+            previous, centers: [..., M, 3] metres before and after the step; object 0 is the target.
+            mask: [..., M] bool, True for real objects.
+        """
+        before, after = previous[..., :2], centers[..., :2]
+        fall = (self._entered(-table_distance(before), -table_distance(after)) & mask).any(dim=-1)
+        if self.layout.task == "clearing":
+            violation = torch.zeros_like(fall)
+            success = (~mask | (self._region.signed_distance(after) > self.margin)).all(dim=-1)
+        elif self.layout.task == "insertion":
+            inside = (-self._region.signed_distance(points) for points in (before, after))
+            # Entering is leaving the outside: the same rule as for the table's edge and the bridge.
+            violation = (self._entered(*inside) & mask).any(dim=-1)
+            success = self._arrived(after[..., 0, :])
+        else:
+            target = (self._region.signed_distance(points[..., 0, :]) for points in (before, after))
+            violation = self._entered(*target)
+            success = self._arrived(after[..., 0, :])
+        violation = violation & ~fall
+        success = success & ~fall & ~violation
+        progress = self.potential(after, mask) - self.potential(before, mask)
+        reward = TIME_REWARD + GOAL_REWARD * success + VIOLATION_REWARD * (violation | fall)
+        if self.dense:
+            reward = reward + progress
+        return Outcome(reward.to(centers.dtype), progress, success, violation, fall)
+
+    def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
+        """Minus the metres still to go, whose change is the dense term: [...].
+
+        Insertion and crossing: the target's distance to the goal's nearest tile centre. Clearing has virtual goals at
+        the table's edges: the sum, over objects still in the region, of their distance to the nearest edge.
+
+        Args:
+            positions: [..., M, 2] metres. mask: [..., M] bool.
+        """
+        if self._goal is not None:
+            centers = self._goal.centers.to(positions)
+            return -(positions[..., 0, None, :] - centers).norm(dim=-1).amin(dim=-1)
+        remaining = self._region.contains(positions) & mask
+        return -(table_distance(positions) * remaining).sum(dim=-1)
+
+    def _entered(self, before: Tensor, after: Tensor) -> Tensor:
+        """Whether a signed distance (positive is forbidden) is forbidden now, or comes closer within the margin."""
+        return (after > 0.0) | ((after > -self.margin) & (after > before))
+
+    def _arrived(self, target: Tensor) -> Tensor:
+        assert self._goal is not None
+        return self._goal.signed_distance(target) <= -self.margin

@@ -1,0 +1,71 @@
+"""Distances to unions of tiles, as pure functions of tensors with any leading dimensions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from envs.layouts import Tile
+from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, tile_center
+
+
+class TileSet:
+    """A union of tiles, to which points have an exact signed distance.
+
+    Args:
+        tiles: any number of tiles; neighbours melt into one shape.
+    """
+
+    def __init__(self, tiles: Iterable[Tile]) -> None:
+        self.tiles = tuple(tiles)
+        centers = torch.tensor([tile_center(tile) for tile in self.tiles]).reshape(-1, 2)
+        self.centers = centers
+        self._low, self._high = centers - TILE_SIDE / 2, centers + TILE_SIDE / 2
+        edges = torch.tensor(_outline(set(self.tiles))).reshape(-1, 2, 2)
+        self._edge_low, self._edge_high = edges[:, 0], edges[:, 1]
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Whether points [..., 2] metres lie in the union, its border included: [...] bool."""
+        point = points[..., None, :]
+        return ((point >= self._low.to(points)) & (point <= self._high.to(points))).all(dim=-1).any(dim=-1)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Metres from points [..., 2] to the union's outline, negative inside: [...]."""
+        point = points[..., None, :]
+        nearest = torch.clamp(point, self._edge_low.to(points), self._edge_high.to(points))
+        distance = (point - nearest).square().sum(dim=-1).amin(dim=-1).sqrt()
+        return torch.where(self.contains(points), -distance, distance)
+
+
+def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:
+    """Border segments of a union of tiles, collinear neighbours joined, each as [low corner, high corner]."""
+    half = TILE_SIDE / 2
+    runs: dict[tuple[int, float], list[tuple[float, float]]] = {}
+    for tile in sorted(tiles):
+        center = tile_center(tile)
+        for axis in (0, 1):
+            for side in (-1, 1):
+                neighbour = (tile[0] + side, tile[1]) if axis == 0 else (tile[0], tile[1] + side)
+                if neighbour not in tiles:
+                    across, along = center[axis] + side * half, center[1 - axis]
+                    runs.setdefault((axis, round(across, 6)), []).append((along - half, along + half))
+    segments = []
+    for (axis, across), pieces in sorted(runs.items()):
+        joined: list[tuple[float, float]] = []
+        for low, high in sorted(pieces):
+            if joined and abs(joined[-1][1] - low) < 1e-6:
+                joined[-1] = (joined[-1][0], high)
+            else:
+                joined.append((low, high))
+        for low, high in joined:
+            corners = [(across, low), (across, high)] if axis == 0 else [(low, across), (high, across)]
+            segments.append(corners)
+    return segments
+
+
+def table_distance(points: Tensor) -> Tensor:
+    """Metres by which points [..., 2] lie inside the table's nearest edge, negative off the table: [...]."""
+    low, high = points.new_tensor(TABLE_LOW), points.new_tensor(TABLE_HIGH)
+    return torch.minimum(points - low, high - points).amin(dim=-1)

@@ -1,0 +1,55 @@
+"""The table, the tool's reach and the tile grid: the fixed geometry that everything else refers to.
+
+All coordinates are metres in the robot's base frame; the table's top lies at z = 0. Source: reference.md,
+"Workspace" and "Action".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+TABLE_LOW = (0.22, -0.61)  # metres; the table is 0.76 m by 1.22 m around (0.60, 0.00)
+TABLE_HIGH = (0.98, 0.61)  # metres
+TABLE_CENTER = (0.60, 0.00)  # metres
+TABLE_THICKNESS = 0.1  # metres
+
+REACH_LOW = (0.30, -0.55)  # metres; the planar box that the tool's tip may touch
+REACH_HIGH = (0.80, 0.55)  # metres
+MAXIMUM_MOTION = 0.1  # metres per push, on each axis
+
+TILE_SIDE = 0.15  # metres
+TILE_ORIGIN = (0.295, -0.485)  # metres; the centre of tile (0, 0)
+
+MAXIMUM_OBJECTS = 5
+POINTS_PER_OBJECT = 256
+
+
+def tile_center(tile: tuple[int, int]) -> tuple[float, float]:
+    """Planar centre (x, y) in metres of tile (i, j)."""
+    return TILE_ORIGIN[0] + TILE_SIDE * tile[0], TILE_ORIGIN[1] + TILE_SIDE * tile[1]
+
+
+def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the tool starts and stops for a normalised push.
+
+    The start is scaled onto the reachable box, the motion by `MAXIMUM_MOTION`, and the end is clipped to the box.
+
+    Args:
+        action: [..., 4] (x, y, dx, dy), clipped to [-1, 1].
+
+    Returns:
+        start: [..., 2] metres; end: [..., 2] metres.
+    """
+    action = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+    low, high = np.array(REACH_LOW), np.array(REACH_HIGH)
+    start = low + (action[..., :2] + 1.0) / 2.0 * (high - low)
+    end = np.clip(start + MAXIMUM_MOTION * action[..., 2:], low, high)
+    return start, end
+
+
+def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The action [..., 4] whose push starts at `start` [..., 2] metres and moves by `motion` [..., 2] metres."""
+    low, high = np.array(REACH_LOW), np.array(REACH_HIGH)
+    position = 2.0 * (np.asarray(start, dtype=np.float64) - low) / (high - low) - 1.0
+    return np.concatenate([position, np.asarray(motion, dtype=np.float64) / MAXIMUM_MOTION], axis=-1)

@@ -1,0 +1,1 @@
+"""What is inferred: inference networks and the Pyro guide programs."""

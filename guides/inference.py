@@ -1,0 +1,95 @@
+"""Inference networks q_h and q_g (paper, section 3.3, appendix A.1)."""
+
+from __future__ import annotations
+
+import torch
+from pyro import distributions
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+from torch.nn import functional
+
+from models.dynamics import EffectTrunk
+from models.layers import POSITION_UNIT, ObjectPool, fully_connected, relative_positions
+from models.state import State
+
+SCALE_FLOOR = 1e-6  # keeps the density of a code finite
+
+
+class GaussianCode(nn.Module):
+    """A diagonal Gaussian over a code, from a feature."""
+
+    def __init__(self, dimension: int, *, width: int = 64) -> None:
+        super().__init__()
+        self.head = nn.Linear(width, 2 * dimension)
+
+    def forward(self, feature: Tensor) -> TorchDistribution:
+        """`feature: [..., width]` -> batch `[...]`, event `[dimension]`."""
+        mean, scale = self.head(feature).chunk(2, -1)
+        return distributions.Normal(mean, functional.softplus(scale) + SCALE_FLOOR).to_event(1)
+
+
+class EffectInference(nn.Module):
+    """q_h(c | s, s'): which effect turned s into s'.
+
+    Per object two FC on (s, s' - s), centers and features; masked sum over objects; FC; Gaussian.
+    """
+
+    def __init__(self, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64) -> None:
+        super().__init__()
+        self.objects = nn.Sequential(
+            fully_connected(2 * (3 + feature_dimension), width), fully_connected(width, width)
+        )
+        self.scene = fully_connected(width, width)
+        self.code = GaussianCode(effect_dimension, width=width)
+
+    def forward(self, state: State, subgoal: State) -> TorchDistribution:
+        """`state, subgoal: [...]` -> batch `[...]`; objects count that are real in both."""
+        parts = (
+            relative_positions(state.centers),
+            state.features,
+            (subgoal.centers - state.centers) / POSITION_UNIT,
+            subgoal.features - state.features,
+        )
+        real = (state.mask & subgoal.mask).unsqueeze(-1)
+        pooled = (self.objects(torch.cat(parts, -1)) * real).sum(-2)
+        return self.code(self.scene(pooled))
+
+
+class MotionInference(nn.Module):
+    """q_g(z | s, a, c): which motion brought the effect about.
+
+    (s, c) pooled as in the action generator; FC of each push, concatenated over T; FC of both; Gaussian.
+    """
+
+    def __init__(
+        self,
+        *,
+        segment_length: int = 3,
+        effect_dimension: int = 16,
+        motion_dimension: int = 16,
+        width: int = 64,
+        encoder_width: int = 64,
+    ) -> None:
+        super().__init__()
+        self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=encoder_width)
+        self.pool = ObjectPool(width)
+        self.pushes = nn.Sequential(fully_connected(4, width), nn.Flatten(-2))
+        self.from_pushes = nn.Linear(segment_length * width, width)
+        self.from_pooled = nn.Linear(width, width, bias=False)
+        self.code = GaussianCode(motion_dimension, width=width)
+
+    def forward(
+        self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor
+    ) -> TorchDistribution:
+        """Leading dimensions broadcast.
+
+        Args:
+            encoded: `[..., M, 3 * encoder_width]`, features of s from the model's `StateEncoder`.
+            mask: `[..., M]` of s.
+            actions: `[..., T, 4]`.
+            effect_code: `[..., C]`.
+        """
+        pooled = self.pool(self.trunk(encoded, effect_code), mask)
+        # A linear layer on (pooled, pushes), in two parts since only the first varies with the code.
+        feature = (self.from_pooled(pooled) + self.from_pushes(self.pushes(actions))).relu()
+        return self.code(feature)

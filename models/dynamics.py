@@ -1,0 +1,92 @@
+"""Networks that change states: dynamics f and meta-dynamics h (paper, equations 1 and 2, appendix A.1)."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from models.layers import fully_connected
+from models.state import State
+
+PUSH_RANGE = 0.15  # metres, farthest that one push moves an object along an axis
+SUBGOAL_RANGE = 0.5  # metres, farthest that a segment of pushes moves an object along an axis
+
+
+class EffectTrunk(nn.Module):
+    """What a context (an action or an effect code) does to each object: the effect feature."""
+
+    def __init__(self, context_dimension: int, *, width: int = 64, encoder_width: int = 64) -> None:
+        super().__init__()
+        self.context = fully_connected(context_dimension, width)
+        self.from_state = nn.Linear(3 * encoder_width, width)
+        self.from_context = nn.Linear(width, width, bias=False)
+        self.second = fully_connected(width, width)
+
+    def forward(self, encoded: Tensor, context: Tensor) -> Tensor:
+        """`encoded: [..., M, 3 * encoder_width]`, `context: [..., context_dimension]` -> `[..., M, width]`.
+
+        The leading dimensions of both broadcast.
+        """
+        # A linear layer on (state feature, context repeated per object), whose part for the context
+        # is computed once per scene instead of once per object.
+        from_context = self.from_context(self.context(context)).unsqueeze(-2)
+        return self.second((self.from_state(encoded) + from_context).relu_())
+
+
+class StateChange(nn.Module):
+    """Head that moves each object: one gate per object says whether, the rest says how.
+
+    center'  = center + gate * range * tanh(change of center)
+    feature' = unit(feature + gate * change of feature)
+    """
+
+    def __init__(self, *, reach: float, feature_dimension: int = 64, width: int = 64) -> None:
+        super().__init__()
+        self.reach = reach  # metres
+        self.parts = (1, 3, feature_dimension)
+        self.head = nn.Linear(width, sum(self.parts))
+
+    def forward(self, state: State, effect: Tensor) -> State:
+        """`effect: [..., M, width]` -> predicted state; leading dimensions broadcast, padding stays put."""
+        gate, motion, turn = self.head(effect).split(self.parts, -1)
+        gate = gate.sigmoid() * state.mask.unsqueeze(-1)
+        centers = state.centers + gate * (self.reach * motion.tanh())
+        features = functional.normalize(state.features + gate * turn, dim=-1)
+        return State(centers, features, state.mask.expand(centers.shape[:-1]))
+
+
+class Dynamics(nn.Module):
+    """f: mean of the state after one push."""
+
+    def __init__(self, *, feature_dimension: int = 64, width: int = 64, reach: float = PUSH_RANGE) -> None:
+        super().__init__()
+        self.trunk = EffectTrunk(4, width=width, encoder_width=width)
+        self.change = StateChange(reach=reach, feature_dimension=feature_dimension, width=width)
+
+    def forward(self, state: State, encoded: Tensor, action: Tensor) -> State:
+        """`encoded: [..., M, 3 * width]` features of `state`, `action: [..., 4]` -> `State [...]`."""
+        return self.change(state, self.trunk(encoded, action))
+
+
+class MetaDynamics(nn.Module):
+    """h: mean of the subgoal, the state T pushes ahead, that an effect code stands for."""
+
+    def __init__(
+        self,
+        *,
+        effect_dimension: int = 16,
+        feature_dimension: int = 64,
+        width: int = 64,
+        reach: float = SUBGOAL_RANGE,
+    ) -> None:
+        super().__init__()
+        self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=width)
+        self.change = StateChange(reach=reach, feature_dimension=feature_dimension, width=width)
+
+    def effect(self, encoded: Tensor, effect_code: Tensor) -> Tensor:
+        """Effect feature of (s, c) `[..., M, width]`, which the action generator reads as well."""
+        return self.trunk(encoded, effect_code)
+
+    def forward(self, state: State, effect: Tensor) -> State:
+        """`effect: [..., M, width]` of (s, c) -> subgoal `State [...]`."""
+        return self.change(state, effect)

@@ -1,0 +1,26 @@
+"""Priors of the codes: p(c) and p(z) (paper, section 3.1)."""
+
+from __future__ import annotations
+
+import torch
+from pyro import distributions
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from models.state import State
+
+
+class StandardPrior(nn.Module):
+    """N(0, I), whatever the state. A learned prior has the same two arguments and reads them."""
+
+    def __init__(self, dimension: int = 16) -> None:
+        super().__init__()
+        self.dimension = dimension
+
+    def forward(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
+        """`state: [...]`, `effect_code: [..., C]` for motions -> batch `[...]`, event `[dimension]`."""
+        shape = state.batch_shape
+        if effect_code is not None:
+            shape = torch.broadcast_shapes(shape, effect_code.shape[:-1])
+        zero, one = state.centers.new_zeros(()), state.centers.new_ones(())
+        return distributions.Normal(zero, one).expand((*shape, self.dimension)).to_event(1)

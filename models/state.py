@@ -1,0 +1,109 @@
+"""States of the tabletop and windows of experience (paper, sections 2 and 3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class State(NamedTuple):
+    """What the robot knows of `M` objects (padded to a fixed number) in any batch `[...]` of scenes.
+
+    `state[0]` is the tuple's first field, not a scene: use `scene`, `step` and `take_plans` to index.
+    """
+
+    centers: Tensor  # [..., M, 3] metres, in the robot's base frame
+    features: Tensor  # [..., M, F] geometric features of unit length
+    mask: Tensor  # [..., M] bool, True for real objects, False for padding
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Shape of the leading dimensions `[...]`."""
+        return self.centers.shape[:-2]
+
+    @property
+    def objects(self) -> int:
+        """`M`, padding included."""
+        return self.centers.shape[-2]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> State:
+        """Apply one function to every field, for example `state.map(lambda field: field.to(device))`."""
+        return State(function(self.centers), function(self.features), function(self.mask))
+
+    def scene(self, index: int | slice | Tensor) -> State:
+        """Index the first leading dimension: `[B, ...] -> [...]` or `[b, ...]`."""
+        return self.map(lambda field: field[index])
+
+    def step(self, index: int | slice) -> State:
+        """Index the last leading dimension, usually time: `[..., T] -> [...]` or `[..., t]`."""
+        return State(
+            self.centers[..., index, :, :], self.features[..., index, :, :], self.mask[..., index, :]
+        )
+
+    def expand(self, batch_shape: Sequence[int]) -> State:
+        """Broadcast to leading dimensions `batch_shape`, as views without copies."""
+        return State(
+            self.centers.expand(*batch_shape, *self.centers.shape[-2:]),
+            self.features.expand(*batch_shape, *self.features.shape[-2:]),
+            self.mask.expand(*batch_shape, self.mask.shape[-1]),
+        )
+
+    def expand_plans(self, plans: int) -> State:
+        """One copy (a view) per plan sample: `[B] -> [B, N]`."""
+        single = State(self.centers.unsqueeze(-3), self.features.unsqueeze(-3), self.mask.unsqueeze(-2))
+        return single.expand((*self.batch_shape, plans))
+
+    def take_plans(self, index: Tensor) -> State:
+        """Choose plans by number, per scene: fields `[B, N, ...]`, `index: [B, n]` int64 -> `[B, n, ...]`."""
+        rows = torch.arange(index.shape[0], device=index.device).unsqueeze(-1)
+        return self.map(lambda field: field[rows, index])
+
+
+class Window(NamedTuple):
+    """One training example: `T + 1` states and the `T` pushes between them, in any batch `[...]`."""
+
+    states: State  # fields with leading [..., T + 1]
+    actions: Tensor  # [..., T, 4] normalised pushes (x, y, dx, dy): start and motion
+    transition_mask: Tensor  # [..., T] bool: pairs that count for the dynamics f
+    sequence_mask: Tensor  # [...] bool: windows that count for the terms with latent variables (h and g)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Shape of the leading dimensions `[...]`."""
+        return self.actions.shape[:-2]
+
+    @property
+    def segment_length(self) -> int:
+        """`T`, the number of pushes."""
+        return self.actions.shape[-2]
+
+    @property
+    def first(self) -> State:
+        """The state s before the first push: `[...]`."""
+        return self.states.step(0)
+
+    @property
+    def last(self) -> State:
+        """The state s' after the last push, the subgoal reached: `[...]`."""
+        return self.states.step(-1)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Window:
+        """Apply one function to every tensor, for example `window.map(lambda tensor: tensor[:8])`."""
+        return Window(
+            self.states.map(function),
+            function(self.actions),
+            function(self.transition_mask),
+            function(self.sequence_mask),
+        )
+
+
+def stack_steps(states: Sequence[State]) -> State:
+    """Stack states `[...]` of successive times into one state with leading dimensions `[..., T]`."""
+    return State(
+        torch.stack([state.centers for state in states], -3),
+        torch.stack([state.features for state in states], -3),
+        torch.stack([state.mask for state in states], -2),
+    )

@@ -1,0 +1,51 @@
+"""The dynamics f as a piece of a Pyro program, shared by every model that has one (paper, equation 1)."""
+
+from __future__ import annotations
+
+import pyro
+from torch import Tensor
+from torch.nn import functional
+
+from models.dynamics import Dynamics
+from models.encoder import StateEncoder
+from models.likelihoods import LikelihoodScales
+from models.state import State, Window, stack_steps
+
+
+def observe_transitions(
+    dynamics: Dynamics, scales: LikelihoodScales, window: Window, encoded: Tensor
+) -> None:
+    """s_t+1 ~ f(. | s_t, a_t) at the T observed pairs of `window: [B]`, all at once.
+
+    Sites next_centers, event `[T, M, 3]`, and next_features, event `[T, M, F]`. Counted are the pairs of
+    `transition_mask`, and there the objects that are real before and after the push.
+
+    Args:
+        encoded: `[B, T, M, 3 * width]`, features of the T states before each push.
+    """
+    before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
+    mean = dynamics(before, encoded, window.actions)
+    counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
+    pyro.sample("next_centers", scales.centers(mean, counted, event_dims=2), obs=after.centers)
+    pyro.sample("next_features", scales.features(mean, counted, event_dims=2), obs=after.features)
+
+
+def generate_transitions(
+    dynamics: Dynamics, encoder: StateEncoder, scales: LikelihoodScales, state: State, actions: Tensor
+) -> None:
+    """Draw s_t+1 ~ f(. | s_t, a_t) push by push from `state: [B]` under `actions: [..., B, T, 4]`.
+
+    Sites next_centers_t and next_features_t for t = 1, ..., T; next_centers and next_features record them
+    together, in the shapes of `observe_transitions`. A drawn feature is scaled to unit length before f reads
+    it, as every observed feature is.
+    """
+    drawn = []
+    for step, action in enumerate(actions.unbind(-2), start=1):
+        mean = dynamics(state, encoder(state), action)
+        centers = pyro.sample(f"next_centers_{step}", scales.centers(mean, state.mask))
+        features = pyro.sample(f"next_features_{step}", scales.features(mean, state.mask))
+        drawn.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
+        state = drawn[-1]._replace(features=functional.normalize(features, dim=-1))
+    steps = stack_steps(drawn)
+    pyro.deterministic("next_centers", steps.centers, event_dim=3)
+    pyro.deterministic("next_features", steps.features, event_dim=3)

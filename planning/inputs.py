@@ -1,0 +1,54 @@
+"""Checks at the planners' public boundary: one clear line for bad input."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from models.state import State
+
+
+def check_positive(name: str, value: int) -> None:
+    """Raise ValueError if a count is zero or negative."""
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, not {value}")
+
+
+def check_horizon(horizon: int, segment_length: int) -> None:
+    """Raise ValueError, naming the nearest valid ones, unless H is a positive multiple of T (section 3.2)."""
+    check_positive("horizon", horizon)
+    if horizon % segment_length:
+        below = horizon - horizon % segment_length
+        nearest = [str(valid) for valid in (below, below + segment_length) if valid > 0]
+        raise ValueError(
+            f"horizon={horizon} is not divisible by the model's segment length T={segment_length}: "
+            f"take {' or '.join(nearest)}"
+        )
+
+
+def check_weight(name: str, value: float) -> None:
+    """Raise ValueError unless a weight is finite and not negative."""
+    if not (math.isfinite(value) and value >= 0):
+        raise ValueError(f"{name} must be zero or a positive number, not {value}")
+
+
+def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
+    """Raise ValueError unless `state` is a batch `[B]` with one generator per environment, on its device."""
+    centers = state.centers
+    if centers.ndim != 3 or centers.shape[-1] != 3 or state.mask.shape != centers.shape[:-1]:
+        raise ValueError(
+            "a planner takes states with centers [B, M, 3] and mask [B, M], "
+            f"not {list(centers.shape)} and {list(state.mask.shape)}"
+        )
+    if len(generators) != len(centers):
+        raise ValueError(f"one generator per environment: {len(centers)} needed, {len(generators)} given")
+    if len({id(generator) for generator in generators}) != len(generators):
+        raise ValueError("one generator per environment: the same generator was given twice")
+    for index, generator in enumerate(generators):
+        if generator.device.type != centers.device.type:
+            raise ValueError(
+                f"generator {index} is on {generator.device.type}, the state on {centers.device.type}: "
+                f"make it with torch.Generator('{centers.device.type}')"
+            )

@@ -1,0 +1,153 @@
+"""Toy worlds with known answers. Positions are in metres; only the plane's two coordinates ever change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal
+
+from models.state import State
+
+REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1
+
+
+class PointMass:
+    """h moves objects by 0.15 m times tanh(c), g splits that into T pushes and adds `noise * z`, f obeys.
+
+    Each move is multiplied by the object's gain, the first number of its features.
+    """
+
+    segment_length = 3
+
+    def __init__(self, noise: float = 0.02) -> None:
+        self.noise = noise  # metres per push
+
+    def effect_prior(self, state: State) -> Distribution:
+        return standard_normal(state)
+
+    def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
+        return standard_normal(state)
+
+    def subgoal(self, state: State, effect_code: Tensor) -> State:
+        return move(state, REACH * effect_code[..., :2].tanh())
+
+    def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
+        share = REACH * effect_code[..., :2].tanh() / self.segment_length
+        motions = share.unsqueeze(-2) + self.noise * motion_code[..., :6].unflatten(-1, (3, 2))
+        return torch.cat([torch.zeros_like(motions), motions / 0.1], -1)
+
+    def next_state(self, state: State, action: Tensor) -> State:
+        return move(state, 0.1 * action[..., 2:])
+
+
+class Tabled:
+    """One object on a line, codes from tables: h moves it by c, each of the T = 2 pushes by c / 2 + z."""
+
+    segment_length = 2
+
+    def __init__(self, effects: Sequence[Sequence[float]], motions: Sequence[Sequence[float]]) -> None:
+        self.effects = iter(effects)
+        self.motions = iter(motions)
+
+    def effect_prior(self, state: State) -> Distribution:
+        return Listed(self.effects)
+
+    def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
+        return Listed(self.motions)
+
+    def subgoal(self, state: State, effect_code: Tensor) -> State:
+        return move(state, effect_code[..., :2])
+
+    def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
+        push = effect_code[..., :2] / 2 + motion_code[..., :2]
+        return torch.cat([torch.zeros_like(push), push], -1).unsqueeze(-2).repeat(1, 1, 2, 1)
+
+    def next_state(self, state: State, action: Tensor) -> State:
+        return move(state, action[..., 2:])
+
+
+class Listed(Distribution):
+    """Draws the table's next row, a first coordinate per plan; the other 15 are zero."""
+
+    arg_constraints: dict = {}
+
+    def __init__(self, rows: Iterator[Sequence[float]]) -> None:
+        super().__init__(validate_args=False)
+        self.rows = rows
+
+    def sample(self, sample_shape: object = ()) -> Tensor:
+        first = torch.tensor(next(self.rows))
+        return torch.cat([first[:, None], torch.zeros(len(first), 15)], -1)
+
+
+class Judgement(NamedTuple):
+    reward: Tensor
+    success: Tensor
+    failure: Tensor
+
+
+class GoalDisc:
+    """The target must reach a disc, and no real object may enter the half-plane y < `forbidden_below`."""
+
+    def __init__(
+        self,
+        goal: tuple[float, float],
+        radius: float = 0.05,
+        forbidden_below: float = -torch.inf,
+        dense: bool = False,
+    ) -> None:
+        self.goal, self.radius, self.forbidden_below, self.dense = goal, radius, forbidden_below, dense
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
+        success = self.distance(centers) <= self.radius
+        failure = ((centers[..., 1] < self.forbidden_below) & mask).any(-1)
+        reward = 100.0 * success - 100.0 * failure - 1.0
+        if self.dense:
+            reward = reward + self.distance(previous) - self.distance(centers)
+        return Judgement(reward, success, failure)
+
+    def distance(self, centers: Tensor) -> Tensor:
+        return (centers[..., 0, :2] - torch.tensor(self.goal, dtype=centers.dtype)).norm(dim=-1)
+
+
+class Line:
+    """The target, on a line, succeeds from x = 1 on and fails up to x = -0.5."""
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
+        x = centers[..., 0, 0]
+        success, failure = x >= 1.0, x <= -0.5
+        return Judgement(100.0 * success - 100.0 * failure - 1.0, success, failure)
+
+
+def standard_normal(state: State) -> Distribution:
+    return Independent(Normal(state.centers.new_zeros(*state.batch_shape, 16), 1.0), 1)
+
+
+def move(state: State, displacement: Tensor) -> State:
+    gain = state.features[..., :1]
+    planar = gain * displacement.unsqueeze(-2)
+    shift = torch.cat([planar, torch.zeros_like(planar[..., :1])], -1)
+    return state._replace(centers=state.centers + shift)
+
+
+def scenes(positions: Sequence[Sequence[tuple[float, float]]], gains: Sequence[float] = (1.0,)) -> State:
+    """A batch of scenes from the objects' x and y: `[B, M]` pairs, and a gain per object."""
+    planar = torch.tensor(positions)
+    centers = torch.cat([planar, torch.full_like(planar[..., :1], 0.03)], -1)
+    features = torch.tensor(gains)[:, None].expand(*planar.shape[:-1], 1).clone()
+    return State(centers, features, torch.ones(planar.shape[:-1], dtype=torch.bool))
+
+
+def generators(*seeds: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+@pytest.fixture
+def toy() -> SimpleNamespace:
+    names: list[Callable] = [PointMass, Tabled, GoalDisc, Line, Judgement, move, scenes, generators]
+    return SimpleNamespace(**{name.__name__: name for name in names}, REACH=REACH)

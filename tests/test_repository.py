@@ -1,0 +1,221 @@
+"""Statements about the repository as a whole: what its files may say, and what import-linter cannot check."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("cavin_pyro", "models", "guides", "planning", "envs")
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+# Where the name that is imported is not the name that is installed.
+DISTRIBUTIONS = {
+    "hydra": "hydra-core",
+    "imageio_ffmpeg": "imageio-ffmpeg",
+    "mpl_toolkits": "matplotlib",
+    "pybullet_data": "pybullet",
+    "pybullet_utils": "pybullet",
+    "pyro": "pyro-ppl",
+    "yaml": "pyyaml",
+}
+CODE_RUNNING_MODULES = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"}
+CODE_RUNNING_CALLS = {
+    *("eval", "exec", "os.system", "torch.load", "torch.save"),
+    *("yaml.load", "yaml.full_load", "yaml.unsafe_load"),
+}
+MACHINE_PATH = re.compile(rb"/(?:work|tmp|root|farm|home|Users)/[A-Za-z0-9_.]")
+
+
+def repository_files() -> list[Path]:
+    """Every file that is tracked, or would be with the next `git add --all`."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listing = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    files = {ROOT / name for name in listing.split("\0") if name}
+    return sorted(file for file in files if file.is_file())
+
+
+def modules(*packages: str) -> list[Path]:
+    return sorted(file for package in packages for file in (ROOT / package).rglob("*.py"))
+
+
+def parse(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(), filename=str(file))
+
+
+def place(file: Path, line: int = 1) -> str:
+    return f"{file.relative_to(ROOT)}:{line}"
+
+
+def imports(file: Path) -> Iterator[tuple[str, int]]:
+    """Names of modules that a file imports from elsewhere, with the line of each."""
+    for node in ast.walk(parse(file)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module, node.lineno
+
+
+def pins(lines: list[str]) -> dict[str, str]:
+    """Exact versions by name; anything but `name==version`, with or without a marker, is an error."""
+    found = {}
+    for line in lines:
+        match = re.fullmatch(r"([a-z0-9][a-z0-9-]*)==([0-9][0-9.]*)(; python_version < '3\.11')?", line)
+        assert match, f"not an exact pin: {line}"
+        found[match[1]] = match[2]
+    return found
+
+
+def lock() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return pins([line for line in lines if line and not line.startswith("#")])
+
+
+def test_one_version_is_named_everywhere() -> None:
+    version = PROJECT["project"]["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    releases = re.findall(r"^## \[(\d[^]]*)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    package = (ROOT / "cavin_pyro" / "__init__.py").read_text()
+    assert citation["version"] == version
+    assert releases[0] == version
+    assert re.findall(r'^__version__ = "(.*)"$', package, re.MULTILINE) == [version]
+
+
+def test_licence_and_citation_say_whose_work_it_is() -> None:
+    licence = (ROOT / "LICENSE").read_text()
+    assert licence.startswith("MIT License\n\nCopyright (c) 2026 the cavin_pyro authors\n")
+    assert PROJECT["project"]["license"] == "MIT"
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["license"] == "MIT"
+    (paper,) = citation["references"]
+    names = [author["family-names"] for author in paper["authors"]]
+    assert names == ["Fang", "Zhu", "Garg", "Savarese", "Fei-Fei"]
+
+
+def test_every_dependency_is_locked_at_the_version_that_the_project_names() -> None:
+    named = pins(PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["test"])
+    locked = lock()
+    assert named == {name: locked.get(name) for name in named}
+
+
+def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
+    declared = pins(PROJECT["project"]["dependencies"])
+    known = {*sys.stdlib_module_names, *PACKAGES}
+    strangers = [
+        f"{place(file, line)} imports {name}"
+        for file in modules(*PACKAGES)
+        for name, line in imports(file)
+        if (top := name.partition(".")[0]) not in known and DISTRIBUTIONS.get(top, top) not in declared
+    ]
+    assert not strangers
+
+
+def test_every_dependency_says_why_it_was_chosen() -> None:
+    text = (ROOT / "docs" / "dependencies.md").read_text()
+    reasons = {name for row in re.findall(r"^\| ([^|]+) \|", text, re.MULTILINE) for name in row.split(", ")}
+    extras = PROJECT["project"]["optional-dependencies"]["test"]
+    assert set(pins(PROJECT["project"]["dependencies"] + extras)) <= reasons
+
+
+def test_every_folder_of_a_package_is_a_package() -> None:
+    """A wheel leaves out folders without `__init__.py`, which a checkout imports all the same."""
+    folders = {file.parent for file in modules(*PACKAGES)}
+    assert folders
+    assert not [place(folder) for folder in sorted(folders) if not (folder / "__init__.py").is_file()]
+
+
+def test_every_command_is_a_console_script_and_every_console_script_has_its_main() -> None:
+    scripts = dict(target.split(":") for target in PROJECT["project"]["scripts"].values())
+    mains = {
+        f"cavin_pyro.{file.stem}"
+        for file in (ROOT / "cavin_pyro").glob("*.py")
+        for node in parse(file).body
+        if isinstance(node, ast.FunctionDef) and node.name == "main"
+    }
+    assert scripts
+    assert set(scripts.values()) == {"main"}
+    existing = {name for name in scripts if (ROOT / name.replace(".", "/")).with_suffix(".py").is_file()}
+    assert existing <= mains
+    assert mains - set(scripts) <= {"cavin_pyro.demo"}  # make demo is its name
+
+
+def test_a_wheel_carries_every_file_that_the_packages_read() -> None:
+    setuptools = PROJECT["tool"]["setuptools"]
+    globs = [glob for globs in setuptools["data-files"].values() for glob in globs]
+    carried = {file for glob in globs for file in ROOT.glob(glob)}
+    for package, globs in setuptools["package-data"].items():
+        carried |= {file for glob in globs for file in (ROOT / package).glob(glob)}
+    data = {file for file in repository_files() if file.suffix != ".py"}
+    data = {file for file in data if file.relative_to(ROOT).parts[0] in {*PACKAGES, "checkpoints"}}
+    assert data
+    assert not [place(file) for file in sorted(data - carried)]
+
+
+@pytest.mark.parametrize("file", [pytest.param(file, id=place(file)) for file in modules(*PACKAGES)])
+def test_no_module_calls_what_can_run_code_out_of_data(file: Path) -> None:
+    tops = [(name.partition(".")[0], line) for name, line in imports(file)]
+    found = [place(file, line) for top, line in tops if top in CODE_RUNNING_MODULES]
+    for node in ast.walk(parse(file)):
+        if isinstance(node, ast.Call):
+            keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+            unsafe = keywords.get("shell") == "True" or keywords.get("allow_pickle") == "True"
+            if unsafe or ast.unparse(node.func) in CODE_RUNNING_CALLS:
+                found.append(place(file, node.lineno))
+    assert not found
+
+
+def test_planning_starts_without_pyro_pybullet_and_the_other_packages() -> None:
+    """import-linter reads what files import; this sees what in fact was imported."""
+    names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in modules("planning")]
+    names = [name.removesuffix(".__init__") for name in names]
+    program = f"import sys, {', '.join(names)}\nprint(*sys.modules)"
+    command = [sys.executable, "-c", program]
+    output = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    loaded = set(output.split())
+    assert names
+    assert set(names) <= loaded
+    assert not loaded & {"pyro", "pybullet", "envs", "guides", "cavin_pyro"}
+    assert {name for name in loaded if name.startswith("models.")} <= {"models.state"}
+
+
+def test_every_yaml_file_parses_and_says_something() -> None:
+    files = [file for file in repository_files() if file.suffix in {".yaml", ".yml", ".cff"}]
+    assert files
+    for file in files:
+        assert yaml.safe_load(file.read_text()) is not None, f"{place(file)} is empty"
+
+
+def test_no_file_names_a_path_of_somebodys_machine() -> None:
+    found = []
+    for file in repository_files():
+        lines = file.read_bytes().splitlines()
+        found += [place(file, number) for number, line in enumerate(lines, 1) if MACHINE_PATH.search(line)]
+    assert not found
+
+
+def test_no_file_weighs_more_than_three_megabytes() -> None:
+    assert not [place(file) for file in repository_files() if file.stat().st_size > 3_000_000]
+
+
+def test_tests_mirror_the_packages_and_have_names_of_their_own() -> None:
+    """pytest's importlib mode wants no `__init__.py` and files that cannot be mistaken for one another."""
+    files = sorted((ROOT / "tests").rglob("*.py"))
+    folders = {file.relative_to(ROOT / "tests").parts[0] for file in files if file.parent != ROOT / "tests"}
+    names = Counter(file.name for file in files if file.name.startswith("test_"))
+    assert folders <= set(PACKAGES)
+    assert not [place(file) for file in files if file.name == "__init__.py"]
+    assert not [name for name, count in names.items() if count > 1]
