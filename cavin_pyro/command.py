@@ -73,7 +73,8 @@ def _stop(line: str, status: int) -> None:
 
 def _run(body: Body, config: DictConfig) -> None:
     check_packages()
-    body(config)
+    # Resolved and plain, because Hydra's own interpolations mean nothing in a worker process.
+    body(OmegaConf.create(OmegaConf.to_container(config, resolve=True)))
 
 
 def check_packages() -> None:

@@ -72,14 +72,15 @@ class Episode:
 
 @torch.inference_mode()
 def observed_state(observation: ObservationDict, pointnet: PointNet) -> State:
-    """The planner's state, a batch of one, from what the camera saw.
+    """The planner's state, a batch of one, from what the camera saw, without padding that nobody needs.
 
     Args:
         observation: as of `envs.pushing.PushingEnv`, [M, ...].
     """
-    centers = torch.from_numpy(observation["centers"])
-    clouds = torch.from_numpy(observation["clouds"]) - centers[:, None]
-    mask = torch.from_numpy(observation["mask"].astype(np.bool_))
+    objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1
+    centers = torch.from_numpy(observation["centers"][:objects])
+    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
+    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
     return State(centers[None], pointnet(clouds)[None], mask[None])
 
 
@@ -144,5 +145,6 @@ def _subgoal_distance(decision: Decision, centers: NDArray[np.float32]) -> float
     subgoals = decision.plan.subgoals.centers[0]
     if len(subgoals) == 0:
         return float("nan")
-    distance = np.linalg.norm(subgoals[0].numpy() - centers, axis=-1)
-    return float(distance[decision.mask].mean())
+    objects = len(subgoals[0])
+    distance = np.linalg.norm(subgoals[0].numpy() - centers[:objects], axis=-1)
+    return float(distance[decision.mask[:objects]].mean())

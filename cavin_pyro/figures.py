@@ -12,6 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from cavin_pyro.episodes import Episode
@@ -47,7 +48,7 @@ def draw_plan(path: Path, episode: Episode, layout: Layout, camera: Camera) -> N
     decisions = [episode.decisions[index] for index in chosen]
     columns = {1: 1, 2: 2, 4: 2}.get(len(decisions), 3)
     rows = -(-len(decisions) // columns)
-    size = (max(8.4, 4.4 * columns), 0.9 + (5.3 if columns == 1 else 2.95) * rows)  # inches
+    size = (max(8.4, 4.4 * columns), 0.9 + (5.3 if columns == 1 else 2.85) * rows)  # inches
     figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     returns = [decision.plan.candidate_returns[0].numpy() for decision in decisions]
@@ -71,8 +72,8 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
     """The loss and each term of the objective over training steps.
 
     Args:
-        rows: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and `validation_<term>`;
-            empty cells are skipped.
+        rows: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and
+            `validation_<term>`; empty cells are skipped.
 
     Raises:
         ValueError: there is no row.
@@ -140,9 +141,7 @@ def _scale(returns: NDArray[np.float32]) -> Normalize | None:
     if len(finite) == 0:
         return None
     low, high = float(finite.min()), float(finite.max())
-    # Lower than the lowest, so that no dot is white and lost.
-    spread = max(high - low, 1.0)
-    return Normalize(low - 0.2 * spread, low + spread)
+    return Normalize(low, high if high > low else low + 1.0)
 
 
 def _curve(rows: Sequence[Mapping[str, str | float]], key: str) -> NDArray[np.float64]:
@@ -157,8 +156,15 @@ def _draw_curves(panel: Axes, curves: Mapping[str, NDArray[np.float64]]) -> None
         marker = "o" if len(curve) == 1 else None
         panel.plot(*curve.T, color=COLORS[name], linewidth=1.4, marker=marker, label=name)
     values = np.concatenate([curve[:, 1] for curve in curves.values()])
-    if len(values) and values.min() > 0 and values.max() > 20 * values.min():
-        panel.set_yscale("log")  # the first steps would flatten all that follow
+    settled = np.concatenate([curve[len(curve) // 20 :, 1] for curve in curves.values()])
+    # A steep beginning would flatten all that follows.
+    if len(values) and values.min() > 0 and values[0] > 20 * values[-1]:
+        panel.set_yscale("log")
+    elif len(values) and np.ptp(values) > 4 * np.ptp(settled) > 0:
+        margin = 0.1 * np.ptp(settled)
+        panel.set_ylim(settled.min() - margin, settled.max() + margin)
+    panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.grid(color="#DDDDDD", linewidth=0.6)
     panel.spines[["top", "right"]].set_visible(False)
     panel.tick_params(labelsize=8)

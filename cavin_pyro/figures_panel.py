@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize, to_rgba
+from matplotlib.colors import ListedColormap, Normalize, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon
 from matplotlib.patheffects import withStroke
@@ -16,24 +18,40 @@ from cavin_pyro.figures_overlay import (
     PREDICTION_COLOR,
     PUSH_COLOR,
     SUBGOAL_COLOR,
-    TARGET_RADIUS,
+    TABLE_COLOR,
     candidate_subgoals,
     observed_centers,
-    on_table,
     predicted_paths,
     pushes,
     subgoal_chains,
+    table_box,
+    target_circle,
     tile_corners,
     tile_groups,
 )
 from envs.camera import Camera
 from envs.layouts import Layout
-from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 CANDIDATES = 150  # dots per panel
-RETURNS = "Purples"  # a scale of its own: nothing else in the picture is purple
+# Nothing else in the picture is purple. The palest part is cut off: it would be lost on the table.
+RETURNS = ListedColormap(colormaps["Purples"](np.linspace(0.2, 1.0, 128)))
 MARGIN = 8  # pixels around the table
-_HALO = [withStroke(linewidth=3.2, foreground="white", alpha=0.85)]
+
+Style = dict[str, Any]
+_HALO = [withStroke(linewidth=2.8, foreground="white", alpha=0.85)]
+_SEEN: Style = {
+    "marker": "o",
+    "markersize": 4.5,
+    "color": "white",
+    "markeredgecolor": "black",
+    "linestyle": "",
+}
+_CANDIDATE: Style = {"marker": "o", "markersize": 3.5, "color": "#6A51A3", "linestyle": ""}
+_SUBGOALS: Style = {"marker": "o", "markersize": 5.5, "color": SUBGOAL_COLOR, "linewidth": 2.2}
+_SUBGOALS |= {"markeredgecolor": "black", "markeredgewidth": 0.7}
+_PREDICTED: Style = {"marker": "x", "markersize": 4, "color": PREDICTION_COLOR, "linewidth": 1.2}
+_PUSH: Style = {"arrowstyle": "-|>", "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4}
+_TARGET: Style = {"color": PUSH_COLOR, "linestyle": "--", "linewidth": 1.5}
 
 
 def draw_decision(
@@ -48,28 +66,22 @@ def draw_decision(
     if decision.photograph is not None:
         height, width = decision.photograph.shape[:2]
         camera = camera.resized(width, height)
-        panel.imshow(decision.photograph, interpolation="antialiased")
-    corners = on_table(np.array([TABLE_HIGH, TABLE_LOW]), camera)
+        panel.imshow(decision.photograph)
+    left, top, right, bottom = table_box(camera)
     if decision.photograph is None:
-        panel.fill(corners[[0, 0, 1, 1], 0], corners[[0, 1, 1, 0], 1], color="#C2B9AD", zorder=0)
+        panel.fill([left, right, right, left], [top, top, bottom, bottom], color=TABLE_COLOR, zorder=0)
     _draw_tiles(panel, layout, camera)
     if scale is not None:
         dots, returns = candidate_subgoals(decision, layout, camera, count=CANDIDATES)
-        panel.scatter(*dots.T, c=returns, norm=scale, cmap=RETURNS, s=9, alpha=0.8, linewidths=0, zorder=2)
+        panel.scatter(dots[:, 0], dots[:, 1], s=9, c=returns, norm=scale, cmap=RETURNS, alpha=0.8, zorder=2)
     for path in predicted_paths(decision, camera):
-        line = {"color": PREDICTION_COLOR, "linewidth": 1.2, "marker": "x", "markersize": 4}
-        panel.plot(*path.T, **line, path_effects=_HALO, zorder=3)
+        panel.plot(path[:, 0], path[:, 1], **_PREDICTED, path_effects=_HALO, zorder=3)
     for chain in subgoal_chains(decision, camera):
-        line = {"color": SUBGOAL_COLOR, "linewidth": 2.2, "marker": "o", "markersize": 5.5}
-        panel.plot(
-            *chain.T, **line, markeredgecolor="black", markeredgewidth=0.7, markevery=slice(1, None), zorder=4
-        )
+        panel.plot(chain[:, 0], chain[:, 1], **_SUBGOALS, markevery=slice(1, None), zorder=4)
     _draw_pushes(panel, decision, camera)
     _draw_objects(panel, decision, camera)
-    panel.set(
-        xlim=(corners[0, 0] - MARGIN, corners[1, 0] + MARGIN),
-        ylim=(corners[1, 1] + MARGIN, corners[0, 1] - MARGIN),
-    )
+    panel.set_xlim(left - MARGIN, right + MARGIN)
+    panel.set_ylim(bottom + MARGIN, top - MARGIN)  # rows count downwards
     panel.set(xticks=[], yticks=[], aspect="equal")
     panel.spines[:].set_visible(False)
     panel.set_title(f"after {counted(decision.step)}", fontsize=10)
@@ -81,25 +93,22 @@ def legend(layout: Layout, decisions: Sequence[Decision], *, candidates: bool) -
         Patch(facecolor=to_rgba(group.color, group.opacity), edgecolor=group.color, label=group.name)
         for group in tile_groups(layout)
     ]
-    entries.append(Line2D([], [], color=PUSH_COLOR, linestyle="--", linewidth=1.5, label="target"))
-    entries.append(_entry("seen", "white", marker="o", markersize=5, markeredgecolor="black", linestyle=""))
+    entries.append(Line2D([], [], label="target", **_TARGET))
+    entries.append(Line2D([], [], label="seen", **_SEEN))
     if candidates:
-        entries.append(_entry("candidates", "#6A51A3", marker="o", markersize=3.5, linestyle=""))
+        entries.append(Line2D([], [], label="candidates", **_CANDIDATE))
     if any(decision.plan.subgoals.centers.shape[1] for decision in decisions):
-        entries.append(_entry("subgoals", SUBGOAL_COLOR, marker="o", linewidth=2, markeredgecolor="black"))
+        entries.append(Line2D([], [], label="subgoals", **_SUBGOALS))
     if any(decision.plan.predicted_centers.shape[1] for decision in decisions):
-        entries.append(_entry("predicted", PREDICTION_COLOR, marker="x", markersize=4, linewidth=1.2))
-    entries.append(_entry("push", PUSH_COLOR, marker=r"$\rightarrow$", markersize=15, linestyle=""))
+        entries.append(Line2D([], [], label="predicted", **_PREDICTED))
+    arrow: Style = {"marker": r"$\rightarrow$", "markersize": 15, "color": PUSH_COLOR, "linestyle": ""}
+    entries.append(Line2D([], [], label="push", **arrow))
     return entries
 
 
 def counted(number: int) -> str:
     """`1 push`, `2 pushes`."""
     return f"{number} push" if number == 1 else f"{number} pushes"
-
-
-def _entry(label: str, color: str, **style: str | float) -> Line2D:
-    return Line2D([], [], color=color, label=label, **style)  # type: ignore[arg-type]
 
 
 def _draw_tiles(panel: Axes, layout: Layout, camera: Camera) -> None:
@@ -111,35 +120,18 @@ def _draw_tiles(panel: Axes, layout: Layout, camera: Camera) -> None:
 
 
 def _draw_pushes(panel: Axes, decision: Decision, camera: Camera) -> None:
+    """Arrows, numbered behind their starts in the order of execution."""
     for number, (start, end) in enumerate(pushes(decision, camera), 1):
-        style = {"arrowstyle": "-|>", "mutation_scale": 11, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.8}
-        panel.add_patch(FancyArrowPatch(start, end, color=PUSH_COLOR, path_effects=_HALO, zorder=5, **style))
-        length = max(np.linalg.norm(end - start), 1e-6)
-        behind = start - 8 * (end - start) / length  # pixels
-        panel.text(*behind, str(number), ha="center", va="center", fontsize=8, path_effects=_HALO, zorder=7)
+        order = 6 - 0.1 * number  # earlier ones on top: pushes often follow one another along a line
+        arrow = FancyArrowPatch(start, end, color=PUSH_COLOR, path_effects=_HALO, zorder=order, **_PUSH)
+        panel.add_patch(arrow)
+        x, y = start - 8 * (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)  # 8 pixels
+        panel.text(x, y, str(number), ha="center", va="center", fontsize=8, path_effects=_HALO, zorder=7)
 
 
 def _draw_objects(panel: Axes, decision: Decision, camera: Camera) -> None:
-    panel.scatter(
-        *observed_centers(decision, camera).T,
-        s=20,
-        color="white",
-        edgecolors="black",
-        linewidths=0.9,
-        zorder=6,
-    )
+    centers = observed_centers(decision, camera)
+    panel.plot(centers[:, 0], centers[:, 1], **_SEEN, zorder=6)
     if decision.mask[0]:
-        center = camera.project(decision.centers[0])
-        radius = TARGET_RADIUS * camera.focal_length / camera.position[2]
-        panel.add_patch(
-            Circle(
-                center,
-                radius,
-                fill=False,
-                color=PUSH_COLOR,
-                linestyle="--",
-                linewidth=1.5,
-                path_effects=_HALO,
-                zorder=6,
-            )
-        )
+        center, radius = target_circle(decision, camera)
+        panel.add_patch(Circle(center, radius, fill=False, path_effects=_HALO, zorder=6, **_TARGET))

@@ -1,0 +1,33 @@
+"""The main job, once per task: `python -m cavin_pyro.demo`."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from cavin_pyro.command import command
+
+
+@command("demo")
+def main(config: DictConfig) -> None:
+    """Plan and execute an episode of each task with the shipped checkpoint, from depth images alone."""
+    import copy
+
+    from cavin_pyro.files import output_folder
+    from cavin_pyro.runs import write_config
+    from cavin_pyro.setups import set_up
+    from cavin_pyro.showing import show_episode
+
+    for task in config.tasks:
+        words = copy.deepcopy(config)
+        words.task = task
+        setup = set_up(copy.deepcopy(words), render=True)
+        folder = output_folder(f"{config.output}/{task}")
+        write_config(folder, words)
+        row = show_episode(setup, folder, seed=config.seed, video=True)
+        setup.env.close()
+        print(f"{task}: {row['outcome']} after {row['steps']} pushes")
+        print(f"  picture {folder / 'plan.png'}\n  video   {folder / 'episode.mp4'}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Many seeded episodes, in parallel, resumable."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.episodes import Episode, run_episode
+from cavin_pyro.progress import progress_bar
+from cavin_pyro.setups import Setup, set_up
+
+Row = dict[str, Any]
+
+
+def evaluate(config: DictConfig, folder: Path) -> list[Row]:
+    """Run the episodes that `episodes.jsonl` does not hold yet; returns all rows in the order of their seeds.
+
+    Every finished episode is one line of that file, so that a killed evaluation goes on where it stopped. A last line
+    cut short by the kill is dropped and its episode run again.
+    """
+    path = folder / "episodes.jsonl"
+    rows = _finished(path)
+    seeds = [seed for seed in range(config.seed, config.seed + config.episodes) if seed not in rows]
+    with progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar:
+        with open(path, "w", encoding="utf-8") as file:
+            for row in rows.values():
+                file.write(json.dumps(row) + "\n")
+            file.flush()
+            for row in _run(config, seeds):
+                rows[row["seed"]] = row
+                file.write(json.dumps(row) + "\n")
+                file.flush()
+                bar.update()
+                successes = sum(one["outcome"] == "success" for one in rows.values())
+                bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
+    return [rows[seed] for seed in sorted(rows)][: config.episodes]
+
+
+def episode_row(episode: Episode) -> Row:
+    """One episode as a line of results."""
+    distances = [push.subgoal_distance for push in episode.pushes if math.isfinite(push.subgoal_distance)]
+    return {
+        "seed": episode.seed,
+        "outcome": episode.outcome,
+        "steps": len(episode.pushes),
+        "return": episode.total_reward,
+        "unsafe": sum(push.unsafe for push in episode.pushes),
+        "ineffective": sum(push.ineffective for push in episode.pushes),
+        "subgoal_distance": float(np.mean(distances)) if distances else None,
+        "planning_ms": [round(decision.milliseconds, 2) for decision in episode.decisions],
+    }
+
+
+def _finished(path: Path) -> dict[int, Row]:
+    rows: dict[int, Row] = {}
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                row = json.loads(line)
+            except ValueError:
+                continue
+            rows[row["seed"]] = row
+    return rows
+
+
+_setup: Setup | None = None  # one per worker process
+
+
+def _begin(config: DictConfig) -> None:
+    global _setup
+    # One thread per worker: threads that spin beside other busy processes cost more than they bring.
+    torch.set_num_threads(1)
+    _setup = set_up(config)
+
+
+def _episode(seed: int) -> Row:
+    assert _setup is not None
+    return episode_row(run_episode(_setup.env, _setup.planner, _setup.pointnet, seed=seed))
+
+
+def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:
+    if not seeds:
+        return
+    if config.workers == 1:
+        _begin(config)
+        yield from map(_episode, seeds)
+        return
+    with multiprocessing.get_context("spawn").Pool(
+        min(config.workers, len(seeds)), initializer=_begin, initargs=(config,)
+    ) as pool:
+        yield from pool.imap_unordered(_episode, seeds)

@@ -1,0 +1,33 @@
+"""Plan: `python -m cavin_pyro.plan task=crossing reward=sparse objects=3 seed=0`."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from cavin_pyro.command import command
+
+
+@command("plan")
+def main(config: DictConfig) -> None:
+    """Run one closed-loop episode from depth images and leave a folder with its table, picture and video."""
+    import copy
+
+    from cavin_pyro.files import output_folder, write_json
+    from cavin_pyro.provenance import provenance
+    from cavin_pyro.runs import write_config
+    from cavin_pyro.setups import set_up
+    from cavin_pyro.showing import show_episode
+
+    setup = set_up(copy.deepcopy(config), render=True)
+    folder = output_folder(config.output)
+    write_config(folder, config)
+    row = show_episode(setup, folder, seed=config.seed, video=config.video)
+    setup.env.close()
+    write_json(folder / "results.json", {**row, "provenance": provenance()})
+    print(f"{config.task}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
+    for name in ("steps.csv", "plan.png", *(["episode.mp4"] if config.video else [])):
+        print(f"  {folder / name}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""From the words of `plan` and `evaluate` to an environment, a planner and a PointNet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyro
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from cavin_pyro.building import build_model, construct, pointnet_of
+from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
+from cavin_pyro.errors import UserError, at_least, user_input
+from cavin_pyro.worlds import check_world, object_ranges
+from envs.layouts import Layout, load_layout
+from envs.pushing import PushingEnv
+from envs.tasks import TaskReward
+from envs.workspace import MAXIMUM_OBJECTS
+from models.pointnet import PointNet
+from planning import Planner
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that closed-loop episodes need; env belongs to this process."""
+
+    env: PushingEnv
+    planner: Planner
+    pointnet: PointNet
+    layout: Layout
+
+
+def check_words(config: DictConfig) -> None:
+    """Check what needs no checkpoint and no simulator.
+
+    Raises:
+        UserError: a number or name out of its range.
+    """
+    at_least("seed", config.seed, 0)
+    at_least("maximum_steps", config.maximum_steps, 1)
+    if type(config.objects) is not int or not 1 <= config.objects <= MAXIMUM_OBJECTS:
+        raise UserError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {config.objects}")
+    check_world(config.env)
+
+
+def set_up(config: DictConfig, *, render: bool = False) -> Setup:
+    """Build environment and planner.
+
+    Raises:
+        UserError: unknown task or layout, a checkpoint that cannot be used, a planner that refuses its options.
+    """
+    check_words(config)
+    with user_input():
+        tiles = OmegaConf.to_container(config.tiles)
+        assert isinstance(tiles, dict)
+        layout = load_layout(config.task, config.layout, {str(name): value for name, value in tiles.items()})
+        reward = TaskReward(layout, reward=config.reward, margin=config.margin)
+    planner, pointnet = _planner(config, reward)
+    with user_input():
+        env = PushingEnv(
+            task=config.task,
+            layout=layout,
+            reward=config.reward,
+            objects=config.objects,
+            ranges=object_ranges(config.env),
+            maximum_steps=config.maximum_steps,
+            render_mode="rgb_array" if render else None,
+        )
+        env.reset(seed=config.seed)  # tells at once whether the layout has room for the objects
+    return Setup(env, planner, pointnet, layout)
+
+
+def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]:
+    path = Path(config.checkpoint or default_checkpoint())
+    checkpoint = load_checkpoint(path, trust=list(config.trust))
+    pointnet = pointnet_of(checkpoint, path)
+    if config.planner.pop("model_free"):
+        return construct(config.planner), pointnet
+    if "model" not in checkpoint.config:
+        raise UserError(f"checkpoint {path} holds no model: give one that train has written")
+    known = checkpoint.config["model"].get("maximum_objects", MAXIMUM_OBJECTS)
+    if config.objects > known:
+        raise UserError(f"objects={config.objects}, but checkpoint {path} knows at most {known}: use objects={known}")
+    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
+    model = build_model(checkpoint.config)
+    checkpoint.load_into("model", model, path)
+    model.requires_grad_(False).eval()
+    torch.manual_seed(config.seed)
+    return construct(config.planner, model=model, reward=reward), pointnet

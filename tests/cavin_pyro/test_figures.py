@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+from matplotlib import colors
+from numpy.typing import NDArray
+
+from cavin_pyro import figures, figures_panel
+from cavin_pyro.episodes import Decision, Episode
+from cavin_pyro.figures import draw_plan, draw_reconstructions, draw_training
+from cavin_pyro.figures_overlay import (
+    PREDICTION_COLOR,
+    SUBGOAL_COLOR,
+    candidate_subgoals,
+    predicted_paths,
+    pushes,
+    subgoal_chains,
+    tile_corners,
+    tile_groups,
+)
+from envs.camera import Camera
+from envs.layouts import TASK_NAMES, load_layout
+from envs.workspace import normalised_push, tile_center
+from models.pointnet import PointNetAutoencoder
+from models.state import State
+from planning import Plan, RandomPlanner
+
+CAMERA = Camera().resized(512, 424)
+OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5
+TARGET = (0.50, 0.10)  # metres
+
+
+def seen_centers() -> NDArray[np.float32]:
+    centers = np.zeros((ROOM, 3), dtype=np.float32)
+    centers[:OBJECTS] = [[*TARGET, 0.03], [0.70, -0.30, 0.03], [0.40, 0.40, 0.03]]
+    return centers
+
+
+def state() -> State:
+    centers = torch.from_numpy(seen_centers()[None, :OBJECTS])
+    return State(centers, torch.ones(1, OBJECTS, 64), torch.ones(1, OBJECTS, dtype=torch.bool))
+
+
+def random_plan() -> Plan:
+    return RandomPlanner(T).plan(state(), [torch.Generator().manual_seed(0)])
+
+
+def made_up_plan(segments: int = 2) -> Plan:
+    """The target goes 5 cm along x per segment, the first obstacle goes 5 mm, the other one stays."""
+    start = state().centers
+    along = torch.zeros(K, OBJECTS, 3)
+    along[:, 0, 0] = 0.05 * torch.arange(1, K + 1)
+    along[:, 1, 1] = 0.005
+    subgoals = start + along
+    generator = torch.Generator().manual_seed(1)
+    return random_plan()._replace(
+        effect_codes=torch.zeros(1, K, 16),
+        motion_codes=torch.zeros(1, K, 16),
+        subgoals=State(
+            subgoals[None], torch.ones(1, K, OBJECTS, 64), torch.ones(1, K, OBJECTS, dtype=torch.bool)
+        ),
+        segments=torch.tensor([segments]),
+        predicted_centers=(start + along.repeat_interleave(T, 0))[None],
+        expected_return=torch.tensor([90.0]),
+        candidate_centers=start[:, None, None] + 0.1 * torch.randn(1, N, K, OBJECTS, 3, generator=generator),
+        candidate_returns=torch.linspace(-100, 90, N)[None],
+    )
+
+
+def decision(plan: Plan, *, step: int = 0, photograph: bool = True) -> Decision:
+    picture = np.full((424, 512, 3), 200, dtype=np.uint8) if photograph else None
+    return Decision(step, seen_centers(), np.arange(ROOM) < OBJECTS, plan, 20.0, picture)
+
+
+def episode(*plans: Plan) -> Episode:
+    return Episode(7, "success", [decision(plan, step=T * number) for number, plan in enumerate(plans)])
+
+
+def pixels_like(image: NDArray[np.uint8], color: str) -> int:
+    distance = np.abs(image[..., :3].astype(int) - 255 * np.array(colors.to_rgb(color)))
+    return int((distance.max(axis=-1) < 12).sum())
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_a_plans_figure_shows_subgoals_and_predictions(task: str, tmp_path: Path) -> None:
+    layout = load_layout(task, 0)
+    draw_plan(tmp_path / "plan.png", episode(made_up_plan(), made_up_plan()), layout, CAMERA)
+    image = imageio.imread(tmp_path / "plan.png")
+    assert image.shape[:2] == (round(120 * (0.9 + 2.85)), round(120 * 8.8))
+    assert (image[0, 0, :3] == 255).all()
+    assert pixels_like(image, SUBGOAL_COLOR) > 100
+    assert pixels_like(image, PREDICTION_COLOR) > 10
+
+
+def test_a_plan_that_predicts_nothing_is_drawn_without_subgoals_and_predictions(tmp_path: Path) -> None:
+    draw_plan(tmp_path / "plan.png", episode(random_plan()), load_layout("insertion", 0), CAMERA)
+    image = imageio.imread(tmp_path / "plan.png")
+    assert image.std() > 10
+    assert pixels_like(image, SUBGOAL_COLOR) == pixels_like(image, PREDICTION_COLOR) == 0
+
+
+def test_at_most_six_decisions_are_shown_from_the_first_to_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = []
+    monkeypatch.setattr(
+        figures, "draw_decision", lambda panel, shown_one, *rest: shown.append(shown_one.step)
+    )
+    draw_plan(tmp_path / "plan.png", episode(*[random_plan()] * 20), load_layout("clearing", 0), CAMERA)
+    assert len(shown) == 6
+    assert shown == sorted(shown)
+    assert (shown[0], shown[-1]) == (0, 19 * T)
+
+
+def test_a_figure_needs_no_photograph(tmp_path: Path) -> None:
+    ended = Episode(0, "timeout", [decision(made_up_plan(), photograph=False)])
+    draw_plan(tmp_path / "plan.png", ended, load_layout("crossing", 0), CAMERA)
+    assert pixels_like(imageio.imread(tmp_path / "plan.png"), SUBGOAL_COLOR) > 100
+
+
+def test_an_episode_without_decisions_and_empty_metrics_are_refused_and_leave_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no decision"):
+        draw_plan(tmp_path / "plan.png", Episode(0), load_layout("crossing", 0), CAMERA)
+    with pytest.raises(ValueError, match="no row"):
+        draw_training(tmp_path / "training.png", [])
+    with pytest.raises(ValueError, match="no cloud"):
+        draw_reconstructions(
+            tmp_path / "clouds.png", PointNetAutoencoder(), np.zeros((0, 256, 3), np.float32)
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_legend_names_what_is_drawn_and_nothing_else() -> None:
+    layout = load_layout("crossing", 0)
+    full = [
+        entry.get_label()
+        for entry in figures_panel.legend(layout, [decision(made_up_plan())], candidates=True)
+    ]
+    bare = [
+        entry.get_label()
+        for entry in figures_panel.legend(layout, [decision(random_plan())], candidates=False)
+    ]
+    assert full == ["bridge", "goal", "target", "seen", "candidates", "subgoals", "predicted", "push"]
+    assert bare == ["bridge", "goal", "target", "seen", "push"]
+
+
+@pytest.mark.parametrize("segments", [1, 2, K])
+def test_chains_end_where_the_plan_does_and_leave_out_what_hardly_moves(segments: int) -> None:
+    seen = decision(made_up_plan(segments))
+    (chain,) = subgoal_chains(seen, CAMERA)
+    (path,) = predicted_paths(seen, CAMERA)
+    assert len(chain) == 1 + segments
+    assert len(path) == 1 + segments * T
+    np.testing.assert_allclose(chain[0], CAMERA.project(seen.centers[0]))
+    np.testing.assert_allclose(
+        chain[-1], CAMERA.project(seen.centers[0] + [0.05 * segments, 0.0, 0.0]), atol=1e-3
+    )
+    np.testing.assert_allclose(path[-1], chain[-1], atol=1e-3)
+
+
+def test_predictions_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+    plan = made_up_plan()
+    plan.predicted_centers[:] = torch.nan
+    plan.subgoals.centers[:] = torch.inf
+    plan.candidate_centers[:, :20] = torch.nan
+    plan.candidate_returns[:, 20:30] = -torch.inf
+    seen = decision(plan)
+    assert predicted_paths(seen, CAMERA) == subgoal_chains(seen, CAMERA) == []
+    dots, returns = candidate_subgoals(seen, load_layout("insertion", 0), CAMERA, count=1000)
+    assert len(dots) == len(returns) == 10 * K
+    assert np.isfinite(dots).all()
+    draw_plan(tmp_path / "plan.png", Episode(0, "fall", [seen]), load_layout("insertion", 0), CAMERA)
+
+
+@pytest.mark.parametrize(("task", "objects"), [("clearing", OBJECTS), ("insertion", 1), ("crossing", 1)])
+def test_candidates_are_the_targets_or_in_clearing_everybodys(task: str, objects: int) -> None:
+    seen, layout = decision(made_up_plan()), load_layout(task, 0)
+    every, returns = candidate_subgoals(seen, layout, CAMERA, count=10_000)
+    assert every.shape == (N * K * objects, 2)
+    assert (np.diff(returns) >= 0).all()
+    few, _ = candidate_subgoals(seen, layout, CAMERA, count=50)
+    assert few.shape == (50, 2)
+
+
+def test_arrows_lie_where_the_tool_will_go() -> None:
+    action = normalised_push(np.array([0.5, 0.1]), np.array([0.05, 0.0]))
+    plan = random_plan()._replace(actions=torch.from_numpy(action)[None, None])
+    ((start, end),) = pushes(decision(plan), CAMERA)
+    np.testing.assert_allclose(start, CAMERA.project(np.array([0.5, 0.1, 0.0])))
+    np.testing.assert_allclose(end, CAMERA.project(np.array([0.55, 0.1, 0.0])))
+    assert end[1] < start[1]  # the image's up is +x
+
+
+def test_every_task_draws_its_region_and_the_goal_where_there_is_one() -> None:
+    names = {task: [group.name for group in tile_groups(load_layout(task, 0))] for task in TASK_NAMES}
+    assert names == {
+        "clearing": ["to clear"],
+        "insertion": ["keep out", "goal"],
+        "crossing": ["bridge", "goal"],
+    }
+    corners = tile_corners((1, 2), CAMERA)
+    x, y = tile_center((1, 2))
+    np.testing.assert_allclose(corners.mean(axis=0), CAMERA.project(np.array([x, y, 0.0])))
+    np.testing.assert_allclose(np.ptp(corners, axis=0), 0.15 * CAMERA.focal_length / CAMERA.position[2])
+
+
+@pytest.mark.parametrize("rows", [1, 50])
+def test_training_curves_are_drawn_from_numbers_and_from_words_of_a_csv_file(
+    rows: int, tmp_path: Path
+) -> None:
+    table: list[dict[str, str | float]] = [
+        {
+            "step": str(100 * number),
+            "training_loss": "" if number == 3 else 1000.0 / (1 + number) - 5,
+            "validation_loss": 1000.0 / (1 + number),
+            "validation_kl_effect_code": "nan" if number == 4 else 0.1 * number,
+            "validation_nll_actions": 50.0 - number,
+            "validation_nll_next_centers": -1.0,
+            "learning_rate": 1e-4,
+        }
+        for number in range(rows)
+    ]
+    draw_training(tmp_path / "training.png", table)
+    image = imageio.imread(tmp_path / "training.png")
+    assert image.shape[:2] == (round(120 * 4.2), round(120 * (5.0 + 2 * 2.9)))
+    for color in figures.COLORS.values():
+        assert pixels_like(image, color) > 20
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_reconstructions_show_both_clouds(count: int, tmp_path: Path) -> None:
+    clouds = 0.03 * np.random.default_rng(0).standard_normal((count, 256, 3)).astype(np.float32)
+    draw_reconstructions(tmp_path / "clouds.png", PointNetAutoencoder(), clouds)
+    image = imageio.imread(tmp_path / "clouds.png")
+    assert image.shape[:2] == (round(120 * 4.1), round(120 * (0.8 + 1.6 * count)))
+    assert pixels_like(image, figures.SEEN) > 100
+    assert pixels_like(image, figures.DRAWN) > 100
