@@ -7,6 +7,7 @@ names in `trust`.
 
 from __future__ import annotations
 
+import importlib
 import json
 import sysconfig
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from cavin_pyro.errors import UserError
@@ -24,6 +25,7 @@ from cavin_pyro.files import replacing
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
 OWN_MODULES = ("models", "guides")
+BUILT_SECTIONS = ("model", "prior", "guide")  # of the configuration; the others are read by people only
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def save_checkpoint(
     header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
     header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
     with replacing(path) as temporary:
-        save_file(tensors, temporary, metadata=header)
+        temporary.write_bytes(save(tensors, metadata=header))  # `save_file` would hide what a full disk says
 
 
 def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
@@ -101,7 +103,9 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
     except (KeyError, ValueError) as error:
         raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
-    _check_targets(config, path, (*OWN_MODULES, *trust))
+    if not isinstance(config, dict) or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
+        raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
+    _check_targets([config.get(section) for section in BUILT_SECTIONS], path, trust)
     return Checkpoint(config, provenance, tensors)
 
 
@@ -113,14 +117,27 @@ def default_checkpoint() -> Path:
     return installed if installed.exists() and not checkout.exists() else checkout
 
 
-def _check_targets(config: Any, path: Path, allowed: tuple[str, ...]) -> None:
+def _check_targets(config: Any, path: Path, trust: Sequence[str]) -> None:
     if isinstance(config, dict):
         target = config.get("_target_")
-        if target is not None and str(target).split(".")[0] not in allowed:
+        top = str(target).split(".")[0]
+        if target is not None and top not in trust and not _is_own_class(str(target)):
             raise UserError(
                 f"checkpoint {path} asks to run {target}, which is not part of this program: "
-                f"if you trust that module, pass trust=[{str(target).split('.')[0]}]"
+                f"if you trust that module, pass trust=[{top}]"
             )
         config = list(config.values())
     for entry in config if isinstance(config, list) else ():
-        _check_targets(entry, path, allowed)
+        _check_targets(entry, path, trust)
+
+
+def _is_own_class(target: str) -> bool:
+    """Whether a dotted name is a class of this program; what its modules merely import does not count."""
+    module, _, name = target.rpartition(".")
+    if module.split(".")[0] not in OWN_MODULES:
+        return False
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    return isinstance(found, type) and found.__module__.split(".")[0] in OWN_MODULES

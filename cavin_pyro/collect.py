@@ -11,14 +11,14 @@ from cavin_pyro.command import command
 def main(config: DictConfig) -> None:
     """Collect random pushes by the heuristic policy into a dataset folder; resumes what was interrupted."""
     from cavin_pyro.collection import CollectionSettings, collect, repair
-    from cavin_pyro.errors import UserError, at_least
+    from cavin_pyro.errors import UserError, at_least, check_seed
     from cavin_pyro.files import output_folder
     from cavin_pyro.worlds import check_world, object_ranges
     from envs.workspace import MAXIMUM_OBJECTS
 
     for name in ("transitions", "workers", "steps", "hold", "minimum_objects", "episodes_per_shard"):
         at_least(name, config[name], 1)
-    at_least("seed", config.seed, 0)
+    check_seed(config.seed)
     if not config.minimum_objects <= config.maximum_objects <= MAXIMUM_OBJECTS:
         raise UserError(
             f"maximum_objects must be between minimum_objects={config.minimum_objects} and {MAXIMUM_OBJECTS}, "

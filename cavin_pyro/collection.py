@@ -13,7 +13,7 @@ import numpy as np
 
 from cavin_pyro import __version__
 from cavin_pyro.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
-from cavin_pyro.errors import UserError
+from cavin_pyro.errors import UserError, user_input
 from cavin_pyro.progress import progress_bar
 from envs.objects import WHOLE_TABLE, Area, ObjectRanges
 from envs.policy import HeuristicPushingPolicy
@@ -77,7 +77,8 @@ def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) ->
     """Collect one episode; arrays as in `cavin_pyro.dataset`, without the leading E."""
     scene_generator, policy_generator = np.random.default_rng([settings.seed, episode]).spawn(2)
     count = int(scene_generator.integers(settings.minimum_objects, settings.maximum_objects + 1))
-    seen = scene.draw([_crowd(scene_generator)] * count, settings.ranges, scene_generator)
+    with user_input():
+        seen = scene.draw([_crowd(scene_generator)] * count, settings.ranges, scene_generator)
     policy = HeuristicPushingPolicy(policy_generator, hold=settings.hold)
     arrays = _blank(settings, scene)
     arrays["mask"][:] = seen.mask
@@ -185,7 +186,6 @@ def _begin(settings: CollectionSettings, folder: Path) -> dict[str, Any]:
             "episodes": 0,
             "transitions": 0,
         }
-        _write(folder, metadata)
         return metadata
     try:
         metadata = read_metadata(folder)

@@ -28,7 +28,9 @@ from cavin_pyro.errors import UserError
 CONFIGURATION = "pkg://cavin_pyro.conf"
 PACKAGES = ("models", "guides", "planning", "envs")
 BAD_INPUT = 2  # exit status
-_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG}
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", list: "a list", dict: "a section"}
+_OF_ANY_KIND = {"layout"}  # a number or a path
 
 Body = Callable[[DictConfig], None]
 
@@ -73,8 +75,12 @@ def _stop(line: str, status: int) -> None:
 
 def _run(body: Body, config: DictConfig) -> None:
     check_packages()
-    # Resolved and plain, because Hydra's own interpolations mean nothing in a worker process.
-    body(OmegaConf.create(OmegaConf.to_container(config, resolve=True)))
+    try:
+        # Resolved and plain, because Hydra's own interpolations mean nothing in a worker process.
+        plain = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except OmegaConfBaseException as error:
+        raise UserError(f"a word has no value: {str(error).splitlines()[0]}") from error
+    body(plain)
 
 
 def check_packages() -> None:
@@ -100,13 +106,42 @@ def _check_words(name: str) -> None:
     overrides = [word for word in sys.argv[1:] if not word.startswith("-")]
     with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
         try:
-            hydra.compose(name, overrides=overrides, return_hydra_config=False)
+            config = hydra.compose(name, overrides=overrides, return_hydra_config=True)
+            _check_kinds(_plain(_defaults(name, overrides, config)), _plain(config))
         except MissingConfigException as error:
             raise UserError(_explain_choice(error)) from error
-        except (HydraException, OmegaConfBaseException) as error:
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserError(_explain_override(name, overrides, error)) from error
         finally:
             GlobalHydra.instance().clear()
+
+
+def _defaults(name: str, overrides: list[str], config: DictConfig) -> DictConfig:
+    """The configuration with the parts that the user chose and none of the other words; config tells which are parts."""
+    groups = config.hydra.runtime.choices
+    return hydra.compose(name, overrides=[word for word in overrides if word.partition("=")[0] in groups])
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    plain = OmegaConf.to_container(config, resolve=False)
+    assert isinstance(plain, dict)
+    return {str(name): value for name, value in plain.items()}
+
+
+def _check_kinds(defaults: dict[str, Any], config: dict[str, Any], prefix: str = "") -> None:
+    """Every value must be of its default's kind; whole numbers will do for numbers, and null defaults tell nothing."""
+    for name, default in defaults.items():
+        if name not in config:
+            raise UserError(f"{prefix}{name} cannot be taken away: give it a value as {prefix}{name}=value")
+        value = config[name]
+        kind = _KINDS.get(type(default))
+        interpolated = isinstance(value, str) and value.startswith("${")
+        if kind is None or name in _OF_ANY_KIND or interpolated:
+            continue
+        if type(value) is not type(default) and not (kind == "a number" and type(value) is int):
+            raise UserError(f"{prefix}{name} must be {kind}, not {value}")
+        if isinstance(default, dict):
+            _check_kinds(default, value, f"{prefix}{name}.")
 
 
 def _explain_choice(error: MissingConfigException) -> str:
@@ -116,19 +151,22 @@ def _explain_choice(error: MissingConfigException) -> str:
 
 
 def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
-    known = hydra.compose(name)
+    try:
+        known = _defaults(name, overrides, hydra.compose(name, return_hydra_config=True))
+    except (HydraException, ValueError):
+        known = hydra.compose(name)
     for override in OverridesParser.create().parse_overrides(_parsable(overrides)):
         key = override.key_or_group
         if override.package or key.startswith("hydra") or override.type is not OverrideType.CHANGE or "@" in key:
             continue
         parent, _, last = key.rpartition(".")
-        section: Any = OmegaConf.select(known, parent) if parent else known
-        if not OmegaConf.is_dict(section):
-            return f"unknown override {key!r}: {_valid(parent.rpartition('.')[0], known)}"
-        if last not in section and not last.startswith("_"):
-            close = difflib.get_close_matches(last, [str(word) for word in section], n=1)
-            hint = f"did you mean {close[0]}? " if close else ""
-            return f"unknown override {key!r}: {hint}{_valid(parent, known)}"
+        if last.startswith("_") or last in _words(known, parent):
+            continue
+        close = difflib.get_close_matches(last, _words(known, parent), n=1)
+        while parent and not _words(known, parent):
+            parent = parent.rpartition(".")[0]
+        valid = f"valid{' under ' if parent else ''}{parent} are {', '.join(_words(known, parent))}"
+        return f"unknown override {key!r}: {f'did you mean {close[0]}? ' if close else ''}{valid}"
     first = str(error).splitlines()[0].rstrip(".")
     return f"{first}: write overrides as name=value"
 
@@ -144,7 +182,7 @@ def _parsable(overrides: list[str]) -> list[str]:
     return kept
 
 
-def _valid(parent: str, known: DictConfig) -> str:
-    section: Any = OmegaConf.select(known, parent) if parent else known
-    words = ", ".join(sorted(str(word) for word in section))
-    return f"valid under {parent} are {words}" if parent else f"valid are {words}"
+def _words(known: DictConfig, section: str) -> list[str]:
+    """The words of a section, none if there is no such section."""
+    found: Any = OmegaConf.select(known, section) if section else known
+    return sorted(map(str, found)) if OmegaConf.is_dict(found) else []

@@ -38,11 +38,19 @@ def shard_path(folder: Path, number: int) -> Path:
 
 def write_shard(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write one shard atomically; equal arrays give equal bytes."""
-    with replacing(path) as temporary, h5py.File(temporary, "w", libver="v110") as file:
+    with replacing(path) as temporary:
+        temporary.write_bytes(_shard_bytes(arrays))
+
+
+def _shard_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    # Made in memory, because HDF5 on a full disk ends in errors of its own that cannot be caught in one place.
+    with h5py.File("shard", "w", libver="v110", driver="core", backing_store=False) as file:
         for name in sorted(arrays):
             file.create_dataset(
                 name, data=arrays[name], chunks=True, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
             )
+        file.flush()
+        return file.id.get_file_image()
 
 
 def read_shard(path: Path, names: tuple[str, ...] | None = None) -> Arrays:
@@ -85,7 +93,10 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             f"dataset {folder} has format version {metadata.get('version')}, this program reads {FORMAT_VERSION}: "
             "collect it again"
         )
-    if not metadata.get("shards"):
+    counts = [metadata.get(name) for name in ("shards", "episodes", "transitions")]
+    if not all(type(count) is int for count in counts) or not isinstance(metadata.get("settings"), dict):
+        raise UserError(f"{path} is damaged: it does not tell settings and counts; collect the dataset again")
+    if metadata["shards"] < 1:
         raise UserError(f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}")
     return metadata
 

@@ -30,3 +30,13 @@ def at_least(name: str, value: float, minimum: float) -> None:
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not value >= minimum:
         raise UserError(f"{name} must be at least {minimum:g}, not {value}")
+
+
+def check_seed(seed: int) -> None:
+    """Check a seed, which every generator of random numbers in use must take.
+
+    Raises:
+        UserError: the seed is no whole number from 0 on, or needs more than 32 bits.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise UserError(f"seed must be a whole number from 0 to {2**32 - 1}, not {seed}")

@@ -14,6 +14,7 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.episodes import Episode, run_episode
+from cavin_pyro.files import replacing
 from cavin_pyro.progress import progress_bar
 from cavin_pyro.setups import Setup, set_up
 
@@ -30,10 +31,9 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     rows = _finished(path)
     seeds = [seed for seed in range(config.seed, config.seed + config.episodes) if seed not in rows]
     with progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar:
-        with open(path, "w", encoding="utf-8") as file:
-            for row in rows.values():
-                file.write(json.dumps(row) + "\n")
-            file.flush()
+        with replacing(path) as temporary:
+            temporary.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")
+        with open(path, "a", encoding="utf-8") as file:
             for row in _run(config, seeds):
                 rows[row["seed"]] = row
                 file.write(json.dumps(row) + "\n")

@@ -12,16 +12,22 @@ from typing import Any
 
 from cavin_pyro.errors import UserError
 
+PARTIAL = ".partial"  # in the names of files that are being written
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path`, which takes its place at the end, or vanishes if anything went wrong."""
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{PARTIAL}{path.suffix}")
     try:
         yield temporary
         with open(temporary, "rb") as written:
             os.fsync(written.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)  # a full disk does not say which file it refused
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -47,7 +53,7 @@ def read_json(path: Path) -> Any:
 
 
 def output_folder(path: str | Path) -> Path:
-    """Make a folder to write results into, and make sure that it can be written.
+    """Make a folder to write results into, make sure that it can be written, and clear away what a kill left there.
 
     Raises:
         UserError: the folder cannot be made or written to.
@@ -58,6 +64,8 @@ def output_folder(path: str | Path) -> Path:
         probe = folder / f".probe.{uuid.uuid4().hex[:8]}"
         probe.touch()
         probe.unlink()
+        for abandoned in folder.glob(f".*{PARTIAL}*"):
+            abandoned.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(
             f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"

@@ -14,10 +14,10 @@ def main(config: DictConfig) -> None:
     """Train PointNet to draw a dataset's clouds again, and write it as a checkpoint."""
     import numpy as np
     import torch
-    from hydra.utils import instantiate
 
+    from cavin_pyro.building import check_sizes, construct
     from cavin_pyro.checkpoint import save_checkpoint
-    from cavin_pyro.errors import at_least
+    from cavin_pyro.errors import UserError, at_least, check_seed
     from cavin_pyro.features import sample_clouds
     from cavin_pyro.figures import draw_reconstructions
     from cavin_pyro.files import output_folder, write_json
@@ -25,13 +25,17 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.provenance import provenance
     from cavin_pyro.runs import write_config
 
-    for name in ("clouds", "steps", "batch_size"):
-        at_least(name, config[name], 1)
+    for name, minimum in (("clouds", 2), ("steps", 1), ("batch_size", 1)):
+        at_least(name, config[name], minimum)
+    if not config.learning_rate > 0:
+        raise UserError(f"learning_rate must be a positive number, not {config.learning_rate}")
+    check_seed(config.seed)
+    check_sizes("autoencoder", config.autoencoder)
+    torch.manual_seed(config.seed)
+    autoencoder = construct(config.autoencoder)
     clouds = sample_clouds(Path(config.data), count=config.clouds, generator=np.random.default_rng(config.seed))
     folder = output_folder(config.output)
     settings = write_config(folder, config)
-    torch.manual_seed(config.seed)
-    autoencoder = instantiate(config.autoencoder)
     losses = pretrain(
         autoencoder,
         clouds,

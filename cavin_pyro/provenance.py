@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro import __version__
+from cavin_pyro.checkpoint import load_checkpoint
+from cavin_pyro.dataset import read_metadata
+from cavin_pyro.windows import WindowTable
 
 
 def provenance() -> dict[str, Any]:
@@ -24,6 +27,18 @@ def provenance() -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
         "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def training_provenance(data: Path, pointnet: Path, windows: WindowTable) -> dict[str, Any]:
+    """The same for a trained model: also which data and which PointNet it was trained with."""
+    metadata, trained_before = read_metadata(data), load_checkpoint(pointnet).provenance
+    return {
+        **provenance(),
+        "data": {name: metadata[name] for name in ("transitions", "episodes", "settings", "made_by")},
+        "pointnet": trained_before.get("pointnet", trained_before),
+        "training_windows": len(windows.training),
+        "validation_windows": len(windows.validation),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from cavin_pyro.errors import UserError, at_least
+from cavin_pyro.errors import UserError, at_least, check_seed
 from cavin_pyro.training import SCHEDULES, TrainerSettings
 from cavin_pyro.windows import WindowSettings
 
@@ -18,7 +18,7 @@ def trainer_settings(config: DictConfig) -> TrainerSettings:
     trainer = config.trainer
     for name in ("steps", "batch_size", "validate_every", "validation_windows", "patience"):
         at_least(f"trainer.{name}", trainer[name], 1)
-    at_least("seed", config.seed, 0)
+    check_seed(config.seed)
     for name in ("learning_rate", "clip_norm"):
         if not isinstance(trainer[name], int | float) or not trainer[name] > 0:
             raise UserError(f"trainer.{name} must be a positive number, not {trainer[name]}")

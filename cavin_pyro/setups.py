@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.building import build_model, construct, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
-from cavin_pyro.errors import UserError, at_least, user_input
+from cavin_pyro.errors import UserError, at_least, check_seed, user_input
 from cavin_pyro.worlds import check_world, object_ranges
 from envs.layouts import Layout, load_layout
 from envs.pushing import PushingEnv
@@ -37,7 +37,7 @@ def check_words(config: DictConfig) -> None:
     Raises:
         UserError: a number or name out of its range.
     """
-    at_least("seed", config.seed, 0)
+    check_seed(config.seed)
     at_least("maximum_steps", config.maximum_steps, 1)
     if type(config.objects) is not int or not 1 <= config.objects <= MAXIMUM_OBJECTS:
         raise UserError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {config.objects}")

@@ -15,22 +15,26 @@ def main(config: DictConfig) -> None:
     import pyro
     import torch
 
-    from cavin_pyro.building import build_guide, build_model, construct, load_pointnet
+    from cavin_pyro.building import build_guide, build_model, build_objective, check_fit, load_pointnet
     from cavin_pyro.checkpoint import default_checkpoint, save_checkpoint
     from cavin_pyro.figures import draw_training
     from cavin_pyro.files import output_folder, write_json
-    from cavin_pyro.provenance import provenance
+    from cavin_pyro.provenance import training_provenance
     from cavin_pyro.runs import check_same_run, write_config
     from cavin_pyro.settings import trainer_settings, window_settings
     from cavin_pyro.training import Trainer
     from cavin_pyro.windows import load_windows
+    from envs.workspace import MAXIMUM_OBJECTS
 
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     trainer, window = trainer_settings(config), window_settings(config)
     torch.manual_seed(config.seed)
     model = build_model(config)
     guide = build_guide(config, model)
-    pointnet = load_pointnet(config.pointnet or default_checkpoint())
+    objective = build_objective(config)
+    source = Path(config.pointnet or default_checkpoint())
+    pointnet = load_pointnet(source)
+    check_fit(model, pointnet, MAXIMUM_OBJECTS)
     windows = load_windows(Path(config.data), pointnet, window, skip_corrupt=config.skip_corrupt)
     print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
 
@@ -39,12 +43,12 @@ def main(config: DictConfig) -> None:
     settings = write_config(folder, config)
     parts = {"model": model, "guide": guide, "pointnet": pointnet}
     path = folder / "checkpoint.safetensors"
-    record = {**provenance(), "training_windows": len(windows.training), "validation_windows": len(windows.validation)}
+    record = training_provenance(Path(config.data), source, windows)
 
     def save(step: int, row: dict[str, float]) -> None:
         save_checkpoint(path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row})
 
-    run = Trainer(model, guide, construct(config.objective), windows, trainer, folder, save)
+    run = Trainer(model, guide, objective, windows, trainer, folder, save)
     run.run()
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})

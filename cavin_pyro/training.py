@@ -19,7 +19,7 @@ import torch
 from pyro.infer import ELBO
 from pyro.nn import PyroModule
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 
@@ -139,12 +139,14 @@ class Trainer:
     def _stop_at(self, term: str) -> None:
         kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
         raise UserError(
-            f"training stopped at step {self.step + 1}: the term {term} is not finite; {kept}: "
+            f"training stopped after step {self.step}: the term {term} is not finite; {kept}: "
             "look at the data, or lower trainer.learning_rate"
         )
 
     def _validate(self, training_loss: float, windows_per_second: float, board: SummaryWriter) -> None:
         terms, loss = self._validation_terms()
+        if not math.isfinite(loss):
+            self._stop_at(next((name for name, value in terms.items() if not math.isfinite(value)), "loss"))
         row = {"step": float(self.step), "training_loss": training_loss, "validation_loss": loss}
         row |= {f"validation_{name}": value for name, value in terms.items()}
         row |= {"learning_rate": self.settings.rate(self.step), "windows_per_second": windows_per_second}
@@ -194,7 +196,7 @@ class Trainer:
         for number, entry in self._optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{number}.{name}": value for name, value in entry.items()}
         with replacing(self.resume_path) as temporary:
-            save_file({name: value.contiguous() for name, value in tensors.items()}, temporary)
+            temporary.write_bytes(save({name: value.contiguous() for name, value in tensors.items()}))
 
     def _resume(self) -> None:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -89,8 +90,11 @@ class EpisodeVideo:
             raise ValueError(f"a frame is [H, W, 3] of uint8, not {list(frame.shape)} of {frame.dtype}")
         frame = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
         drawn = self._draw(frame, phase)
-        for _ in range(repeat):
-            self._writer.append_data(drawn)
+        try:
+            for _ in range(repeat):
+                self._writer.append_data(drawn)
+        except OSError as error:  # from imageio, and without a number
+            raise OSError(errno.EIO, "ffmpeg stopped, is the disk full?", str(self.path)) from error
         self._frames += repeat
 
     @contextmanager
@@ -105,9 +109,13 @@ class EpisodeVideo:
                 self._writer = None
             if self._frames == 0:
                 raise ValueError(f"no frame was added to {self.path}: add one, or leave the video out")
-            written, _ = count_frames_and_secs(str(temporary))
+            try:
+                written, _ = count_frames_and_secs(str(temporary))
+            except RuntimeError:  # the file is no video
+                written = 0
             if written != self._frames:  # ffmpeg does not tell when a disk is full at the end
-                raise OSError(f"{self.path} got {written} of {self._frames} frames: is the disk full?")
+                told = f"{written} of {self._frames} frames arrived, is the disk full?"
+                raise OSError(errno.EIO, told, str(self.path))
 
     def _draw(self, frame: NDArray[np.uint8], phase: str) -> NDArray[np.uint8]:
         """The frame [H, W, 3] with overlay and caption."""

@@ -1,4 +1,4 @@
-"""What is real: the table, the objects on it, the robot that pushes them, the camera above, and the three tasks."""
+"""What is real: the table, the objects on it, the robot that pushes, the camera above, the three tasks."""
 
 import gymnasium
 

@@ -1,8 +1,8 @@
 """The overhead depth camera: its geometry, and the way from a depth image back to points on the table.
 
 Pinhole model with square pixels; the optical axis looks straight down unless the pose says otherwise.
-Source: reference.md, "Workspace" (Kinect2, 512 by 424 pixels); here half of each side by default, which shows a
-57 mm cube with about a hundred pixels.
+Source: reference.md, "Workspace" (Kinect2, 512 by 424 pixels); here half of each side by default, which shows
+a 57 mm cube with about a hundred pixels.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ class Camera:
         """The same view with another number of pixels."""
         return Camera(width, height, self.position)
 
-    def points(self, depth: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+    def points(
+        self, depth: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
         """Points in the robot's base frame behind chosen pixels.
 
         Args:
@@ -63,7 +65,9 @@ class Camera:
         return np.stack([column, row], axis=-1)
 
 
-def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+def sample_cloud(
+    points: NDArray[np.float64], count: int, generator: np.random.Generator
+) -> NDArray[np.float64]:
     """Draw `count` of the points [P, 3], without replacement where there are enough.
 
     Raises:

@@ -1,6 +1,7 @@
 """Where a task happens: tiles to clear, avoid or stay on, goal tiles, and the tiles on which objects start.
 
-A layout is a small YAML file (`envs/layouts/` holds the paper's nine); any other file of the same form is a new task.
+A layout is a small YAML file: `envs/layouts/` holds the paper's nine, any other file of that form is a new
+task.
 
     task: crossing            # clearing, insertion or crossing
     region: [[2, 2], [2, 3]]  # clear of objects / no object may enter / the target must stay
@@ -20,14 +21,13 @@ from typing import Any
 
 import yaml
 
-from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, tile_center
+from envs.workspace import TILE_COUNT
 
 TASK_NAMES = ("clearing", "insertion", "crossing")
 BUILTIN_LAYOUTS = (0, 1, 2)
 
 Tile = tuple[int, int]
 _FOLDER = Path(__file__).parent / "layouts"
-_EPSILON = 1e-9  # metres
 
 
 @dataclass(frozen=True)
@@ -56,37 +56,43 @@ def load_layout(task: str, layout: int | str | Path, overrides: Mapping[str, Any
     """
     if task not in TASK_NAMES:
         raise ValueError(f"unknown task {task!r}: choose from {', '.join(TASK_NAMES)}")
-    if str(layout).isdigit():
-        if int(layout) not in BUILTIN_LAYOUTS:
-            raise ValueError(f"unknown layout {layout}: choose 0, 1, 2 or the path of a YAML file")
-        path = _FOLDER / f"{task}_{int(layout)}.yaml"
+    name = str(layout)
+    if name.isdecimal():
+        if int(name) not in BUILTIN_LAYOUTS:
+            raise ValueError(f"unknown layout {name}: choose 0, 1, 2 or the path of a YAML file")
+        path = _FOLDER / f"{task}_{int(name)}.yaml"
     else:
-        path = Path(layout)
+        path = Path(name)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ValueError(f"layout {path} cannot be read ({error.strerror}): give 0, 1, 2 or a YAML file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = error.strerror
+        raise ValueError(f"layout {path} cannot be read ({reason}): give 0, 1, 2 or a YAML file") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"layout {path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ValueError(f"layout {path} must hold the keys {', '.join(TILE_FIELDS)}")
     declared = content.pop("task", task)
+    if declared not in TASK_NAMES:
+        raise ValueError(f"layout {path}: unknown task {declared!r}, choose from {', '.join(TASK_NAMES)}")
     if declared != task:
         raise ValueError(f"layout {path} is for task {declared}: run it with task={declared}")
     content |= {name: tiles for name, tiles in (overrides or {}).items() if tiles is not None}
-    return parse_layout(task, content, where=f"layout {path}" if not overrides else f"layout {path} with overrides")
+    where = f"layout {path} with overrides" if overrides else f"layout {path}"
+    return parse_layout(task, content, where=where)
 
 
 def parse_layout(task: str, content: Mapping[str, Any], *, where: str = "layout") -> Layout:
     """Check tile lists and build a `Layout`.
 
     Raises:
-        ValueError: a key is unknown or missing, a tile is malformed, listed twice, or off the table, or the tiles
-            contradict the task (named in the message).
+        ValueError: a key is unknown or missing, a tile is malformed, listed twice, or off the table, or the
+            tiles contradict the task (named in the message).
     """
-    unknown = sorted(set(content) - set(TILE_FIELDS))
+    unknown = sorted(set(content) - set(TILE_FIELDS), key=str)
     if unknown:
-        raise ValueError(f"{where}: unknown key {unknown[0]!r}, valid keys are task, {', '.join(TILE_FIELDS)}")
+        valid = ", ".join(("task", *TILE_FIELDS))
+        raise ValueError(f"{where}: unknown key {unknown[0]!r}, valid keys are {valid}")
     missing = [name for name in TILE_FIELDS if name not in content and name != "goal"]
     if missing:
         raise ValueError(f"{where}: the key {missing[0]!r} is missing")
@@ -101,16 +107,13 @@ def _parse_tiles(value: Any, where: str) -> tuple[Tile, ...]:
         raise ValueError(f"{where} must be a list of tiles such as [[2, 3], [2, 4]], not {value!r}")
     tiles: list[Tile] = []
     for entry in value:
-        if not (isinstance(entry, list | tuple) and len(entry) == 2 and all(type(index) is int for index in entry)):
+        is_pair = isinstance(entry, list | tuple) and len(entry) == 2
+        if not (is_pair and all(type(index) is int for index in entry)):
             raise ValueError(f"{where}: a tile is two whole numbers such as [2, 3], not {entry!r}")
         tile = (entry[0], entry[1])
-        for axis, coordinate in enumerate(tile_center(tile)):
-            inside = (
-                TABLE_LOW[axis] - _EPSILON <= coordinate - TILE_SIDE / 2
-                and coordinate + TILE_SIDE / 2 <= TABLE_HIGH[axis] + _EPSILON
-            )
-            if not inside:
-                raise ValueError(f"{where}: tile {list(tile)} is off the table, which holds [0, 0] to [4, 6]")
+        if not all(0 <= index < count for index, count in zip(tile, TILE_COUNT, strict=True)):
+            last = [count - 1 for count in TILE_COUNT]
+            raise ValueError(f"{where}: tile {list(tile)} is off the table, which holds [0, 0] to {last}")
         if tile in tiles:
             raise ValueError(f"{where}: tile {list(tile)} is listed twice, tiles must not overlap")
         tiles.append(tile)
@@ -126,7 +129,8 @@ def _check_sense(layout: Layout, where: str) -> None:
             raise ValueError(f"{where}: clearing has no goal tiles, leave goal empty")
         outside = set(layout.target_start) - set(layout.region)
         if outside:
-            raise ValueError(f"{where}: target_start tile {list(min(outside))} is outside the region to clear")
+            tile = list(min(outside))
+            raise ValueError(f"{where}: target_start tile {tile} is outside the region to clear")
         return
     if not layout.goal:
         raise ValueError(f"{where}: {layout.task} needs at least one goal tile")

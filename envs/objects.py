@@ -24,7 +24,8 @@ class ObjectRanges:
 
     Attributes:
         names: shapes to choose from. scale: factor on size. mass: factor on the published mass.
-        friction: Coulomb coefficient against the table. clearance: metres between neighbouring centres at the start.
+        friction: Coulomb coefficient against the table.
+        clearance: metres between neighbouring centres at the start.
     """
 
     names: tuple[str, ...] = BUILTIN_NAMES
@@ -58,7 +59,7 @@ WHOLE_TABLE: Area = (((TABLE_LOW[0] + 0.1, TABLE_LOW[1] + 0.1), (TABLE_HIGH[0] -
 
 
 def _point_in(area: Area, generator: np.random.Generator) -> NDArray[np.float64]:
-    low, high = area[generator.integers(len(area))]
+    low, high = area[int(generator.integers(len(area)))]
     return generator.uniform(low, high)
 
 

@@ -1,7 +1,7 @@
 """The only file that calls PyBullet: bodies, steps, contacts and images of one simulated world.
 
-Bodies are integers. Objects fall, slide and collide. The tool follows a prescribed path: its pose *and* velocity are
-set before every step, so that contacts are solved as with an arm too strong to be slowed.
+Bodies are integers. Objects fall, slide and collide. The tool follows a prescribed path: its pose *and*
+velocity are set before every step, so that contacts are solved as with an arm too strong to be slowed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
 @contextmanager
 def _quiet(descriptor: int) -> Iterator[None]:
-    """Keep what Bullet prints at import and on connecting out of the streams that carry the program's own words."""
+    """Keep what Bullet prints at import and on connecting out of the streams with the program's own words."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = os.dup(descriptor)
@@ -40,7 +40,10 @@ with _quiet(2):
     from pybullet_utils.bullet_client import BulletClient
 
 TIME_STEP = 1.0 / 240.0  # seconds
-SOLVER_ITERATIONS = 20  # per step; 50 move objects to the same places within a millimetre and cost twice the time
+# Per step. Measured over 120 pushes of the policy among 3 to 5 objects: 50 iterations leave 72 % of the
+# objects that move within 1 mm of where 20 leave them, 93 % within 3 mm and all within 9 mm, and take 1.5
+# times as long; 200 iterations agree with 20 about as well (68 %, 90 %, 9 mm).
+SOLVER_ITERATIONS = 20
 GRAVITY = 9.81  # metres per second squared
 TABLE_FRICTION = 1.0  # Bullet multiplies both bodies' coefficients, so the object's own value is what counts
 TOOL_FRICTION = 0.3
@@ -67,7 +70,11 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Poses:
-    """Where bodies are, in truth. positions: [M, 3] metres; orientations: [M, 4] unit quaternions (x, y, z, w)."""
+    """Where bodies are, in truth.
+
+    Attributes:
+        positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
+    """
 
     positions: NDArray[np.float64]
     orientations: NDArray[np.float64]
@@ -76,8 +83,8 @@ class Poses:
 class PhysicsWorld:
     """One PyBullet world in DIRECT mode with a table in it.
 
-    Every `reset` starts from an empty simulation, because Bullet's contact caches would otherwise carry the history
-    of earlier scenes into the next one, and equal seeds would not give equal states.
+    Every `reset` starts from an empty simulation, because Bullet's contact caches would otherwise carry the
+    history of earlier scenes into the next one, and equal seeds would not give equal states.
     """
 
     def __init__(self) -> None:
@@ -96,8 +103,11 @@ class PhysicsWorld:
         bullet.resetSimulation()
         bullet.setGravity(0.0, 0.0, -GRAVITY)
         bullet.setTimeStep(TIME_STEP)
-        bullet.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
-        half = [(high - low) / 2 for low, high in zip(TABLE_LOW, TABLE_HIGH, strict=True)] + [TABLE_THICKNESS / 2]
+        bullet.setPhysicsEngineParameter(
+            numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1
+        )
+        sides = [high - low for low, high in zip(TABLE_LOW, TABLE_HIGH, strict=True)]
+        half = [side / 2 for side in (*sides, TABLE_THICKNESS)]
         table = bullet.createMultiBody(
             baseMass=0.0,
             baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half),
@@ -124,7 +134,8 @@ class PhysicsWorld:
         Args:
             mesh: a Wavefront file, metres, origin at the centre of mass. scale: factor on its size.
             mass: kilograms. friction: Coulomb coefficient against the table.
-            position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w). color: red, green, blue in [0, 1].
+            position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
+            color: red, green, blue in [0, 1].
         """
         bullet, size = self._bullet, [scale] * 3
         body = bullet.createMultiBody(
@@ -179,7 +190,7 @@ class PhysicsWorld:
         return len(self._bullet.getClosestPoints(body, other, 0.0)) > 0
 
     def rest(self, bodies: Sequence[int]) -> None:
-        """Put bodies to sleep where they are: they cost no time and cannot creep until something touches them."""
+        """Put bodies to sleep: they cost no time and do not creep until something touches them."""
         for body in bodies:
             for state in (pybullet.ACTIVATION_STATE_ENABLE_SLEEPING, pybullet.ACTIVATION_STATE_SLEEP):
                 self._bullet.changeDynamics(body, -1, activationState=state)

@@ -23,6 +23,7 @@ CLOUD_CLEARANCE = 0.005  # metres between the tool and every visible point where
 NEAR = 0.01  # metres; margin between the tool and the target object along the push
 CENTRAL_FRACTION = 0.7  # of pushes aim at the middle of the target; the others may just graze it
 CENTRAL = 0.03  # metres between a push's path and the target's centre that count as aiming at its middle
+COMPARED = 8  # passing pushes, at most, of which the one is made that goes farthest after it meets the target
 REDRAWS = 20  # targets and angles tried before a uniformly random push is made instead
 
 
@@ -81,13 +82,28 @@ class HeuristicPushingPolicy:
         central = generator.random() < CENTRAL_FRACTION
         close = clear & (_distance_to_path(center, start, end) <= (CENTRAL if central else extent + reach))
         scene = observation.clouds[observation.mask][:, ::4, :2].reshape(-1, 2)
-        for candidate in np.flatnonzero(close):  # in the order drawn: the first that passes is a fair draw
+        wanted, travels = int(generator.integers(1, COMPARED + 1)), {}
+        for candidate in np.flatnonzero(close):  # in the order drawn: the first that pass are fair draws
             path = start[None, candidate], end[None, candidate]
             touches = _distance_to_path(cloud[:, None], *path).min() <= reach
             safe = np.linalg.norm(scene - start[candidate], axis=-1).min() >= STICK_RADIUS + CLOUD_CLEARANCE
             if touches and safe:
-                return actions[candidate]
-        return None
+                travels[candidate] = _travel_after_contact(cloud, start[candidate], end[candidate])
+            if len(travels) == wanted:
+                break
+        return actions[max(travels, key=travels.__getitem__)] if travels else None
+
+
+def _travel_after_contact(
+    cloud: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> float:
+    """Metres that the tool still goes after it first meets the cloud [P, 2]; 0 if it passes by."""
+    line = end - start
+    length = max(float(np.linalg.norm(line)), 1e-6)
+    along = (cloud - start) @ line / length
+    across = np.abs((cloud - start) @ np.array([-line[1], line[0]]) / length)
+    met = along[(across <= STICK_RADIUS) & (along >= 0.0)]
+    return max(0.0, length - float(met.min())) if len(met) else 0.0
 
 
 def _distance_to_path(

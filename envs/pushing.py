@@ -29,14 +29,16 @@ ObservationDict = dict[str, NDArray[Any]]
 class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """Push objects on a table until a task's goal is reached, seen by a depth camera from above.
 
-    Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is the
-    target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
+    Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is
+    the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
 
-    `info` of a step: `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and `terms`, the named parts
-    of the reward. An episode terminates at success, violation or fall and is truncated after `maximum_steps`.
+    `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and
+    `terms`, the named parts of the reward. An episode terminates at success, violation or fall, and is
+    truncated after `maximum_steps`.
 
     Args:
-        task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout.
+        task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout. A `Layout`
+            is taken as it is, and its task counts.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
         maximum_steps: pushes per episode.
 
@@ -59,19 +61,24 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         camera: Camera | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not 1 <= objects <= MAXIMUM_OBJECTS:
-            raise ValueError(f"objects must be 1 to {MAXIMUM_OBJECTS}, not {objects}")
+        if objects not in range(1, MAXIMUM_OBJECTS + 1):
+            raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
         if maximum_steps < 1:
             raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        if isinstance(layout, Layout) and tiles:
+            raise ValueError(
+                "tiles replace fields of a layout that is read: give its number or path, or no tiles"
+            )
         self.layout = layout if isinstance(layout, Layout) else load_layout(task, layout, tiles)
         self.reward = TaskReward(self.layout, reward=reward)
-        self.objects, self.maximum_steps, self.render_mode = objects, maximum_steps, render_mode
+        self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.ranges = ranges or ObjectRanges()
         self.scene = Scene(camera=camera)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
-        self.observation_space = gymnasium.spaces.Dict(
+        # Gymnasium declares that a Dict space's elements are spaces.
+        self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
             {
                 "clouds": gymnasium.spaces.Box(-10.0, 10.0, shape, np.float32),
                 "centers": gymnasium.spaces.Box(-10.0, 10.0, (MAXIMUM_OBJECTS, 3), np.float32),
@@ -100,9 +107,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self._steps = 0
         return _as_dict(self._seen), {"steps": 0}
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Push, wait until the objects rest, look, and judge.
 
         Raises:
@@ -137,7 +142,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         truncated = not terminated and self._steps >= self.maximum_steps
         return _as_dict(seen), sum(terms.values()), terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """A colour image of the table [424, 512, 3] in mode rgb_array."""
         if self.render_mode != "rgb_array":
             return None
@@ -163,8 +168,8 @@ def _areas(tiles: tuple[Tile, ...], jitter: float) -> Area:
 
 def _as_dict(seen: Observation) -> ObservationDict:
     return {
-        "clouds": seen.clouds,
-        "centers": seen.centers,
+        "clouds": seen.clouds.copy(),  # what a caller does to them must not change the next step's reward
+        "centers": seen.centers.copy(),
         "mask": seen.mask.astype(np.int8),
         "visible": seen.visible.astype(np.int8),
     }

@@ -6,6 +6,7 @@ Source: paper section 4.1 (position control, straight pushes) and reference.md, 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,8 @@ FrameHook = Callable[[], None]
 class StickRobot:
     """The tool alone, moved kinematically: the fast robot.
 
-    Its speed follows half a period of a cosine, so that objects, whose friction can brake harder than the tool does,
-    stop when the tool stops.
+    Its speed follows half a period of a sine, so that objects, whose friction can brake harder than the tool
+    does, stop when the tool stops.
     """
 
     def __init__(self, world: PhysicsWorld) -> None:
@@ -61,7 +62,7 @@ class StickRobot:
         if safe:
             phase = np.linspace(0.0, np.pi, PUSH_STEPS + 1)
             travelled = (1.0 - np.cos(phase)) / 2.0
-            for number, (now, then) in enumerate(zip(travelled[:-1], travelled[1:], strict=True)):
+            for number, (now, then) in enumerate(pairwise(travelled)):
                 position = start + now * (end - start)
                 velocity = (then - now) / TIME_STEP * (end - start)
                 world.place(self._tool, (*position, height), (*velocity, 0.0))
@@ -72,7 +73,7 @@ class StickRobot:
         return safe
 
     def settle(self, objects: Sequence[int], *, limit: int = 240) -> None:
-        """Wait off stage until the objects rest, at most `limit` physics steps, and let them sleep if they do."""
+        """Wait off stage until the objects rest, at most `limit` physics steps; let them sleep if they do."""
         for number in range(limit):
             self._world.place(self._tool, OFF_STAGE, (0.0, 0.0, 0.0))
             self._world.step()

@@ -43,8 +43,8 @@ class Observation:
 
     Attributes:
         clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of each cloud.
-        mask: [M] bool, True for objects seen at least once. visible: [M] bool, True for objects in this image; an
-            object hidden in this image keeps the cloud last seen.
+        mask: [M] bool, True for objects seen at least once.
+        visible: [M] bool, True for objects in this image; an object hidden in it keeps the cloud last seen.
     """
 
     clouds: NDArray[np.float32]
@@ -118,7 +118,8 @@ class Scene:
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
         raise ValueError(
-            f"no room for {len(areas)} objects: none of {DRAWS} scenes drawn on the layout's start tiles could be used"
+            f"no room for {len(areas)} objects: none of {DRAWS} scenes drawn on the layout's start tiles "
+            "could be used"
         )
 
     def reset(self, objects: Sequence[ObjectParameters], point_generator: np.random.Generator) -> Observation:

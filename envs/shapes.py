@@ -1,6 +1,7 @@
-"""The ten builtin objects: the paper's YCB subset rebuilt from convex parts at the published sizes and masses.
+"""The ten builtin objects: the paper's YCB subset rebuilt from convex parts at published sizes and masses.
 
-A shape is a tuple of convex parts; the same parts serve collision and the camera, so what is pushed is what is seen.
+A shape is a tuple of convex parts; the same parts serve collision and the camera, so what is pushed is what
+is seen. Round things are prisms whose corners lie on the published circle.
 Sizes and masses: YCB Object and Model Set (Calli et al. 2015).
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -51,15 +53,15 @@ def _hull(points: NDArray[np.float64] | list[list[float]]) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull(np.asarray(points, dtype=np.float64))
 
 
-def _ring(radius: float, z: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ring(radius: float, z: float, angles: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full_like(angles, z)], axis=1)
 
 
 def _lathed(bottom: float, top: float, height: float) -> list[trimesh.Trimesh]:
-    """A hollow vessel open at the top (diameters in metres): a floor, and the wall as one convex stave per side.
+    """A hollow vessel open at the top (diameters in metres): a floor, and a wall of one convex stave a side.
 
-    The staves end on the floor instead of beside it, so that only the floor touches the table: each part that touches
-    adds contacts to solve.
+    The staves end on the floor instead of beside it, so that only the floor touches the table: each part
+    that touches adds contacts to solve.
     """
     turns = np.linspace(0.0, 2.0 * np.pi, STAVES + 1)
     floor = _hull(np.vstack([_ring(bottom / 2, z, turns[:-1]) for z in (0.0, WALL)]))
@@ -88,18 +90,20 @@ def _mug(diameter: float, height: float) -> list[trimesh.Trimesh]:
 
 
 def _banana(thickness: float, length: float) -> list[trimesh.Trimesh]:
-    """A tapered tube bent by 100 degrees, lying flat; each part is the hull of two neighbouring cross-sections."""
+    """A tapered tube bent by 100 degrees, lying flat; each part is the hull of two neighbouring sections."""
     bend, cuts = np.radians(100.0), 7
-    bow = length / (2.0 * np.sin(bend / 2))  # metres; the radius whose chord is the banana's length
+    bow = length / (2.0 * np.sin(bend / 2))  # metres; the radius whose chord, from end to end, is `length`
     around = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
     sections = []
     for angle in np.linspace(-bend / 2, bend / 2, cuts):
         radius = thickness / 2 * (1.0 - 0.6 * (abs(angle) / (bend / 2)) ** 3)
         distance = bow + radius * np.cos(around)
         sections.append(
-            np.stack([distance * np.sin(angle), distance * np.cos(angle) - bow, radius * np.sin(around)], axis=1)
+            np.stack(
+                [distance * np.sin(angle), distance * np.cos(angle) - bow, radius * np.sin(around)], axis=1
+            )
         )
-    return [_hull(np.vstack(pair)) for pair in zip(sections[:-1], sections[1:], strict=True)]
+    return [_hull(np.vstack(pair)) for pair in pairwise(sections)]
 
 
 _RECIPES = {  # metres and kilograms
@@ -138,7 +142,7 @@ def builtin_shape(name: str) -> Shape:
 def write_mesh(shape: Shape, folder: Path) -> Path:
     """Write the shape as one Wavefront file, a group per convex part, and return its path.
 
-    Every triangle keeps corners of its own, so that a renderer shades it flat; a file that is already there is kept.
+    Every triangle keeps corners of its own, so that a renderer shades it flat; a file already there is kept.
     """
     path = folder / f"{shape.name}.obj"
     if not path.exists():

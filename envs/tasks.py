@@ -1,7 +1,8 @@
 """What a task rewards: one implementation for the real environment and for imagined states.
 
-Pure functions on tensors with any leading dimensions, written from the paper's section 4.1 and its appendix "Task
-Details": +100 at the goal, -100 for a violation, -1 per step, and for dense rewards the target's progress in metres.
+Pure functions on tensors with any leading dimensions, written from the paper's section 4.1 and its appendix
+"Task Details": +100 at the goal, -100 for a violation, -1 per step, and for dense rewards the target's
+progress in metres.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ class Outcome(NamedTuple):
     """What one step of a task came to; every field is [...].
 
     Attributes:
-        progress: metres towards the goal, the dense term. success, violation, fall: bool, at most one is true.
-        reward: the sum of the terms.
+        reward: the sum of the terms. progress: metres towards the goal, the dense term.
+        success, violation, fall: bool, at most one is true.
     """
 
     reward: Tensor
@@ -45,8 +46,9 @@ class TaskReward:
 
     Args:
         layout: tiles and task. reward: dense or sparse.
-        margin: metres by which to be stricter than the task itself, for those who plan under uncertainty: goals
-            shrink and forbidden places grow. An object that starts within the margin may stay, not go further out.
+        margin: metres by which to be stricter than the task itself, for those who plan under uncertainty:
+            goals shrink and forbidden places grow. An object that starts within the margin may stay there,
+            but come no closer to what is forbidden.
 
     Raises:
         ValueError: unknown kind of reward, or a negative margin.
@@ -93,8 +95,9 @@ class TaskReward:
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the metres still to go, whose change is the dense term: [...].
 
-        Insertion and crossing: the target's distance to the goal's nearest tile centre. Clearing has virtual goals at
-        the table's edges: the sum, over objects still in the region, of their distance to the nearest edge.
+        Insertion and crossing: the target's distance to the goal's nearest tile centre. Clearing has virtual
+        goals at the table's edges: the sum, over objects still in the region, of their distance to the
+        nearest edge.
 
         Args:
             positions: [..., M, 2] metres. mask: [..., M] bool.
@@ -103,10 +106,10 @@ class TaskReward:
             centers = self._goal.centers.to(positions)
             return -(positions[..., 0, None, :] - centers).norm(dim=-1).amin(dim=-1)
         remaining = self._region.contains(positions) & mask
-        return -(table_distance(positions) * remaining).sum(dim=-1)
+        return -torch.where(remaining, table_distance(positions), 0.0).sum(dim=-1)
 
     def _entered(self, before: Tensor, after: Tensor) -> Tensor:
-        """Whether a signed distance (positive is forbidden) is forbidden now, or comes closer within the margin."""
+        """Whether a depth in metres (positive is forbidden) is forbidden now, or grows within the margin."""
         return (after > 0.0) | ((after > -self.margin) & (after > before))
 
     def _arrived(self, target: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,23 +21,33 @@ class TileSet:
 
     def __init__(self, tiles: Iterable[Tile]) -> None:
         self.tiles = tuple(tiles)
-        centers = torch.tensor([tile_center(tile) for tile in self.tiles]).reshape(-1, 2)
-        self.centers = centers
-        self._low, self._high = centers - TILE_SIDE / 2, centers + TILE_SIDE / 2
-        edges = torch.tensor(_outline(set(self.tiles))).reshape(-1, 2, 2)
+        self.centers = _tensor([tile_center(tile) for tile in self.tiles]).reshape(-1, 2)
+        # Neighbours compute their common border from the same half index, so that rounding leaves no gap.
+        self._low = _tensor([tile_center((i - 0.5, j - 0.5)) for i, j in self.tiles]).reshape(-1, 2)
+        self._high = _tensor([tile_center((i + 0.5, j + 0.5)) for i, j in self.tiles]).reshape(-1, 2)
+        edges = _tensor(_outline(set(self.tiles))).reshape(-1, 2, 2)
         self._edge_low, self._edge_high = edges[:, 0], edges[:, 1]
 
     def contains(self, points: Tensor) -> Tensor:
         """Whether points [..., 2] metres lie in the union, its border included: [...] bool."""
-        point = points[..., None, :]
-        return ((point >= self._low.to(points)) & (point <= self._high.to(points))).all(dim=-1).any(dim=-1)
+        x, y = points[..., :1], points[..., 1:]
+        (low_x, low_y), (high_x, high_y) = self._low.to(points).T, self._high.to(points).T
+        return ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)).any(dim=-1)
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Metres from points [..., 2] to the union's outline, negative inside: [...]."""
-        point = points[..., None, :]
-        nearest = torch.clamp(point, self._edge_low.to(points), self._edge_high.to(points))
-        distance = (point - nearest).square().sum(dim=-1).amin(dim=-1).sqrt()
+        # One axis at a time: edges innermost is several times faster than axes innermost.
+        squared = torch.zeros(()).to(points)
+        for axis in (0, 1):
+            coordinate = points[..., axis, None]
+            low, high = self._edge_low[:, axis].to(points), self._edge_high[:, axis].to(points)
+            squared = squared + (coordinate - torch.clamp(coordinate, low, high)).square()
+        distance = squared.amin(dim=-1).sqrt()
         return torch.where(self.contains(points), -distance, distance)
+
+
+def _tensor(numbers: Sequence[Any]) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
 
 
 def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:

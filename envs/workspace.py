@@ -20,20 +20,21 @@ MAXIMUM_MOTION = 0.1  # metres per push, on each axis
 
 TILE_SIDE = 0.15  # metres
 TILE_ORIGIN = (0.295, -0.485)  # metres; the centre of tile (0, 0)
+TILE_COUNT = (5, 7)  # whole tiles on the table along x and y
 
 MAXIMUM_OBJECTS = 5
 POINTS_PER_OBJECT = 256
 
 
-def tile_center(tile: tuple[int, int]) -> tuple[float, float]:
-    """Planar centre (x, y) in metres of tile (i, j)."""
+def tile_center(tile: tuple[float, float]) -> tuple[float, float]:
+    """Planar centre (x, y) in metres of tile (i, j); half a tile further lies the border to its neighbour."""
     return TILE_ORIGIN[0] + TILE_SIDE * tile[0], TILE_ORIGIN[1] + TILE_SIDE * tile[1]
 
 
 def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where the tool starts and stops for a normalised push.
 
-    The start is scaled onto the reachable box, the motion by `MAXIMUM_MOTION`, and the end is clipped to the box.
+    The start is scaled onto the reachable box, the motion by `MAXIMUM_MOTION`, the end is clipped to the box.
 
     Args:
         action: [..., 4] (x, y, dx, dy), clipped to [-1, 1].
@@ -49,7 +50,7 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
 
 
 def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The action [..., 4] whose push starts at `start` [..., 2] metres and moves by `motion` [..., 2] metres."""
+    """The action [..., 4] that starts at `start` [..., 2] metres and moves by `motion` [..., 2] metres."""
     low, high = np.array(REACH_LOW), np.array(REACH_HIGH)
     position = 2.0 * (np.asarray(start, dtype=np.float64) - low) / (high - low) - 1.0
     return np.concatenate([position, np.asarray(motion, dtype=np.float64) / MAXIMUM_MOTION], axis=-1)

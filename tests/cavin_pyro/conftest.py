@@ -1,0 +1,173 @@
+"""Small products of the commands, made once per test process, and ways to run the commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pyro
+import pytest
+import torch
+
+from cavin_pyro.checkpoint import save_checkpoint
+from cavin_pyro.collection import CollectionSettings, collect
+from guides.cascaded import CascadedGuide
+from models.cascaded import CascadedModel
+from models.pointnet import PointNet
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+PUSHES = CollectionSettings(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
+
+# Each case in turn, in one process: a start costs seconds, the case itself milliseconds.
+RUN_IN_TURN = """
+import contextlib, importlib, io, json, os, sys, traceback
+
+answers = []
+for case in json.load(sys.stdin):
+    output, errors, status = io.StringIO(), io.StringIO(), 0
+    os.makedirs(case["folder"], exist_ok=True)
+    os.chdir(case["folder"])
+    sys.argv = [case["command"], *case["words"]]
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        try:
+            importlib.import_module("cavin_pyro." + case["command"]).main()
+        except SystemExit as stop:
+            status = stop.code
+        except BaseException:
+            status = 1
+            traceback.print_exc()
+    answers.append({"status": status, "output": output.getvalue(), "errors": errors.getvalue()})
+print(json.dumps(answers))
+"""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How a command ended."""
+
+    status: int
+    output: str
+    errors: str
+
+    @property
+    def complaints(self) -> list[str]:
+        """The lines on stderr, apart from progress bars."""
+        lines = self.errors.replace("\r", "\n").split("\n")
+        return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+%\|", line)]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command to be run in a folder of its own."""
+
+    command: str
+    words: Sequence[str]
+
+
+def start_command(command: str, *words: str, folder: Path, quiet: bool = False) -> subprocess.Popen[str]:
+    """Begin a command as a user does, from the folder; `quiet` for those that are to be killed."""
+    pipe = subprocess.DEVNULL if quiet else subprocess.PIPE
+    line = [sys.executable, "-m", f"cavin_pyro.{command}", *words]
+    return subprocess.Popen(line, cwd=folder, env=ENVIRONMENT, stdout=pipe, stderr=pipe, text=True)
+
+
+def run_command(command: str, *words: str, folder: Path) -> Answer:
+    """Run a command as a user does, from the folder."""
+    with start_command(command, *words, folder=folder) as process:
+        output, errors = process.communicate(timeout=300)
+    return Answer(process.returncode, output, errors)
+
+
+def run_in_turn(cases: Mapping[str, Case], folder: Path) -> dict[str, Answer]:
+    """Run many commands in one process, each from `folder / its name`."""
+    jobs = [
+        {"command": case.command, "words": list(case.words), "folder": str(folder / name)}
+        for name, case in cases.items()
+    ]
+    line = [sys.executable, "-c", RUN_IN_TURN]
+    done = subprocess.run(line, env=ENVIRONMENT, input=json.dumps(jobs), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    answers: list[dict[str, Any]] = json.loads(done.stdout.splitlines()[-1])
+    return {name: Answer(**answer) for name, answer in zip(cases, answers, strict=True)}
+
+
+def small_parts(seed: int = 0) -> dict[str, torch.nn.Module]:
+    """An untrained cascade of width 8."""
+    torch.manual_seed(seed)
+    model = CascadedModel(effect_dimension=4, motion_dimension=4, width=8)
+    return {"model": model, "guide": CascadedGuide(model, width=8), "pointnet": PointNet()}
+
+
+def small_config() -> dict[str, Any]:
+    """How to build `small_parts` again."""
+    sizes = {"effect_dimension": 4, "motion_dimension": 4, "width": 8, "maximum_objects": 5}
+    return {
+        "model": {"_target_": "models.cascaded.CascadedModel", "segment_length": 3, **sizes},
+        "guide": {"_target_": "guides.cascaded.CascadedGuide", "width": 8},
+        "prior": {"_target_": "models.priors.StandardPrior"},
+    }
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, by its name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="session")
+def shell() -> SimpleNamespace:
+    """Ways to run the commands."""
+    names: list[Callable] = [Case, contents, run_command, run_in_turn, start_command]
+    return SimpleNamespace(**{name.__name__: name for name in names})
+
+
+@pytest.fixture(scope="session")
+def small() -> SimpleNamespace:
+    """Small things to try."""
+    return SimpleNamespace(config=small_config, parts=small_parts, pushes=PUSHES)
+
+
+@pytest.fixture(autouse=True)
+def clean_pyro() -> Iterator[None]:
+    pyro.clear_param_store()
+    torch.manual_seed(0)
+    # Setting up an episode changes the other two as well, which must not outlive the test.
+    kept = {name: pyro.settings.get(name) for name in ("validate_distributions_pyro", "validate_distributions_torch")}
+    with pyro.settings.context(module_local_params=True, **kept):
+        yield
+    pyro.clear_param_store()
+
+
+@pytest.fixture(scope="session")
+def pushes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of 12 episodes in 3 shards, to be read only."""
+    folder = tmp_path_factory.mktemp("data") / "pushes"
+    folder.mkdir()
+    metadata = collect(PUSHES, folder, transitions=60, workers=1)
+    assert metadata["shards"] == 3
+    return folder
+
+
+@pytest.fixture
+def own_pushes(pushes: Path, tmp_path: Path) -> Path:
+    """A copy of the dataset, to be spoilt."""
+    return shutil.copytree(pushes, tmp_path / "pushes")
+
+
+@pytest.fixture(scope="session")
+def checkpoint_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint as train writes it, of an untrained and very small cascade; to be read only."""
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
+    with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
+        save_checkpoint(path, parts=small_parts(), config=small_config(), provenance={"step": 0})
+    return path

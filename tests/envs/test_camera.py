@@ -1,0 +1,103 @@
+"""The overhead camera: geometry alone, and through the renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.camera import Camera, sample_cloud
+from envs.physics import Rendering
+from envs.scene import Scene
+from envs.segmentation import segment_by_mask
+
+PIXEL = 0.0053  # metres on an object's top; what one pixel of the default camera shows
+
+
+@settings(deadline=None)
+@given(
+    row=st.integers(0, 211),
+    column=st.integers(0, 255),
+    distance=st.floats(0.3, 2.0),
+    position=st.tuples(st.floats(0.4, 0.8), st.floats(-0.2, 0.2), st.floats(0.7, 1.5)),
+)
+def test_projecting_a_point_finds_the_middle_of_its_pixel(
+    row: int, column: int, distance: float, position: tuple[float, float, float]
+) -> None:
+    camera = Camera(position=position)
+    depth = np.full((camera.height, camera.width), distance)
+    point = camera.points(depth, np.array([row]), np.array([column]))
+    assert point.shape == (1, 3)
+    assert point[0, 2] == pytest.approx(position[2] - distance)
+    np.testing.assert_allclose(camera.project(point), [[column + 0.5, row + 0.5]], atol=1e-6)
+
+
+def test_the_images_up_is_x_and_its_left_is_y() -> None:
+    camera = Camera()
+    middle, up, left = camera.project(np.array([[0.6, 0.0, 0.0], [0.7, 0.0, 0.0], [0.6, 0.1, 0.0]]))
+    np.testing.assert_allclose(middle, [camera.width / 2, camera.height / 2])
+    assert up[1] < middle[1] and up[0] == middle[0]
+    assert left[0] < middle[0] and left[1] == middle[1]
+
+
+def test_a_resized_camera_sees_the_same_in_more_pixels() -> None:
+    camera = Camera(position=(0.5, 0.1, 0.9))
+    points = np.random.default_rng(0).uniform([0.3, -0.5, 0.0], [0.9, 0.5, 0.2], size=(20, 3))
+    larger = camera.resized(2 * camera.width, 2 * camera.height)
+    np.testing.assert_allclose(larger.project(points), 2 * camera.project(points))
+
+
+def test_the_whole_table_is_in_view() -> None:
+    camera = Camera()
+    corners = camera.project(np.array([[x, y, 0.0] for x in (0.22, 0.98) for y in (-0.61, 0.61)]))
+    assert (corners >= 0).all() and (corners <= [camera.width, camera.height]).all()
+
+
+def test_the_bare_table_lies_at_height_zero(scene: Scene, put: Callable) -> None:
+    scene.reset([put("rubiks_cube", 0.6, 0.4)], np.random.default_rng(0))
+    rendering = scene.world.render(scene.camera)
+    assert rendering.depth.shape == rendering.bodies.shape == (212, 256)
+    rows, columns = np.mgrid[60:150:10, 100:160:10].reshape(2, -1)
+    points = scene.camera.points(rendering.depth, rows, columns)
+    np.testing.assert_allclose(points[:, 2], 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["gelatin_box", "rubiks_cube", "sugar_box"])
+def test_the_cloud_of_a_box_right_under_the_camera_is_centred_on_it(
+    scene: Scene, put: Callable, name: str
+) -> None:
+    seen = scene.reset([put(name, 0.6, 0.0)], np.random.default_rng(0))
+    truth = scene.ground_truth().positions[0]
+    # The renderer samples a pixel at its corner, so points lie half a pixel too far along +x and -y; the rest
+    # is the noise of 256 points.
+    np.testing.assert_allclose(seen.centers[0, :2], truth[:2], atol=PIXEL)
+    assert abs(np.median(seen.clouds[0, :, 2]) - 2 * truth[2]) < 0.002  # the top of the box
+
+
+@settings(deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_a_cloud_repeats_points_only_where_there_are_too_few(present: int, count: int, seed: int) -> None:
+    points = np.arange(3.0 * present).reshape(present, 3)
+    cloud = sample_cloud(points, count, np.random.default_rng(seed))
+    assert cloud.shape == (count, 3)
+    assert {tuple(point) for point in cloud} <= {tuple(point) for point in points}
+    if present >= count:
+        assert len({tuple(point) for point in cloud}) == count
+
+
+def test_a_cloud_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="the object is not visible"):
+        sample_cloud(np.zeros((0, 3)), 4, np.random.default_rng(0))
+
+
+def test_the_mask_gives_each_body_its_own_pixels_in_the_order_asked_for() -> None:
+    bodies = np.array([[0, 0, 2], [1, 2, 2], [-1, -1, 0]])
+    blank = np.zeros((3, 3))
+    rendering = Rendering(blank, bodies, np.zeros((3, 3, 3), np.uint8))
+    two, seven, one = segment_by_mask(rendering, [2, 7, 1])
+    assert list(zip(*two, strict=True)) == [(0, 2), (1, 1), (1, 2)]
+    assert len(seven[0]) == 0
+    assert list(zip(*one, strict=True)) == [(1, 0)]

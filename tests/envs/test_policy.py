@@ -1,0 +1,140 @@
+"""The heuristic pushing policy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.objects import Area, ObjectRanges
+from envs.policy import NEAR, NOISE, SPREAD, START_CLEARANCE, HeuristicPushingPolicy
+from envs.robots import STICK_RADIUS
+from envs.scene import Observation, Scene
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
+
+SEEDS = st.integers(0, 2**32 - 1)
+REACHABLE: Area = (((0.40, -0.40), (0.70, 0.40)),)
+
+
+def blobs(seed: int, count: int = 3) -> Observation:
+    """Discs of 3 cm radius within reach, with room between them: what a camera could see."""
+    generator = np.random.default_rng(seed)
+    places = [(x, y) for x in (0.42, 0.60) for y in (-0.40, -0.15, 0.10, 0.35)]
+    clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float32)
+    for slot, place in enumerate(generator.permutation(places)[:count]):
+        angle, radius = (
+            generator.uniform(0, 2 * np.pi, POINTS_PER_OBJECT),
+            0.03 * generator.random(POINTS_PER_OBJECT),
+        )
+        clouds[slot, :, 0] = place[0] + radius * np.cos(angle)
+        clouds[slot, :, 1] = place[1] + radius * np.sin(angle)
+        clouds[slot, :, 2] = 0.03
+    mask = np.arange(MAXIMUM_OBJECTS) < count
+    return Observation(clouds, clouds.mean(axis=1), mask, mask)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=SEEDS, count=st.integers(1, MAXIMUM_OBJECTS))
+def test_pushes_start_clear_of_every_object(seed: int, count: int) -> None:
+    seen = blobs(seed, count)
+    policy = HeuristicPushingPolicy(np.random.default_rng(seed))
+    for _ in range(6):
+        action = policy.act(seen)
+        assert action.shape == (4,) and (np.abs(action) <= 1).all()
+        start, _ = push_endpoints(action)
+        assert np.linalg.norm(seen.centers[:count, :2] - start, axis=1).min() >= START_CLEARANCE == 0.05
+        assert np.linalg.norm(seen.clouds[:count, ::4, :2] - start, axis=-1).min() >= STICK_RADIUS
+
+
+@settings(deadline=None, max_examples=30)
+@given(SEEDS)
+def test_pushes_point_within_45_degrees_of_the_held_angle_but_for_noise(seed: int) -> None:
+    assert np.degrees(SPREAD) == pytest.approx(45) and NOISE == 0.3
+    policy = HeuristicPushingPolicy(np.random.default_rng(seed))
+    for _ in range(6):
+        action = policy.act(blobs(seed))
+        cone = policy.intent.angle + np.linspace(-SPREAD, SPREAD, 2001)
+        directions = np.stack([np.cos(cone), np.sin(cone)], axis=1)
+        assert np.abs(action[2:] - directions).max(axis=1).min() <= NOISE + 0.001
+
+
+def test_pushes_use_the_whole_spread_of_directions() -> None:
+    policy = HeuristicPushingPolicy(np.random.default_rng(0), hold=10_000)
+    seen = blobs(0, 1)
+    actions = np.array([policy.act(seen) for _ in range(150)])
+    turns = np.arctan2(actions[:, 3], actions[:, 2]) - policy.intent.angle
+    turns = (turns + np.pi) % (2 * np.pi) - np.pi
+    assert turns.min() < -0.6 and turns.max() > 0.6
+    assert np.abs(turns).max() < SPREAD + np.arcsin(NOISE * np.sqrt(2))
+
+
+@settings(deadline=None, max_examples=30)
+@given(SEEDS)
+def test_pushes_bring_the_tool_near_their_target(seed: int) -> None:
+    policy = HeuristicPushingPolicy(np.random.default_rng(seed))
+    seen = blobs(seed)
+    for _ in range(6):
+        start, end = push_endpoints(policy.act(seen))
+        path = start + np.linspace(0, 1, 200)[:, None] * (end - start)
+        cloud = seen.clouds[policy.intent.target, :, :2]
+        assert np.linalg.norm(cloud[:, None] - path, axis=-1).min() <= STICK_RADIUS + NEAR + 0.001
+
+
+@pytest.mark.parametrize("hold", [1, 3, 5])
+def test_target_and_angle_are_held_for_as_many_pushes_as_asked(hold: int) -> None:
+    policy = HeuristicPushingPolicy(np.random.default_rng(0), hold=hold)
+    seen, intents = blobs(1), []
+    for _ in range(6 * hold):
+        policy.act(seen)
+        intents.append((policy.intent.target, policy.intent.angle))
+    runs = [set(intents[first : first + hold]) for first in range(0, len(intents), hold)]
+    assert all(len(run) == 1 for run in runs)
+    assert len(set.union(*runs)) == 6
+    assert len({target for target, _ in intents}) > 1
+
+
+def test_only_known_objects_are_targets() -> None:
+    seen = blobs(2, 4)
+    mask = np.array([False, True, False, True, False])
+    seen = Observation(seen.clouds, seen.centers, mask, mask)
+    policy, targets = HeuristicPushingPolicy(np.random.default_rng(0), hold=1), set()
+    for _ in range(30):
+        policy.act(seen)
+        targets.add(policy.intent.target)
+    assert targets == {1, 3}
+
+
+def test_an_object_out_of_reach_is_answered_with_some_push() -> None:
+    seen = blobs(0, 1)
+    clouds = seen.clouds + np.float32([0.0, 5.0, 0.0])
+    away = Observation(clouds, clouds.mean(axis=1), seen.mask, seen.visible)
+    action = HeuristicPushingPolicy(np.random.default_rng(0)).act(away)
+    assert action.shape == (4,) and (np.abs(action) <= 1).all()
+
+
+@settings(deadline=None, max_examples=20)
+@given(SEEDS)
+def test_the_same_seed_chooses_the_same_pushes(seed: int) -> None:
+    def choose(seed: int) -> np.ndarray:
+        policy = HeuristicPushingPolicy(np.random.default_rng(seed))
+        return np.array([policy.act(blobs(7)) for _ in range(4)])
+
+    np.testing.assert_array_equal(choose(seed), choose(seed))
+    assert not np.array_equal(choose(seed), choose(seed + 1))
+
+
+def test_most_pushes_move_something_and_few_are_unsafe() -> None:
+    scene = Scene()
+    reports = []
+    for seed in range(12):
+        draw, act = np.random.default_rng(seed).spawn(2)
+        seen = scene.draw([REACHABLE] * 3, ObjectRanges(clearance=0.12), draw)
+        policy = HeuristicPushingPolicy(act)
+        for _ in range(5):
+            reports.append(scene.push(policy.act(seen)))
+            seen = scene.observe()
+    scene.close()
+    assert len(reports) == 60
+    assert np.mean([not report.ineffective for report in reports]) >= 0.6
+    assert np.mean([report.unsafe for report in reports]) <= 0.15
