@@ -33,7 +33,9 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
         cause = error.__cause__ or error
         if isinstance(cause, ValueError):
             raise UserError(" ".join(str(cause).split())) from error
-        raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
+        raise UserError(
+            f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}"
+        ) from error
 
 
 def check_sizes(section: str, config: Config) -> None:
@@ -81,9 +83,13 @@ def check_fit(model: PyroModule, pointnet: PointNet, objects: int) -> None:
     """
     features = pointnet.feature.out_features
     if model.feature_dimension != features:
-        raise UserError(f"model.feature_dimension={model.feature_dimension}, but the PointNet's features have {features}")
+        raise UserError(
+            f"model.feature_dimension={model.feature_dimension}, but the PointNet's features have {features}"
+        )
     if model.maximum_objects < objects:
-        raise UserError(f"model.maximum_objects={model.maximum_objects}, but datasets have room for {objects}")
+        raise UserError(
+            f"model.maximum_objects={model.maximum_objects}, but datasets have room for {objects}"
+        )
 
 
 def load_pointnet(path: str | Path) -> PointNet:

@@ -11,7 +11,7 @@ from cavin_pyro.command import command
 def main(config: DictConfig) -> None:
     """Collect random pushes by the heuristic policy into a dataset folder; resumes what was interrupted."""
     from cavin_pyro.collection import CollectionSettings, collect, repair
-    from cavin_pyro.errors import UserError, at_least, check_seed
+    from cavin_pyro.errors import UserError, at_least, fraction, check_seed
     from cavin_pyro.files import output_folder
     from cavin_pyro.worlds import check_world, object_ranges
     from envs.workspace import MAXIMUM_OBJECTS
@@ -24,11 +24,13 @@ def main(config: DictConfig) -> None:
             f"maximum_objects must be between minimum_objects={config.minimum_objects} and {MAXIMUM_OBJECTS}, "
             f"not {config.maximum_objects}"
         )
+    fraction("perturbed", config.perturbed)
     check_world(config.env)
     settings = CollectionSettings(
         seed=config.seed,
         steps=config.steps,
         hold=config.hold,
+        perturbed=config.perturbed,
         minimum_objects=config.minimum_objects,
         maximum_objects=config.maximum_objects,
         episodes_per_shard=config.episodes_per_shard,

@@ -30,6 +30,7 @@ class CollectionSettings:
 
     Attributes:
         seed: the root of all randomness. steps: pushes per episode. hold: pushes that share an intent.
+        perturbed: share of pushes that start elsewhere than the heuristic wants (see `envs.policy`).
         minimum_objects, maximum_objects: how many lie on the table, drawn uniformly.
         episodes_per_shard: episodes per file, the unit of work and of resuming. ranges: object parameters.
     """
@@ -37,6 +38,7 @@ class CollectionSettings:
     seed: int = 0
     steps: int = 10
     hold: int = 5
+    perturbed: float = 0.3
     minimum_objects: int = 1
     maximum_objects: int = MAXIMUM_OBJECTS
     episodes_per_shard: int = 50
@@ -56,7 +58,9 @@ def collect(settings: CollectionSettings, folder: Path, *, transitions: int, wor
         UserError: the folder holds a dataset of other settings.
     """
     metadata = _begin(settings, folder)
-    with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
+    with progress_bar(
+        "collecting", total=transitions, initial=metadata["transitions"], unit="transition"
+    ) as bar:
         if metadata["transitions"] >= transitions:
             return metadata
         for arrays, seconds in _shards(settings, first=metadata["shards"], workers=workers):
@@ -79,7 +83,7 @@ def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) ->
     count = int(scene_generator.integers(settings.minimum_objects, settings.maximum_objects + 1))
     with user_input():
         seen = scene.draw([_crowd(scene_generator)] * count, settings.ranges, scene_generator)
-    policy = HeuristicPushingPolicy(policy_generator, hold=settings.hold)
+    policy = HeuristicPushingPolicy(policy_generator, hold=settings.hold, perturbed=settings.perturbed)
     arrays = _blank(settings, scene)
     arrays["mask"][:] = seen.mask
     arrays["episode"] = np.int64(episode)
@@ -153,7 +157,8 @@ def _collect_shard(job: tuple[CollectionSettings, int]) -> tuple[Arrays, dict[st
     _scene.seconds = dict.fromkeys(_scene.seconds, 0.0)
     first = shard * settings.episodes_per_shard
     episodes = [
-        collect_episode(_scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
+        collect_episode(_scene, settings, episode)
+        for episode in range(first, first + settings.episodes_per_shard)
     ]
     arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
     return arrays, {"cpu": time.process_time() - began, **_scene.seconds}
@@ -204,7 +209,9 @@ def _begin(settings: CollectionSettings, folder: Path) -> dict[str, Any]:
 
 
 def _write(folder: Path, metadata: dict[str, Any]) -> None:
-    write_metadata(folder, {name: value for name, value in metadata.items() if name not in ("format", "version")})
+    write_metadata(
+        folder, {name: value for name, value in metadata.items() if name not in ("format", "version")}
+    )
 
 
 def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:

@@ -1,7 +1,7 @@
 """What all commands share: Hydra for the words, one line for bad input, exit status 2.
 
-    @command("plan")
-    def main(config: DictConfig) -> None: ...
+@command("plan")
+def main(config: DictConfig) -> None: ...
 """
 
 from __future__ import annotations
@@ -63,7 +63,10 @@ def guarded(action: Callable[[], None]) -> None:
         if error.errno not in _DISK_ERRORS:
             raise
         where = f" at {error.filename}" if error.filename else ""
-        _stop(f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR", 2)
+        _stop(
+            f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR",
+            2,
+        )
     except KeyboardInterrupt:
         _stop("interrupted; where the command can resume, the same command goes on", 130)
 
@@ -157,7 +160,12 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
         known = hydra.compose(name)
     for override in OverridesParser.create().parse_overrides(_parsable(overrides)):
         key = override.key_or_group
-        if override.package or key.startswith("hydra") or override.type is not OverrideType.CHANGE or "@" in key:
+        if (
+            override.package
+            or key.startswith("hydra")
+            or override.type is not OverrideType.CHANGE
+            or "@" in key
+        ):
             continue
         parent, _, last = key.rpartition(".")
         if last.startswith("_") or last in _words(known, parent):

@@ -47,7 +47,13 @@ def _shard_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     with h5py.File("shard", "w", libver="v110", driver="core", backing_store=False) as file:
         for name in sorted(arrays):
             file.create_dataset(
-                name, data=arrays[name], chunks=True, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+                name,
+                data=arrays[name],
+                chunks=True,
+                compression="gzip",
+                compression_opts=1,
+                shuffle=True,
+                fletcher32=True,
             )
         file.flush()
         return file.id.get_file_image()
@@ -97,7 +103,9 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     if not all(type(count) is int for count in counts) or not isinstance(metadata.get("settings"), dict):
         raise UserError(f"{path} is damaged: it does not tell settings and counts; collect the dataset again")
     if metadata["shards"] < 1:
-        raise UserError(f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}")
+        raise UserError(
+            f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
+        )
     return metadata
 
 

@@ -40,3 +40,13 @@ def check_seed(seed: int) -> None:
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise UserError(f"seed must be a whole number from 0 to {2**32 - 1}, not {seed}")
+
+
+def fraction(name: str, value: float) -> None:
+    """Check a share from the command line.
+
+    Raises:
+        UserError: the share is not between 0 and 1.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise UserError(f"{name} must be between 0 and 1, not {value}")

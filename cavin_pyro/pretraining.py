@@ -55,7 +55,13 @@ def pretrain(
             running += loss.item()
             bar.update()
             if step % max(1, steps // 50) == 0 or step == steps:
-                rows.append((step, running / max(1, step - (rows[-1][0] if rows else 0)), _loss(autoencoder, validation)))
+                rows.append(
+                    (
+                        step,
+                        running / max(1, step - (rows[-1][0] if rows else 0)),
+                        _loss(autoencoder, validation),
+                    )
+                )
                 running = 0.0
                 bar.set_postfix(validation=f"{rows[-1][2]:.4f}")
     with replacing(log) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:

@@ -7,6 +7,7 @@ import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -25,17 +26,20 @@ def provenance() -> dict[str, Any]:
         "command": " ".join(["python -m", _module(), *(shlex.quote(word) for word in sys.argv[1:])]),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
+        "packages": {
+            name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")
+        },
         "machine": f"{platform.system()} {platform.machine()}",
     }
 
 
-def training_provenance(data: Path, pointnet: Path, windows: WindowTable) -> dict[str, Any]:
+def training_provenance(data: Sequence[Path], pointnet: Path, windows: WindowTable) -> dict[str, Any]:
     """The same for a trained model: also which data and which PointNet it was trained with."""
-    metadata, trained_before = read_metadata(data), load_checkpoint(pointnet).provenance
+    trained_before = load_checkpoint(pointnet).provenance
+    kept = ("transitions", "episodes", "settings", "made_by")
     return {
         **provenance(),
-        "data": {name: metadata[name] for name in ("transitions", "episodes", "settings", "made_by")},
+        "data": [{name: read_metadata(folder)[name] for name in kept} for folder in data],
         "pointnet": trained_before.get("pointnet", trained_before),
         "training_windows": len(windows.training),
         "validation_windows": len(windows.validation),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -35,8 +36,10 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         return
     try:
         earlier = _flat(OmegaConf.to_container(OmegaConf.load(path)))
-    except (OSError, OmegaConfBaseException, ValueError) as error:
-        raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
+    except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
+        raise UserError(
+            f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR"
+        ) from error
     now = _flat(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
         if name not in ignore and now.get(name) != earlier.get(name):

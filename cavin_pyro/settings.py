@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from cavin_pyro.errors import UserError, at_least, check_seed
+from cavin_pyro.errors import UserError, at_least, check_seed, fraction
 from cavin_pyro.training import SCHEDULES, TrainerSettings
 from cavin_pyro.windows import WindowSettings
 
@@ -35,8 +35,7 @@ def window_settings(config: DictConfig) -> WindowSettings:
     """
     windows = config.windows
     for name in ("validation_fraction", "quiet_fraction"):
-        if not isinstance(windows[name], int | float) or not 0 <= windows[name] <= 1:
-            raise UserError(f"windows.{name} must be between 0 and 1, not {windows[name]}")
+        fraction(f"windows.{name}", windows[name])
     for name in ("maximum_step", "minimum_move", "maximum_move"):
         at_least(f"windows.{name}", windows[name], 0)
     at_least("model.segment_length", config.model.segment_length, 1)

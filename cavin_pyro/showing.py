@@ -47,9 +47,16 @@ def write_steps(path: Path, episode: Episode) -> None:
         )
         for push in episode.pushes:
             flags = (push.success, push.violation, push.fall, push.unsafe, push.ineffective)
-            distance = "" if push.subgoal_distance != push.subgoal_distance else f"{push.subgoal_distance:.4f}"
+            distance = (
+                "" if push.subgoal_distance != push.subgoal_distance else f"{push.subgoal_distance:.4f}"
+            )
             took = planned.get(push.step - 1)
             writer.writerow(
-                [push.step, *(f"{value:.4f}" for value in push.action), push.reward, *(int(flag) for flag in flags)]
+                [
+                    push.step,
+                    *(f"{value:.4f}" for value in push.action),
+                    push.reward,
+                    *(int(flag) for flag in flags),
+                ]
                 + [distance, "" if took is None else f"{took:.1f}"]
             )

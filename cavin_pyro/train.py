@@ -26,7 +26,9 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.windows import load_windows
     from envs.workspace import MAXIMUM_OBJECTS
 
-    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
+    pyro.settings.set(
+        module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False
+    )
     trainer, window = trainer_settings(config), window_settings(config)
     torch.manual_seed(config.seed)
     model = build_model(config)
@@ -35,7 +37,8 @@ def main(config: DictConfig) -> None:
     source = Path(config.pointnet or default_checkpoint())
     pointnet = load_pointnet(source)
     check_fit(model, pointnet, MAXIMUM_OBJECTS)
-    windows = load_windows(Path(config.data), pointnet, window, skip_corrupt=config.skip_corrupt)
+    data = [Path(folder) for folder in ([config.data] if isinstance(config.data, str) else config.data)]
+    windows = load_windows(data, pointnet, window, skip_corrupt=config.skip_corrupt)
     print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
 
     folder = output_folder(config.output)
@@ -43,10 +46,12 @@ def main(config: DictConfig) -> None:
     settings = write_config(folder, config)
     parts = {"model": model, "guide": guide, "pointnet": pointnet}
     path = folder / "checkpoint.safetensors"
-    record = training_provenance(Path(config.data), source, windows)
+    record = training_provenance(data, source, windows)
 
     def save(step: int, row: dict[str, float]) -> None:
-        save_checkpoint(path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row})
+        save_checkpoint(
+            path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row}
+        )
 
     run = Trainer(model, guide, objective, windows, trainer, folder, save)
     run.run()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,9 +106,12 @@ class Trainer:
             self._resume()
         settings, running, since = self.settings, 0.0, time.perf_counter()
         with (
+            warnings.catch_warnings(),
             progress_bar("training", total=settings.steps, initial=self.step) as bar,
             SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step + 1) as board,
         ):
+            # Pyro's own warnings, many for one NaN; this loop looks itself and stops.
+            warnings.filterwarnings("ignore", "Encountered", UserWarning)
             while self.step < settings.steps and self.stale < settings.patience:
                 running += self._update()
                 self.step += 1
@@ -117,7 +121,9 @@ class Trainer:
                     windows_per_second = count * settings.batch_size / (time.perf_counter() - since)
                     self._validate(running / count, windows_per_second, board)
                     running, since = 0.0, time.perf_counter()
-                    bar.set_postfix(validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}")
+                    bar.set_postfix(
+                        validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}"
+                    )
 
     def _update(self) -> float:
         settings, numbers = self.settings, self.windows.training
@@ -137,7 +143,11 @@ class Trainer:
         return loss.item()
 
     def _stop_at(self, term: str) -> None:
-        kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
+        kept = (
+            f"the best checkpoint, of step {self.best_step}, stays"
+            if self.rows
+            else "there is no checkpoint yet"
+        )
         raise UserError(
             f"training stopped after step {self.step}: the term {term} is not finite; {kept}: "
             "look at the data, or lower trainer.learning_rate"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +49,9 @@ class WindowTable:
         training, validation: numbers of windows, for `batch`.
     """
 
-    def __init__(self, states: State, actions: Tensor, transition_mask: Tensor, settings: WindowSettings) -> None:
+    def __init__(
+        self, states: State, actions: Tensor, transition_mask: Tensor, settings: WindowSettings
+    ) -> None:
         """States, actions and transition_mask have leading dimension [P], positions in time, episode after episode."""
         self._states, self._actions, self._transition_mask = states, actions, transition_mask
         self._steps = torch.arange(settings.segment_length + 1)
@@ -69,27 +72,34 @@ class WindowTable:
 
 
 def load_windows(
-    folder: Path, pointnet: PointNet, settings: WindowSettings, *, skip_corrupt: bool = False
+    folders: Sequence[Path], pointnet: PointNet, settings: WindowSettings, *, skip_corrupt: bool = False
 ) -> WindowTable:
-    """Read a dataset, compute the features that are not there yet, and find its windows.
+    """Read one or more datasets, compute the features that are not there yet, and find the windows.
 
     Raises:
-        UserError: no dataset, a corrupt shard, or no window to learn from.
+        UserError: no dataset, a corrupt shard, datasets that do not go together, or no window to learn from.
     """
     mark, shards = fingerprint(pointnet), []
-    metadata = read_metadata(folder)
+    lengths = {folder: read_metadata(folder)["settings"]["steps"] for folder in folders}
+    if len(set(lengths.values())) > 1:
+        raise UserError(
+            "datasets with episodes of different length cannot be joined: "
+            + ", ".join(f"{folder} has steps={steps}" for folder, steps in lengths.items())
+        )
     names = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")
-    with progress_bar("reading", total=metadata["shards"], unit="file") as bar:
-        for number, arrays in iterate_shards(folder, names, skip_corrupt=skip_corrupt):
-            arrays["features"] = shard_features(folder, number, pointnet, mark)
-            shards.append(arrays)
-            bar.update()
+    total = sum(read_metadata(folder)["shards"] for folder in folders)
+    with progress_bar("reading", total=total, unit="file") as bar:
+        for folder in folders:
+            for number, arrays in iterate_shards(folder, names, skip_corrupt=skip_corrupt):
+                arrays["features"] = shard_features(folder, number, pointnet, mark)
+                shards.append(arrays)
+                bar.update()
     episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in shards[0]}
-    return _find_windows(episodes, settings, folder)
+    return _find_windows(episodes, settings, " and ".join(str(folder) for folder in folders))
 
 
-def _find_windows(episodes: Arrays, settings: WindowSettings, folder: Path) -> WindowTable:
-    count, positions = episodes["visible"].shape[:2]
+def _find_windows(episodes: Arrays, settings: WindowSettings, folder: str) -> WindowTable:
+    positions = episodes["visible"].shape[1]
     if settings.segment_length >= positions:
         raise UserError(
             f"dataset {folder} has {positions - 1} pushes per episode, too few for windows of "
@@ -101,7 +111,9 @@ def _find_windows(episodes: Arrays, settings: WindowSettings, folder: Path) -> W
 
     T = settings.segment_length
     first, last = slice(0, positions - T), slice(T, None)
-    moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(axis=-1)
+    moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(
+        axis=-1
+    )
     flawed = episodes["unsafe"] | episodes["fallen"]
     sound = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
     informative = sound & seen[:, first] & seen[:, last]
@@ -109,7 +121,9 @@ def _find_windows(episodes: Arrays, settings: WindowSettings, folder: Path) -> W
     exists = np.arange(positions - T)[None] + T <= length[:, None]
 
     # The split hangs on an episode's own number, so that more data does not reshuffle what was held out before.
-    draws = np.array([np.random.default_rng([settings.seed, int(number)]).random() for number in episodes["episode"]])
+    draws = np.array(
+        [np.random.default_rng([settings.seed, int(number)]).random() for number in episodes["episode"]]
+    )
     validation = np.broadcast_to((draws < settings.validation_fraction)[:, None], exists.shape)
     turn = np.random.default_rng(settings.seed).random(exists.shape)
     chosen = exists & (informative | (turn < settings.quiet_fraction))
@@ -137,7 +151,9 @@ def _find_windows(episodes: Arrays, settings: WindowSettings, folder: Path) -> W
     return table
 
 
-def _transitions_that_count(episodes: Arrays, seen: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:
+def _transitions_that_count(
+    episodes: Arrays, seen: NDArray[np.bool_], maximum_step: float
+) -> NDArray[np.bool_]:
     """Which pushes [E, S] the dynamics f learns from."""
     step = np.linalg.norm(np.diff(episodes["centers"], axis=1), axis=-1)
     small = (np.where(episodes["mask"][:, None], step, 0.0) < maximum_step).all(axis=-1)

@@ -35,10 +35,14 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     names = ranges.pop("names") or BUILTIN_NAMES
     unknown = [name for name in names if name not in BUILTIN_NAMES]
     if unknown:
-        raise UserError(f"unknown object {unknown[0]!r} in env.ranges.names: choose from {', '.join(BUILTIN_NAMES)}")
+        raise UserError(
+            f"unknown object {unknown[0]!r} in env.ranges.names: choose from {', '.join(BUILTIN_NAMES)}"
+        )
     for name in ("scale", "mass", "friction"):
         value = ranges[name]
-        numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
+        numbers = (
+            isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
+        )
         if not numbers or not 0 < value[0] <= value[1]:
             raise UserError(f"env.ranges.{name} must be two positive numbers, low then high, not {value}")
     if not isinstance(ranges["clearance"], int | float) or not ranges["clearance"] >= 0:

@@ -43,6 +43,9 @@ class Camera:
     ) -> NDArray[np.float64]:
         """Points in the robot's base frame behind chosen pixels.
 
+        PyBullet's software renderer samples a pixel at its corner, not its middle: what it renders comes out
+        half a pixel (2.6 mm) too far along +x and -y. The data collected so far have this offset.
+
         Args:
             depth: [height, width] metres along the optical axis. rows, columns: [P] pixel indices.
 

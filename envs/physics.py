@@ -40,9 +40,9 @@ with _quiet(2):
     from pybullet_utils.bullet_client import BulletClient
 
 TIME_STEP = 1.0 / 240.0  # seconds
-# Per step. Measured over 120 pushes of the policy among 3 to 5 objects: 50 iterations leave 72 % of the
-# objects that move within 1 mm of where 20 leave them, 93 % within 3 mm and all within 9 mm, and take 1.5
-# times as long; 200 iterations agree with 20 about as well (68 %, 90 %, 9 mm).
+# Per step. Measured over 240 pushes of the policy among 3 to 5 objects: 50 iterations leave 72 % of the
+# objects that move within 1 mm of where 20 leave them, 92 % within 3 mm and all within 12 mm, and take 1.3 to
+# 1.5 times as long; 200 iterations agree with 20 about as well (65 %, 88 %, 12 mm).
 SOLVER_ITERATIONS = 20
 GRAVITY = 9.81  # metres per second squared
 TABLE_FRICTION = 1.0  # Bullet multiplies both bodies' coefficients, so the object's own value is what counts

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from envs.robots import STICK_RADIUS
 from envs.scene import Observation
-from envs.workspace import push_endpoints
+from envs.workspace import normalised_push, push_endpoints
 
 CANDIDATES = 2048  # pushes drawn at once
 SPREAD = np.radians(45.0)  # radians; how far a push may turn from the base angle, either way
@@ -24,6 +24,7 @@ NEAR = 0.01  # metres; margin between the tool and the target object along the p
 CENTRAL_FRACTION = 0.7  # of pushes aim at the middle of the target; the others may just graze it
 CENTRAL = 0.03  # metres between a push's path and the target's centre that count as aiming at its middle
 COMPARED = 8  # passing pushes, at most, of which the one is made that goes farthest after it meets the target
+PERTURBATION = 0.04  # metres; standard deviation, on each axis, of how far a perturbed push's start is moved
 REDRAWS = 20  # targets and angles tried before a uniformly random push is made instead
 
 
@@ -40,10 +41,13 @@ class HeuristicPushingPolicy:
 
     Args:
         generator: all of the policy's randomness. hold: pushes that share a target and a base angle.
+        perturbed: share of the pushes whose start is moved at random, so that many of them come down on an
+            object, graze one or miss. A planner picks among thousands of pushes those of which the dynamics
+            model promises most; unless the model has seen such pushes fail, it will promise too much of them.
     """
 
-    def __init__(self, generator: np.random.Generator, *, hold: int = 5) -> None:
-        self._generator, self._hold = generator, hold
+    def __init__(self, generator: np.random.Generator, *, hold: int = 5, perturbed: float = 0.0) -> None:
+        self._generator, self._hold, self._perturbed = generator, hold, perturbed
         self._left = 0
         self.intent = Intent(0, 0.0)
 
@@ -55,9 +59,18 @@ class HeuristicPushingPolicy:
             action = self._propose(observation)
             if action is not None:
                 self._left -= 1
-                return action
+                return self._perturb(action) if self._perturbed > 0.0 else action
             self._new_intent(observation)
         return self._generator.uniform(-1.0, 1.0, size=4)
+
+    def _perturb(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The action, or with probability `perturbed` the same motion from another start."""
+        if self._generator.random() >= self._perturbed:
+            return action
+        start, _ = push_endpoints(action)
+        moved = start + self._generator.normal(scale=PERTURBATION, size=2)
+        action[:2] = np.clip(normalised_push(moved, np.zeros(2))[:2], -1.0, 1.0)
+        return action
 
     def _new_intent(self, observation: Observation) -> None:
         target = int(self._generator.choice(np.flatnonzero(observation.mask)))

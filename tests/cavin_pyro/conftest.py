@@ -30,8 +30,9 @@ PUSHES = CollectionSettings(seed=3, steps=6, episodes_per_shard=4)  # 3 shards o
 
 # Each case in turn, in one process: a start costs seconds, the case itself milliseconds.
 RUN_IN_TURN = """
-import contextlib, importlib, io, json, os, sys, traceback
+import contextlib, gc, importlib, io, json, os, sys, traceback
 
+gc.disable()  # a third of the time, for a process that ends soon
 answers = []
 for case in json.load(sys.stdin):
     output, errors, status = io.StringIO(), io.StringIO(), 0
@@ -142,7 +143,10 @@ def clean_pyro() -> Iterator[None]:
     pyro.clear_param_store()
     torch.manual_seed(0)
     # Setting up an episode changes the other two as well, which must not outlive the test.
-    kept = {name: pyro.settings.get(name) for name in ("validate_distributions_pyro", "validate_distributions_torch")}
+    kept = {
+        name: pyro.settings.get(name)
+        for name in ("validate_distributions_pyro", "validate_distributions_torch")
+    }
     with pyro.settings.context(module_local_params=True, **kept):
         yield
     pyro.clear_param_store()

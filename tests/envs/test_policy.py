@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from envs import policy
 from envs.objects import Area, ObjectRanges
 from envs.policy import NEAR, NOISE, SPREAD, START_CLEARANCE, HeuristicPushingPolicy
 from envs.robots import STICK_RADIUS
@@ -92,6 +93,38 @@ def test_target_and_angle_are_held_for_as_many_pushes_as_asked(hold: int) -> Non
     assert all(len(run) == 1 for run in runs)
     assert len(set.union(*runs)) == 6
     assert len({target for target, _ in intents}) > 1
+
+
+def test_pushes_that_go_on_after_they_meet_the_target_are_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
+    def mean_travel() -> float:
+        rule, travels = HeuristicPushingPolicy(np.random.default_rng(0), hold=1), []
+        for seed in range(60):
+            seen = blobs(seed, 2)
+            start, end = push_endpoints(rule.act(seen))
+            path = start + np.linspace(0, 1, 101)[:, None] * (end - start)
+            cloud = seen.clouds[rule.intent.target, :, :2]
+            met = np.linalg.norm(cloud[:, None] - path, axis=-1).min(axis=0) <= STICK_RADIUS
+            travels.append((1 - met.argmax() / 100) * np.linalg.norm(end - start) if met.any() else 0.0)
+        return float(np.mean(travels))
+
+    preferred = mean_travel()
+    monkeypatch.setattr(policy, "COMPARED", 1)  # the first push that touches the target
+    assert preferred > 1.2 * mean_travel()
+
+
+def test_a_share_of_the_pushes_starts_elsewhere_with_the_same_motion() -> None:
+    shifts = []
+    for seed in range(100):
+        plain, perturbed = (
+            HeuristicPushingPolicy(np.random.default_rng(seed), perturbed=share).act(blobs(seed, 2))
+            for share in (0.0, 0.4)
+        )
+        np.testing.assert_array_equal(perturbed[2:], plain[2:])
+        assert (np.abs(perturbed) <= 1).all()
+        shifts.append(push_endpoints(perturbed)[0] - push_endpoints(plain)[0])
+    moved = [shift for shift in shifts if np.abs(shift).max() > 1e-9]
+    assert 25 < len(moved) < 55
+    assert 0.02 < np.std(moved) < 0.06
 
 
 def test_only_known_objects_are_targets() -> None:

@@ -17,7 +17,7 @@ from envs.layouts import TASK_NAMES, Layout, load_layout
 from envs.objects import ObjectParameters, ObjectRanges
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import EPISODE_STEPS, PushingEnv
-from envs.scene import Observation
+from envs.scene import Observation, PushReport
 from envs.tasks import TaskReward
 from envs.workspace import normalised_push, tile_center
 
@@ -119,6 +119,17 @@ def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(
             assert nearest < 0.075 + 0.06  # within a tile, and some centimetres of rolling until rest
 
 
+def test_a_scene_in_which_the_target_has_rolled_off_the_bridge_is_drawn_anew(make: Make) -> None:
+    env = make(layout=0, objects=1)
+    draws, reset = [], env.scene.reset
+    env.scene.reset = lambda *args: draws.append(reset(*args)) or draws[-1]  # type: ignore
+    reward, started = TaskReward(env.layout), 40
+    for seed in range(started):
+        center = torch.from_numpy(env.reset(seed=seed)[0]["centers"][:1])
+        assert not reward(center, center, torch.tensor([True])).failure
+    assert started < len(draws) < 2 * started
+
+
 @pytest.mark.parametrize("task", TASK_NAMES)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_reward_is_the_task_reward_of_what_was_seen(make: Make, task: str, kind: str) -> None:
@@ -135,14 +146,15 @@ def test_the_reward_is_the_task_reward_of_what_was_seen(make: Make, task: str, k
             torch.from_numpy(seen["centers"]),
             torch.from_numpy(seen["mask"] == 1),
         )
-        assert reward == pytest.approx(outcome.reward.item(), abs=1e-5)
         assert reward == pytest.approx(sum(info["terms"].values()))
-        assert info["success"] == bool(outcome.success) and info["violation"] == bool(outcome.violation)
-        assert terminated == bool(outcome.success | outcome.failure)
+        if not info["fall"]:  # an object that has fallen is out of sight: only the simulator knows
+            assert reward == pytest.approx(outcome.reward.item(), abs=1e-5)
+            assert info["success"] == bool(outcome.success) and info["violation"] == bool(outcome.violation)
+            assert terminated == bool(outcome.success | outcome.failure)
         changed += not info["ineffective"]
         if terminated:
             seen, _ = env.reset()
-    assert changed >= 3
+    assert changed >= 1
 
 
 # How episodes end.
@@ -200,6 +212,20 @@ def test_an_object_off_the_table_ends_the_episode_with_a_fall(make: Make, put: C
     assert not info["success"] and not info["violation"]
     assert not any(one["fall"] for one in infos[:-1])
     assert env.observation_space.contains(seen)
+
+
+@pytest.mark.parametrize(("place", "otherwise"), [((2, 2), "success"), ((4, 4), "violation")])
+def test_a_fall_that_the_camera_cannot_see_outweighs_what_it_sees(
+    make: Make, put: Callable, place: tuple[int, int], otherwise: str
+) -> None:
+    env = make(put("rubiks_cube", *tile_center(place)), layout=BRIDGE, objects=1)
+    for fallen in (False, True):
+        env.reset(seed=0)
+        env.scene.push = lambda _, fallen=fallen: PushReport(False, True, np.zeros(1), fallen)  # type: ignore
+        _, reward, terminated, _, info = env.step(NOTHING)
+        happened = {name for name in ("success", "violation", "fall") if info[name]}
+        assert happened == {"fall" if fallen else otherwise} and terminated
+        assert reward == (99 if happened == {"success"} else -101)
 
 
 def test_the_last_allowed_step_may_still_succeed(make: Make, put: Callable) -> None:

@@ -278,6 +278,14 @@ def test_padding_changes_nothing(layout: Layout, padding: float, margin: float) 
         assert torch.equal(one, other)
 
 
+@pytest.mark.parametrize(
+    ("layout", "goal"), [(CLEARING, tile(3.1, 4)), (INSERTION, tile(2, 1)), (CROSSING, tile(2, 2))]
+)
+def test_padding_within_the_region_to_clear_does_not_hinder_success(layout: Layout, goal: Point) -> None:
+    before, after = states(tile(2, 2.6), ASIDE, tile(2, 3)), states(goal, ASIDE, tile(2, 3))
+    assert TaskReward(layout)(before, after, torch.tensor([True, True, False])).success
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("layout", [CLEARING, INSERTION, CROSSING])
 def test_the_reward_has_the_precision_of_the_states(layout: Layout, dtype: torch.dtype) -> None:

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from cavin_pyro.errors import UserError
+from cavin_pyro.runs import check_same_run, write_config
+
+
+def config(**changes: object) -> DictConfig:
+    words = {
+        "seed": 3,
+        "output": "a",
+        "name": "${output}-${seed}",
+        "trainer": {"steps": 10, "rates": [0.1, 0.2]},
+    }
+    return OmegaConf.create({**words, **changes})
+
+
+def test_a_folder_remembers_its_configuration_without_interpolations(tmp_path: Path) -> None:
+    plain = write_config(tmp_path, config())
+    assert plain == {"seed": 3, "output": "a", "name": "a-3", "trainer": {"steps": 10, "rates": [0.1, 0.2]}}
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == plain
+
+
+def test_the_same_run_may_go_on_and_so_may_a_first_one(tmp_path: Path) -> None:
+    check_same_run(tmp_path, config(), ignore=())
+    write_config(tmp_path, config())
+    check_same_run(tmp_path, config(), ignore=())
+    check_same_run(tmp_path, config(output="b", name="c"), ignore=("output", "name"))
+    check_same_run(tmp_path, config(trainer={"steps": 20, "rates": [0.1, 0.2]}), ignore=("trainer.steps",))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seed": 4, "name": "a-3"}, "a run with seed=3, not 4"),
+        ({"trainer": {"steps": 20, "rates": [0.1, 0.2]}}, "a run with trainer.steps=10, not 20"),
+        ({"trainer": {"steps": 10, "rates": [0.1, 0.3]}}, r"trainer.rates=\[0.1, 0.2\], not \[0.1, 0.3\]"),
+        ({"extra": 1}, "a run with extra=None, not 1"),
+    ],
+)
+def test_another_run_is_refused_and_the_word_is_named(changes: dict, said: str, tmp_path: Path) -> None:
+    write_config(tmp_path, config())
+    with pytest.raises(UserError, match=f"{said}: resume with the same words, or choose another output=DIR"):
+        check_same_run(tmp_path, config(**changes), ignore=())
+
+
+def test_a_damaged_configuration_is_named(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("seed: [1")
+    with pytest.raises(UserError, match=r"config\.yaml is damaged"):
+        check_same_run(tmp_path, config(), ignore=())
