@@ -33,9 +33,7 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
         cause = error.__cause__ or error
         if isinstance(cause, ValueError):
             raise UserError(" ".join(str(cause).split())) from error
-        raise UserError(
-            f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}"
-        ) from error
+        raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
 
 
 def check_sizes(section: str, config: Config) -> None:
@@ -46,7 +44,7 @@ def check_sizes(section: str, config: Config) -> None:
     """
     for name, value in config.items():
         if type(value) is int:
-            at_least(f"{section}.{name}", value, 1)
+            at_least(f"{section}.{name!s}", value, 1)
 
 
 def build_model(config: Config) -> PyroModule:
@@ -87,9 +85,7 @@ def check_fit(model: PyroModule, pointnet: PointNet, objects: int) -> None:
             f"model.feature_dimension={model.feature_dimension}, but the PointNet's features have {features}"
         )
     if model.maximum_objects < objects:
-        raise UserError(
-            f"model.maximum_objects={model.maximum_objects}, but datasets have room for {objects}"
-        )
+        raise UserError(f"model.maximum_objects={model.maximum_objects}, but datasets have room for {objects}")
 
 
 def load_pointnet(path: str | Path) -> PointNet:

@@ -47,9 +47,7 @@ class Checkpoint:
             UserError: the weights are of another architecture.
         """
         prefix = f"{part}."
-        weights = {
-            name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)
-        }
+        weights = {name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)}
         wanted = module.state_dict()
         for name in sorted(set(wanted) | set(weights)):
             have, want = weights.get(name), wanted.get(name)
@@ -88,9 +86,7 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(
-            f"no checkpoint at {path}: give the path of a .safetensors file that train has written"
-        )
+        raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
@@ -107,9 +103,7 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
     except (KeyError, ValueError) as error:
         raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
-    if not isinstance(config, dict) or not all(
-        isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS
-    ):
+    if not isinstance(config, dict) or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
         raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
     _check_targets([config.get(section) for section in BUILT_SECTIONS], path, trust)
     return Checkpoint(config, provenance, tensors)

@@ -11,7 +11,7 @@ from cavin_pyro.command import command
 def main(config: DictConfig) -> None:
     """Collect random pushes by the heuristic policy into a dataset folder; resumes what was interrupted."""
     from cavin_pyro.collection import CollectionSettings, collect, repair
-    from cavin_pyro.errors import UserError, at_least, fraction, check_seed
+    from cavin_pyro.errors import UserError, at_least, check_seed, fraction
     from cavin_pyro.files import output_folder
     from cavin_pyro.worlds import check_world, object_ranges
     from envs.workspace import MAXIMUM_OBJECTS

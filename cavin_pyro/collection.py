@@ -58,9 +58,7 @@ def collect(settings: CollectionSettings, folder: Path, *, transitions: int, wor
         UserError: the folder holds a dataset of other settings.
     """
     metadata = _begin(settings, folder)
-    with progress_bar(
-        "collecting", total=transitions, initial=metadata["transitions"], unit="transition"
-    ) as bar:
+    with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
         if metadata["transitions"] >= transitions:
             return metadata
         for arrays, seconds in _shards(settings, first=metadata["shards"], workers=workers):
@@ -86,7 +84,7 @@ def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) ->
     policy = HeuristicPushingPolicy(policy_generator, hold=settings.hold, perturbed=settings.perturbed)
     arrays = _blank(settings, scene)
     arrays["mask"][:] = seen.mask
-    arrays["episode"] = np.int64(episode)
+    arrays["episode"] = np.array(episode, np.int64)
     _record_view(arrays, 0, seen)
     for step in range(settings.steps):
         action = policy.act(seen).astype(np.float32)
@@ -94,7 +92,7 @@ def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) ->
         seen = scene.observe()
         _record_push(arrays, step, action, report, policy)
         _record_view(arrays, step + 1, seen)
-        arrays["length"] = np.int64(step + 1)
+        arrays["length"] = np.array(step + 1, np.int64)
         if report.fallen:
             break
     return arrays
@@ -157,16 +155,13 @@ def _collect_shard(job: tuple[CollectionSettings, int]) -> tuple[Arrays, dict[st
     _scene.seconds = dict.fromkeys(_scene.seconds, 0.0)
     first = shard * settings.episodes_per_shard
     episodes = [
-        collect_episode(_scene, settings, episode)
-        for episode in range(first, first + settings.episodes_per_shard)
+        collect_episode(_scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
     ]
     arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
     return arrays, {"cpu": time.process_time() - began, **_scene.seconds}
 
 
-def _shards(
-    settings: CollectionSettings, *, first: int, workers: int
-) -> Iterator[tuple[Arrays, dict[str, float]]]:
+def _shards(settings: CollectionSettings, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
     numbers = (first + number for number in range(10**9))
     if workers == 1:
         yield from (_collect_shard((settings, number)) for number in numbers)
@@ -209,9 +204,7 @@ def _begin(settings: CollectionSettings, folder: Path) -> dict[str, Any]:
 
 
 def _write(folder: Path, metadata: dict[str, Any]) -> None:
-    write_metadata(
-        folder, {name: value for name, value in metadata.items() if name not in ("format", "version")}
-    )
+    write_metadata(folder, {name: value for name, value in metadata.items() if name not in ("format", "version")})
 
 
 def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:

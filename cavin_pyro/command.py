@@ -83,6 +83,7 @@ def _run(body: Body, config: DictConfig) -> None:
         plain = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
         raise UserError(f"a word has no value: {str(error).splitlines()[0]}") from error
+    assert isinstance(plain, DictConfig)
     body(plain)
 
 
@@ -120,7 +121,7 @@ def _check_words(name: str) -> None:
 
 
 def _defaults(name: str, overrides: list[str], config: DictConfig) -> DictConfig:
-    """The configuration with the parts that the user chose and none of the other words; config tells which are parts."""
+    """The configuration with the parts that the user chose and no other words; config tells which are parts."""
     groups = config.hydra.runtime.choices
     return hydra.compose(name, overrides=[word for word in overrides if word.partition("=")[0] in groups])
 
@@ -160,12 +161,7 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
         known = hydra.compose(name)
     for override in OverridesParser.create().parse_overrides(_parsable(overrides)):
         key = override.key_or_group
-        if (
-            override.package
-            or key.startswith("hydra")
-            or override.type is not OverrideType.CHANGE
-            or "@" in key
-        ):
+        if override.package or key.startswith("hydra") or override.type is not OverrideType.CHANGE or "@" in key:
             continue
         parent, _, last = key.rpartition(".")
         if last.startswith("_") or last in _words(known, parent):

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.errors import UserError
@@ -109,9 +108,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     return metadata
 
 
-def iterate_shards(
-    folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False
-) -> Iterator[tuple[int, Arrays]]:
+def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
     """Yield (number, arrays) of a dataset's shards in order.
 
     Args:

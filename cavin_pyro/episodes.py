@@ -130,12 +130,8 @@ def run_episode(
                     action=action,
                     reward=float(reward),
                     centers=observation["centers"],
-                    subgoal_distance=_subgoal_distance(decision, observation["centers"])
-                    if last
-                    else float("nan"),
-                    **{
-                        name: info[name] for name in ("success", "violation", "fall", "unsafe", "ineffective")
-                    },
+                    subgoal_distance=_subgoal_distance(decision, observation["centers"]) if last else float("nan"),
+                    **{name: info[name] for name in ("success", "violation", "fall", "unsafe", "ineffective")},
                 )
             )
             ended = terminated or truncated

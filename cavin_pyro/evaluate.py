@@ -28,9 +28,7 @@ def main(config: DictConfig) -> None:
     write_config(folder, config)
     results = summarise(evaluate(config, folder))
     write_json(folder / "results.json", {**results, "provenance": provenance()})
-    text = table(
-        results, f"{config.task}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
-    )
+    text = table(results, f"{config.task}, layout {config.layout}, {config.reward} reward, {config.objects} objects")
     with replacing(folder / "results.txt") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     print(f"{text}\nwritten: {folder / 'results.json'}")

@@ -42,9 +42,7 @@ def draw_plan(path: Path, episode: Episode, layout: Layout, camera: Camera) -> N
     """
     if not episode.decisions:
         raise ValueError("the episode holds no decision to draw: run it first")
-    chosen = (
-        np.linspace(0, len(episode.decisions) - 1, min(PANELS, len(episode.decisions))).round().astype(int)
-    )
+    chosen = np.linspace(0, len(episode.decisions) - 1, min(PANELS, len(episode.decisions))).round().astype(int)
     decisions = [episode.decisions[index] for index in chosen]
     columns = {1: 1, 2: 2, 4: 2}.get(len(decisions), 3)
     rows = -(-len(decisions) // columns)
@@ -118,9 +116,7 @@ def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: N
         for row, vertical in enumerate((1, 2)):
             panel = axes[row, column]
             for points, color, size in zip(pair, (SEEN, DRAWN), (5, 9), strict=True):
-                panel.scatter(
-                    100 * points[:, 0], 100 * points[:, vertical], s=size, color=color, linewidths=0
-                )
+                panel.scatter(100 * points[:, 0], 100 * points[:, vertical], s=size, color=color, linewidths=0)
             panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
             panel.tick_params(labelsize=8)
     for row, label in enumerate(("from above\ny (cm)", "from the side\nz (cm)")):

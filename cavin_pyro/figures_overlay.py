@@ -108,9 +108,7 @@ def candidate_subgoals(
     """
     plan = decision.plan
     centers, returns = plan.candidate_centers[0].numpy(), plan.candidate_returns[0].numpy()
-    objects = (
-        np.flatnonzero(decision.mask[: centers.shape[2]]) if layout.task == "clearing" else np.array([0])
-    )
+    objects = np.flatnonzero(decision.mask[: centers.shape[2]]) if layout.task == "clearing" else np.array([0])
     points = centers[:, :, objects]  # [N, K, objects, 3]
     every = np.broadcast_to(returns[:, None, None], points.shape[:-1]).ravel()
     points = points.reshape(-1, 3)

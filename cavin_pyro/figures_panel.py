@@ -54,9 +54,7 @@ _PUSH: Style = {"arrowstyle": "-|>", "mutation_scale": 10, "shrinkA": 0, "shrink
 _TARGET: Style = {"color": PUSH_COLOR, "linestyle": "--", "linewidth": 1.5}
 
 
-def draw_decision(
-    panel: Axes, decision: Decision, layout: Layout, camera: Camera, scale: Normalize | None
-) -> None:
+def draw_decision(panel: Axes, decision: Decision, layout: Layout, camera: Camera, scale: Normalize | None) -> None:
     """Draw what was seen, considered, chosen and will be done.
 
     Args:

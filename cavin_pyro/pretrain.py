@@ -33,9 +33,7 @@ def main(config: DictConfig) -> None:
     check_sizes("autoencoder", config.autoencoder)
     torch.manual_seed(config.seed)
     autoencoder = construct(config.autoencoder)
-    clouds = sample_clouds(
-        Path(config.data), count=config.clouds, generator=np.random.default_rng(config.seed)
-    )
+    clouds = sample_clouds(Path(config.data), count=config.clouds, generator=np.random.default_rng(config.seed))
     folder = output_folder(config.output)
     settings = write_config(folder, config)
     losses = pretrain(
@@ -52,9 +50,7 @@ def main(config: DictConfig) -> None:
     save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=settings, provenance=record)
     write_json(folder / "metrics.json", record)
     draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
-    print(
-        f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape"
-    )
+    print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")
     print(f"written: {folder / 'pointnet.safetensors'}")
 
 

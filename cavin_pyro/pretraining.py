@@ -43,7 +43,8 @@ def pretrain(
     validation, training = torch.from_numpy(clouds[:held_out]), clouds[held_out:]
     optimizer = torch.optim.Adam(autoencoder.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    rows, running = [], 0.0
+    rows: list[tuple[int, float, float]] = []
+    running = 0.0
     with progress_bar("pretraining", total=steps) as bar:
         for step in range(1, steps + 1):
             batch = _augment(training[generator.integers(len(training), size=batch_size)], generator)

@@ -26,9 +26,7 @@ def provenance() -> dict[str, Any]:
         "command": " ".join(["python -m", _module(), *(shlex.quote(word) for word in sys.argv[1:])]),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         "python": platform.python_version(),
-        "packages": {
-            name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")
-        },
+        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
         "machine": f"{platform.system()} {platform.machine()}",
     }
 

@@ -37,9 +37,7 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
     try:
         earlier = _flat(OmegaConf.to_container(OmegaConf.load(path)))
     except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
-        raise UserError(
-            f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR"
-        ) from error
+        raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
     now = _flat(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
         if name not in ignore and now.get(name) != earlier.get(name):

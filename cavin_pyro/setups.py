@@ -81,12 +81,8 @@ def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]
         raise UserError(f"checkpoint {path} holds no model: give one that train has written")
     known = checkpoint.config["model"].get("maximum_objects", MAXIMUM_OBJECTS)
     if config.objects > known:
-        raise UserError(
-            f"objects={config.objects}, but checkpoint {path} knows at most {known}: use objects={known}"
-        )
-    pyro.settings.set(
-        module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False
-    )
+        raise UserError(f"objects={config.objects}, but checkpoint {path} knows at most {known}: use objects={known}")
+    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = build_model(checkpoint.config)
     checkpoint.load_into("model", model, path)
     model.requires_grad_(False).eval()

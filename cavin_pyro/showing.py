@@ -30,7 +30,11 @@ def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool) -> dict[
             on_decision=reel.set_decision if reel is not None else None,
         )
         if reel is not None:
-            reel.add(setup.env.render(), phase=episode.outcome, repeat=10)
+            reel.add(
+                setup.env.scene.photograph(setup.env.scene.camera.resized(*VIDEO_SIZE)),
+                phase=episode.outcome,
+                repeat=10,
+            )
     write_steps(folder / "steps.csv", episode)
     draw_plan(folder / "plan.png", episode, setup.layout, setup.env.scene.camera.resized(*VIDEO_SIZE))
     return episode_row(episode)
@@ -47,9 +51,7 @@ def write_steps(path: Path, episode: Episode) -> None:
         )
         for push in episode.pushes:
             flags = (push.success, push.violation, push.fall, push.unsafe, push.ineffective)
-            distance = (
-                "" if push.subgoal_distance != push.subgoal_distance else f"{push.subgoal_distance:.4f}"
-            )
+            distance = "" if push.subgoal_distance != push.subgoal_distance else f"{push.subgoal_distance:.4f}"
             took = planned.get(push.step - 1)
             writer.writerow(
                 [

@@ -51,9 +51,7 @@ def table(results: dict[str, Any], title: str) -> str:
     lines = [f"{title}, {results['episodes']} episodes", f"{'':16}{'rate':>8}   95 % interval"]
     for name in ("success", "violation", "fall", "timeout"):
         rate = results[name]
-        lines.append(
-            f"{name:16}{100 * rate['rate']:7.1f} %  {100 * rate['low']:5.1f} to {100 * rate['high']:5.1f} %"
-        )
+        lines.append(f"{name:16}{100 * rate['rate']:7.1f} %  {100 * rate['low']:5.1f} to {100 * rate['high']:5.1f} %")
     lines.append(f"{'':16}{'mean':>8} {'median':>9} {'95th':>9}")
     for name, unit in (("steps", ""), ("return", ""), ("planning_ms", " ms"), ("subgoal_distance", " m")):
         values = results[name]

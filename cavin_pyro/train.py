@@ -26,9 +26,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.windows import load_windows
     from envs.workspace import MAXIMUM_OBJECTS
 
-    pyro.settings.set(
-        module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False
-    )
+    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     trainer, window = trainer_settings(config), window_settings(config)
     torch.manual_seed(config.seed)
     model = build_model(config)
@@ -49,9 +47,7 @@ def main(config: DictConfig) -> None:
     record = training_provenance(data, source, windows)
 
     def save(step: int, row: dict[str, float]) -> None:
-        save_checkpoint(
-            path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row}
-        )
+        save_checkpoint(path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row})
 
     run = Trainer(model, guide, objective, windows, trainer, folder, save)
     run.run()

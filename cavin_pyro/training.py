@@ -121,9 +121,7 @@ class Trainer:
                     windows_per_second = count * settings.batch_size / (time.perf_counter() - since)
                     self._validate(running / count, windows_per_second, board)
                     running, since = 0.0, time.perf_counter()
-                    bar.set_postfix(
-                        validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}"
-                    )
+                    bar.set_postfix(validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}")
 
     def _update(self) -> float:
         settings, numbers = self.settings, self.windows.training
@@ -143,11 +141,7 @@ class Trainer:
         return loss.item()
 
     def _stop_at(self, term: str) -> None:
-        kept = (
-            f"the best checkpoint, of step {self.best_step}, stays"
-            if self.rows
-            else "there is no checkpoint yet"
-        )
+        kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
         raise UserError(
             f"training stopped after step {self.step}: the term {term} is not finite; {kept}: "
             "look at the data, or lower trainer.learning_rate"

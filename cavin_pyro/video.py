@@ -145,9 +145,7 @@ class EpisodeVideo:
             red, green, blue = ImageColor.getrgb(group.color)[:3]
             fill = (red, green, blue, round(255 * group.opacity))
             for tile in group.tiles:
-                draw.polygon(
-                    _points(tile_corners(tile, camera)), fill=fill, outline=group.color, width=2 * _FINE
-                )
+                draw.polygon(_points(tile_corners(tile, camera)), fill=fill, outline=group.color, width=2 * _FINE)
         if self._decision is not None:
             _draw_decision(draw, self._decision, camera)
         return image.resize((width, height), Image.Resampling.LANCZOS)
@@ -188,9 +186,7 @@ def _draw_arrow(draw: ImageDraw.ImageDraw, start: Pixels, end: Pixels) -> None:
     across = np.array([-along[1], along[0]])
     neck = end - 8 * _FINE * along
     draw.line(_points(np.stack([start, neck])), fill=PUSH_COLOR, width=2 * _FINE)
-    draw.polygon(
-        _points(np.stack([end, neck + 4 * _FINE * across, neck - 4 * _FINE * across])), fill=PUSH_COLOR
-    )
+    draw.polygon(_points(np.stack([end, neck + 4 * _FINE * across, neck - 4 * _FINE * across])), fill=PUSH_COLOR)
 
 
 def _points(pixels: Pixels) -> list[tuple[float, float]]:

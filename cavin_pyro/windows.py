@@ -49,9 +49,7 @@ class WindowTable:
         training, validation: numbers of windows, for `batch`.
     """
 
-    def __init__(
-        self, states: State, actions: Tensor, transition_mask: Tensor, settings: WindowSettings
-    ) -> None:
+    def __init__(self, states: State, actions: Tensor, transition_mask: Tensor, settings: WindowSettings) -> None:
         """States, actions and transition_mask have leading dimension [P], positions in time, episode after episode."""
         self._states, self._actions, self._transition_mask = states, actions, transition_mask
         self._steps = torch.arange(settings.segment_length + 1)
@@ -106,14 +104,12 @@ def _find_windows(episodes: Arrays, settings: WindowSettings, folder: str) -> Wi
             f"T={settings.segment_length}: collect with steps of at least that many"
         )
     mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
-    seen = (episodes["visible"] | ~mask[:, None]).all(axis=-1)  # [E, S+1]
+    seen: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
     counts = _transitions_that_count(episodes, seen, settings.maximum_step)
 
     T = settings.segment_length
     first, last = slice(0, positions - T), slice(T, None)
-    moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(
-        axis=-1
-    )
+    moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(axis=-1)
     flawed = episodes["unsafe"] | episodes["fallen"]
     sound = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
     informative = sound & seen[:, first] & seen[:, last]
@@ -121,9 +117,7 @@ def _find_windows(episodes: Arrays, settings: WindowSettings, folder: str) -> Wi
     exists = np.arange(positions - T)[None] + T <= length[:, None]
 
     # The split hangs on an episode's own number, so that more data does not reshuffle what was held out before.
-    draws = np.array(
-        [np.random.default_rng([settings.seed, int(number)]).random() for number in episodes["episode"]]
-    )
+    draws = np.array([np.random.default_rng([settings.seed, int(number)]).random() for number in episodes["episode"]])
     validation = np.broadcast_to((draws < settings.validation_fraction)[:, None], exists.shape)
     turn = np.random.default_rng(settings.seed).random(exists.shape)
     chosen = exists & (informative | (turn < settings.quiet_fraction))
@@ -151,9 +145,7 @@ def _find_windows(episodes: Arrays, settings: WindowSettings, folder: str) -> Wi
     return table
 
 
-def _transitions_that_count(
-    episodes: Arrays, seen: NDArray[np.bool_], maximum_step: float
-) -> NDArray[np.bool_]:
+def _transitions_that_count(episodes: Arrays, seen: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:
     """Which pushes [E, S] the dynamics f learns from."""
     step = np.linalg.norm(np.diff(episodes["centers"], axis=1), axis=-1)
     small = (np.where(episodes["mask"][:, None], step, 0.0) < maximum_step).all(axis=-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -30,23 +31,18 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     Raises:
         UserError: unknown shape, or a range that is not two increasing positive numbers.
     """
-    ranges = OmegaConf.to_container(env.ranges)
-    assert isinstance(ranges, dict)
+    ranges: Any = OmegaConf.to_container(env.ranges)
     names = ranges.pop("names") or BUILTIN_NAMES
     unknown = [name for name in names if name not in BUILTIN_NAMES]
     if unknown:
-        raise UserError(
-            f"unknown object {unknown[0]!r} in env.ranges.names: choose from {', '.join(BUILTIN_NAMES)}"
-        )
+        raise UserError(f"unknown object {unknown[0]!r} in env.ranges.names: choose from {', '.join(BUILTIN_NAMES)}")
     for name in ("scale", "mass", "friction"):
         value = ranges[name]
-        numbers = (
-            isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
-        )
+        numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
         if not numbers or not 0 < value[0] <= value[1]:
             raise UserError(f"env.ranges.{name} must be two positive numbers, low then high, not {value}")
     if not isinstance(ranges["clearance"], int | float) or not ranges["clearance"] >= 0:
         raise UserError(f"env.ranges.clearance must be at least 0 metres, not {ranges['clearance']}")
     assert set(ranges) | {"names"} == {field.name for field in fields(ObjectRanges)}
-    as_tuples = {name: tuple(value) if isinstance(value, list) else value for name, value in ranges.items()}
+    as_tuples = {str(name): tuple(value) if isinstance(value, list) else value for name, value in ranges.items()}
     return ObjectRanges(names=tuple(names), **as_tuples)

@@ -68,9 +68,7 @@ class Camera:
         return np.stack([column, row], axis=-1)
 
 
-def sample_cloud(
-    points: NDArray[np.float64], count: int, generator: np.random.Generator
-) -> NDArray[np.float64]:
+def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """Draw `count` of the points [P, 3], without replacement where there are enough.
 
     Raises:

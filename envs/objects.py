@@ -88,9 +88,7 @@ def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Genera
     )
 
 
-def draw_objects(
-    areas: Sequence[Area], ranges: ObjectRanges, generator: np.random.Generator
-) -> list[ObjectParameters]:
+def draw_objects(areas: Sequence[Area], ranges: ObjectRanges, generator: np.random.Generator) -> list[ObjectParameters]:
     """Draw one object per area, in random orientation, low above the table and clear of its neighbours.
 
     Args:

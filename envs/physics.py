@@ -103,9 +103,7 @@ class PhysicsWorld:
         bullet.resetSimulation()
         bullet.setGravity(0.0, 0.0, -GRAVITY)
         bullet.setTimeStep(TIME_STEP)
-        bullet.setPhysicsEngineParameter(
-            numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1
-        )
+        bullet.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
         sides = [high - low for low, high in zip(TABLE_LOW, TABLE_HIGH, strict=True)]
         half = [side / 2 for side in (*sides, TABLE_THICKNESS)]
         table = bullet.createMultiBody(
@@ -140,9 +138,7 @@ class PhysicsWorld:
         bullet, size = self._bullet, [scale] * 3
         body = bullet.createMultiBody(
             baseMass=mass,
-            baseCollisionShapeIndex=bullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size
-            ),
+            baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size),
             baseVisualShapeIndex=bullet.createVisualShape(
                 pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size, rgbaColor=(*color, 1.0)
             ),
@@ -165,9 +161,7 @@ class PhysicsWorld:
         bullet = self._bullet
         body = bullet.createMultiBody(
             baseMass=TOOL_MASS,
-            baseCollisionShapeIndex=bullet.createCollisionShape(
-                pybullet.GEOM_CYLINDER, radius=radius, height=length
-            ),
+            baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=radius, height=length),
             baseVisualShapeIndex=bullet.createVisualShape(
                 pybullet.GEOM_CYLINDER, radius=radius, length=length, rgbaColor=(0.2, 0.2, 0.22, 1.0)
             ),

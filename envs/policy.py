@@ -107,9 +107,7 @@ class HeuristicPushingPolicy:
         return actions[max(travels, key=travels.__getitem__)] if travels else None
 
 
-def _travel_after_contact(
-    cloud: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]
-) -> float:
+def _travel_after_contact(cloud: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
     """Metres that the tool still goes after it first meets the cloud [P, 2]; 0 if it passes by."""
     line = end - start
     length = max(float(np.linalg.norm(line)), 1e-6)

@@ -68,9 +68,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         if isinstance(layout, Layout) and tiles:
-            raise ValueError(
-                "tiles replace fields of a layout that is read: give its number or path, or no tiles"
-            )
+            raise ValueError("tiles replace fields of a layout that is read: give its number or path, or no tiles")
         self.layout = layout if isinstance(layout, Layout) else load_layout(task, layout, tiles)
         self.reward = TaskReward(self.layout, reward=reward)
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode

@@ -118,8 +118,7 @@ class Scene:
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
         raise ValueError(
-            f"no room for {len(areas)} objects: none of {DRAWS} scenes drawn on the layout's start tiles "
-            "could be used"
+            f"no room for {len(areas)} objects: none of {DRAWS} scenes drawn on the layout's start tiles could be used"
         )
 
     def reset(self, objects: Sequence[ObjectParameters], point_generator: np.random.Generator) -> Observation:

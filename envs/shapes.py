@@ -99,9 +99,7 @@ def _banana(thickness: float, length: float) -> list[trimesh.Trimesh]:
         radius = thickness / 2 * (1.0 - 0.6 * (abs(angle) / (bend / 2)) ** 3)
         distance = bow + radius * np.cos(around)
         sections.append(
-            np.stack(
-                [distance * np.sin(angle), distance * np.cos(angle) - bow, radius * np.sin(around)], axis=1
-            )
+            np.stack([distance * np.sin(angle), distance * np.cos(angle) - bow, radius * np.sin(around)], axis=1)
         )
     return [_hull(np.vstack(pair)) for pair in pairwise(sections)]
 

@@ -28,8 +28,7 @@ class CascadedGuide(Program):
         super().__init__()
         if getattr(model, "name", None) not in self.fits:
             raise ValueError(
-                f"guide {type(self).__name__} does not fit model {type(model).__name__}; "
-                f"it fits {', '.join(self.fits)}"
+                f"guide {type(self).__name__} does not fit model {type(model).__name__}; it fits {', '.join(self.fits)}"
             )
         # In a tuple, so that the model's parameters are not registered (and saved) here a second time.
         self._shared = (model,)

@@ -36,9 +36,7 @@ class EffectInference(nn.Module):
 
     def __init__(self, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64) -> None:
         super().__init__()
-        self.objects = nn.Sequential(
-            fully_connected(2 * (3 + feature_dimension), width), fully_connected(width, width)
-        )
+        self.objects = nn.Sequential(fully_connected(2 * (3 + feature_dimension), width), fully_connected(width, width))
         self.scene = fully_connected(width, width)
         self.code = GaussianCode(effect_dimension, width=width)
 
@@ -78,9 +76,7 @@ class MotionInference(nn.Module):
         self.from_pooled = nn.Linear(width, width, bias=False)
         self.code = GaussianCode(motion_dimension, width=width)
 
-    def forward(
-        self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor
-    ) -> TorchDistribution:
+    def forward(self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor) -> TorchDistribution:
         """Leading dimensions broadcast.
 
         Args:

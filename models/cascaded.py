@@ -53,9 +53,7 @@ class CascadedModel(Program):
         self.width = width
         self.maximum_objects = maximum_objects
         self.scales = scales or LikelihoodScales()
-        self.encoder = StateEncoder(
-            feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects
-        )
+        self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects)
         self.dynamics = Dynamics(feature_dimension=feature_dimension, width=width)
         self.meta_dynamics = MetaDynamics(
             effect_dimension=effect_dimension, feature_dimension=feature_dimension, width=width

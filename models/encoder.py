@@ -35,9 +35,7 @@ class StateEncoder(nn.Module):
         Raises `ValueError` for more objects than the model was made for, or features of another length.
         """
         if state.objects > self.maximum_objects:
-            raise ValueError(
-                f"state has {state.objects} objects; this model knows at most {self.maximum_objects}"
-            )
+            raise ValueError(f"state has {state.objects} objects; this model knows at most {self.maximum_objects}")
         if state.features.shape[-1] != self.feature_dimension:
             raise ValueError(
                 f"features have {state.features.shape[-1]} numbers per object; "

@@ -30,9 +30,7 @@ class PointNet(nn.Module):
 class PointNetAutoencoder(nn.Module):
     """PointNet and a decoder: what a feature must know to draw its cloud again."""
 
-    def __init__(
-        self, *, feature_dimension: int = 64, width: int = 128, points: int = DECODED_POINTS
-    ) -> None:
+    def __init__(self, *, feature_dimension: int = 64, width: int = 128, points: int = DECODED_POINTS) -> None:
         super().__init__()
         self.encoder = PointNet(feature_dimension)
         self.decoder = nn.Sequential(

@@ -39,9 +39,7 @@ class State(NamedTuple):
 
     def step(self, index: int | slice) -> State:
         """Index the last leading dimension, usually time: `[..., T] -> [...]` or `[..., t]`."""
-        return State(
-            self.centers[..., index, :, :], self.features[..., index, :, :], self.mask[..., index, :]
-        )
+        return State(self.centers[..., index, :, :], self.features[..., index, :, :], self.mask[..., index, :])
 
     def expand(self, batch_shape: Sequence[int]) -> State:
         """Broadcast to leading dimensions `batch_shape`, as views without copies."""

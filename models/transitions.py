@@ -12,9 +12,7 @@ from models.likelihoods import LikelihoodScales
 from models.state import State, Window, stack_steps
 
 
-def observe_transitions(
-    dynamics: Dynamics, scales: LikelihoodScales, window: Window, encoded: Tensor
-) -> None:
+def observe_transitions(dynamics: Dynamics, scales: LikelihoodScales, window: Window, encoded: Tensor) -> None:
     """s_t+1 ~ f(. | s_t, a_t) at the T observed pairs of `window: [B]`, all at once.
 
     Sites next_centers, event `[T, M, 3]`, and next_features, event `[T, M, F]`. Counted are the pairs of

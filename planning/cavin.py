@@ -51,9 +51,7 @@ class CavinPlanner:
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
         if motion_horizon not in MOTION_HORIZONS:
-            raise ValueError(
-                f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}"
-            )
+            raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
         self.model = model
         self.reward = reward

@@ -41,9 +41,7 @@ def plan_effects(
     Raises ValueError where no plan of an environment has a finite return.
     """
     plans = state.expand_plans(samples)  # [B, N, M, .]
-    here = state.expand_plans(
-        1
-    )  # [B, 1, M, .]: all plans begin here, so the model need not compute it N times
+    here = state.expand_plans(1)  # [B, 1, M, .]: all plans begin here, so the model need not compute it N times
     mask = plans.mask
     progress = returns.start(plans.centers)
     own_numbers = torch.arange(samples, device=mask.device).expand(plans.batch_shape)
@@ -101,6 +99,4 @@ def _where(condition: Tensor, states: State, otherwise: State) -> State:
 def _follow(fields: Sequence[Tensor], numbers: Tensor) -> Tensor:
     """One plan's record of every segment: K fields `[B, N, ...]`, `numbers: [K, B]` -> `[B, K, ...]`."""
     environments = torch.arange(numbers.shape[1], device=numbers.device)
-    return torch.stack(
-        [field[environments, number] for field, number in zip(fields, numbers, strict=True)], 1
-    )
+    return torch.stack([field[environments, number] for field, number in zip(fields, numbers, strict=True)], 1)

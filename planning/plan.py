@@ -24,11 +24,7 @@ class Plan(NamedTuple):
     subgoals: State  # [B, K, M, .] chosen subgoals; those after the plan's end repeat the last one
     segments: Tensor  # [B] int64: segments until the chosen effect plan ends, 1..K; later codes mean nothing
     predicted_centers: Tensor  # [B, S T, M, 3] metres, predicted by f after each of the planned actions
-    expected_return: (
-        Tensor  # [B] cumulative reward of the chosen effect plan; NaN where nothing was predicted
-    )
+    expected_return: Tensor  # [B] cumulative reward of the chosen effect plan; NaN where nothing was predicted
     expected_success: Tensor  # [B] bool: the chosen effect plan reaches the goal
-    candidate_centers: (
-        Tensor  # [B, N, K, M, 3] metres, subgoals of all effect plans, traced back through copies
-    )
+    candidate_centers: Tensor  # [B, N, K, M, 3] metres, subgoals of all effect plans, traced back through copies
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite

@@ -49,9 +49,7 @@ def interpolate(start: Tensor, end: Tensor, steps: int) -> Tensor:
     return torch.lerp(start.unsqueeze(-3), end.unsqueeze(-3), fraction[:, None, None])
 
 
-def advance(
-    progress: Progress, reward: RewardFunction, start: Tensor, centers: Tensor, mask: Tensor
-) -> Progress:
+def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: Tensor, mask: Tensor) -> Progress:
     """Add the rewards of one segment up to and including the step that ends a plan.
 
     `progress`: fields `[...]`; `start: [..., M, 3]` metres, the state before the segment;

@@ -64,7 +64,7 @@ class Answer:
     def complaints(self) -> list[str]:
         """The lines on stderr, apart from progress bars."""
         lines = self.errors.replace("\r", "\n").split("\n")
-        return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+%\|", line)]
+        return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+(%\|| \w+ \[)", line)]
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,7 @@ def clean_pyro() -> Iterator[None]:
     pyro.clear_param_store()
     torch.manual_seed(0)
     # Setting up an episode changes the other two as well, which must not outlive the test.
-    kept = {
-        name: pyro.settings.get(name)
-        for name in ("validate_distributions_pyro", "validate_distributions_torch")
-    }
+    kept = {name: pyro.settings.get(name) for name in ("validate_distributions_pyro", "validate_distributions_torch")}
     with pyro.settings.context(module_local_params=True, **kept):
         yield
     pyro.clear_param_store()

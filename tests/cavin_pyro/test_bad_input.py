@@ -125,6 +125,7 @@ BAD = [
     ("evaluate", "episodes=-2", "episodes must be at least 1, not -2"),
     ("collect", "maximum_objects=6", "maximum_objects must be between minimum_objects=1 and 5, not 6"),
     ("collect", "maximum_objects=2 minimum_objects=3", "between minimum_objects=3 and 5, not 2"),
+    ("collect", "perturbed=2", "perturbed must be between 0 and 1, not 2"),
     ("collect", "seed=-1", "seed must be a whole number from 0 to"),
     ("pretrain", "seed=-1", "seed must be a whole number from 0 to"),
     ("pretrain", "clouds=1", "clouds must be at least 2, not 1"),
@@ -179,6 +180,8 @@ BAD = [
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
     ("pretrain", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
     ("train", "data=@lost_data", "lost_data/episodes-00001.h5 is missing or corrupt"),
+    ("train", "data=[@pushes,@long_data]", "episodes of different length cannot be joined"),
+    ("train", "data=[@pushes,@nothing]", "python -m cavin_pyro.collect"),
     ("collect", "output=@old_data", "has format version 0"),
     ("collect", "output=@pushes seed=4", "holds a dataset with"),
     ("evaluate", "output=@used", "holds a run with"),
@@ -274,6 +277,9 @@ def spoil_data(folder: Path, good: Path) -> None:
     write_metadata(folder / "old_data", {**metadata, "version": 0})
     write_metadata(folder / "foreign_data", {**metadata, "format": "photographs"})
     (folder / "damaged_data" / "metadata.json").write_text("{")
+    shutil.copytree(good, folder / "long_data")
+    settings = {**metadata["settings"], "steps": 9}
+    write_metadata(folder / "long_data", {**metadata, "settings": settings})
     shutil.copytree(good, folder / "lost_data")
     shard_path(folder / "lost_data", 1).unlink()
     shutil.copytree(good, folder / "corrupt_data")
@@ -290,9 +296,7 @@ def without_features(contents: dict[str, bytes]) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def answers(
-    shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.TempPathFactory
-) -> SimpleNamespace:
+def answers(shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """How every case ended, what it left in its folder, and what became of the material."""
     before = without_features(shell.contents(material))
     rows = [(command, "", "") for command in GOOD] + BAD
@@ -300,15 +304,11 @@ def answers(
     for command, words, _ in rows:
         line = f"output=out {GOOD[command]} {words}"
         line = re.sub(r"@([\w.]+)", lambda name: str(material / name[1]), line)
-        cases[name_of(command, words)] = shell.Case(
-            command, line.split()
-        )  # the last of several values counts
+        cases[name_of(command, words)] = shell.Case(command, line.split())  # the last of several values counts
     folder = tmp_path_factory.mktemp("answers")
     ended = shell.run_in_turn(cases, folder)
     left = {name: [path for path in (folder / name).rglob("*") if path.is_file()] for name in cases}
-    return SimpleNamespace(
-        ended=ended, left=left, before=before, after=without_features(shell.contents(material))
-    )
+    return SimpleNamespace(ended=ended, left=left, before=before, after=without_features(shell.contents(material)))
 
 
 @pytest.mark.parametrize("command", GOOD)

@@ -77,9 +77,7 @@ def test_sizes_are_counts() -> None:
 
 
 def test_an_objective_is_any_elbo_of_pyro() -> None:
-    config = {
-        "objective": {"_target_": "pyro.infer.Trace_ELBO", "num_particles": 3, "vectorize_particles": True}
-    }
+    config = {"objective": {"_target_": "pyro.infer.Trace_ELBO", "num_particles": 3, "vectorize_particles": True}}
     objective = build_objective(config)
     assert isinstance(objective, Trace_ELBO)
     assert objective.num_particles == 3

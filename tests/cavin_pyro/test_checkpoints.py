@@ -45,9 +45,7 @@ def test_weights_configuration_and_provenance_come_back(small: SimpleNamespace, 
             assert torch.equal(part.state_dict()[key], value)
 
 
-def test_a_checkpoint_alone_is_enough_to_build_its_parts(
-    small: SimpleNamespace, checkpoint_file: Path
-) -> None:
+def test_a_checkpoint_alone_is_enough_to_build_its_parts(small: SimpleNamespace, checkpoint_file: Path) -> None:
     checkpoint = load_checkpoint(checkpoint_file)
     model = build_model(checkpoint.config)
     checkpoint.load_into("model", model, checkpoint_file)
@@ -87,9 +85,7 @@ def test_a_checkpoint_cut_short_is_refused(length: int, checkpoint_file: Path, t
 def test_weights_of_another_architecture_are_named(small: SimpleNamespace, checkpoint_file: Path) -> None:
     checkpoint, config = load_checkpoint(checkpoint_file), small.config()
     config["model"]["width"] = 16
-    with pytest.raises(
-        UserError, match=r"model\.\S+ has shape \[.*\] in the file and \[.*\] in CascadedModel"
-    ):
+    with pytest.raises(UserError, match=r"model\.\S+ has shape \[.*\] in the file and \[.*\] in CascadedModel"):
         checkpoint.load_into("model", build_model(config), checkpoint_file)
     with pytest.raises(UserError, match="in the file and None in PointNet"):
         checkpoint.load_into("model", PointNet(), checkpoint_file)
@@ -124,7 +120,7 @@ def test_a_checkpoint_may_name_classes_of_this_program_only(
         for step in place:
             part = part[step]
         part["_target_"] = target
-        with pytest.raises(UserError, match="asks to run .*, which is not part of this program"):
+        with pytest.raises(UserError, match=r"asks to run .*, which is not part of this program"):
             load_checkpoint(rewritten(checkpoint_file, tmp_path, config))
 
 

@@ -30,9 +30,7 @@ def test_a_run_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace,
     words = ["transitions=80", "steps=2", "episodes_per_shard=1", "seed=5"]
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     for shards in (1, 6, 11):  # wait for that many, then for a random moment
-        process = shell.start_command(
-            "collect", *words, "workers=2", f"output={broken}", folder=tmp_path, quiet=True
-        )
+        process = shell.start_command("collect", *words, "workers=2", f"output={broken}", folder=tmp_path, quiet=True)
         while process.poll() is None and not shard_path(broken, shards - 1).exists():
             time.sleep(0.002)
         time.sleep(random.uniform(0.0, 0.05))
@@ -47,9 +45,7 @@ def test_a_run_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace,
     assert len(data_of(whole)) == 40 + 1
 
 
-def test_a_dataset_grows_without_changing_what_it_held(
-    small: SimpleNamespace, pushes: Path, tmp_path: Path
-) -> None:
+def test_a_dataset_grows_without_changing_what_it_held(small: SimpleNamespace, pushes: Path, tmp_path: Path) -> None:
     for transitions in (1, 20, 30, 60, 60):
         metadata = collect(small.pushes, tmp_path, transitions=transitions, workers=1)
         assert metadata["transitions"] >= transitions
@@ -105,9 +101,7 @@ def test_other_settings_are_refused_and_change_nothing(small: SimpleNamespace, o
         ({"steps": 7}, "holds a dataset with steps=6, not 7"),
         ({"ranges": replace(small.pushes.ranges, mass=(1.0, 1.0))}, "holds a dataset with ranges="),
     ):
-        with pytest.raises(
-            UserError, match=f"{said}.*: resume with the same settings, or choose another output=DIR"
-        ):
+        with pytest.raises(UserError, match=f"{said}.*: resume with the same settings, or choose another output=DIR"):
             collect(replace(small.pushes, **changes), own_pushes, transitions=100, workers=1)
     assert data_of(own_pushes) == before
 

@@ -14,9 +14,7 @@ from cavin_pyro.features import cloud_features, fingerprint, sample_clouds, shar
 from models.pointnet import PointNet
 
 
-def test_features_are_what_pointnet_says_of_each_cloud(
-    own_pushes: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_features_are_what_pointnet_says_of_each_cloud(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(features, "BATCH", 7)  # does not divide the number of clouds
     pointnet = PointNet()
     found = shard_features(own_pushes, 1, pointnet, fingerprint(pointnet))
@@ -72,18 +70,14 @@ def test_damaged_features_are_made_again(own_pushes: Path) -> None:
     assert read_shard(path)["features"].shape == first.shape
 
 
-def test_a_dataset_that_cannot_be_written_to_can_be_read(
-    own_pushes: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dataset_that_cannot_be_written_to_can_be_read(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(source: Path, target: Path) -> None:
         raise PermissionError(13, os.strerror(13))
 
     monkeypatch.setattr(os, "replace", refuse)
     pointnet = PointNet()
     found = shard_features(own_pushes, 0, pointnet, fingerprint(pointnet))
-    np.testing.assert_array_equal(
-        found, cloud_features(pointnet, read_shard(shard_path(own_pushes, 0))["clouds"])
-    )
+    np.testing.assert_array_equal(found, cloud_features(pointnet, read_shard(shard_path(own_pushes, 0))["clouds"]))
     assert not list(own_pushes.glob("features-*/*"))
 
 

@@ -60,9 +60,7 @@ def made_up_plan(segments: int = 2) -> Plan:
     return random_plan()._replace(
         effect_codes=torch.zeros(1, K, 16),
         motion_codes=torch.zeros(1, K, 16),
-        subgoals=State(
-            subgoals[None], torch.ones(1, K, OBJECTS, 64), torch.ones(1, K, OBJECTS, dtype=torch.bool)
-        ),
+        subgoals=State(subgoals[None], torch.ones(1, K, OBJECTS, 64), torch.ones(1, K, OBJECTS, dtype=torch.bool)),
         segments=torch.tensor([segments]),
         predicted_centers=(start + along.repeat_interleave(T, 0))[None],
         expected_return=torch.tensor([90.0]),
@@ -107,9 +105,7 @@ def test_at_most_six_decisions_are_shown_from_the_first_to_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = []
-    monkeypatch.setattr(
-        figures, "draw_decision", lambda panel, shown_one, *rest: shown.append(shown_one.step)
-    )
+    monkeypatch.setattr(figures, "draw_decision", lambda panel, shown_one, *rest: shown.append(shown_one.step))
     draw_plan(tmp_path / "plan.png", episode(*[random_plan()] * 20), load_layout("clearing", 0), CAMERA)
     assert len(shown) == 6
     assert shown == sorted(shown)
@@ -128,22 +124,14 @@ def test_an_episode_without_decisions_and_empty_metrics_are_refused_and_leave_no
     with pytest.raises(ValueError, match="no row"):
         draw_training(tmp_path / "training.png", [])
     with pytest.raises(ValueError, match="no cloud"):
-        draw_reconstructions(
-            tmp_path / "clouds.png", PointNetAutoencoder(), np.zeros((0, 256, 3), np.float32)
-        )
+        draw_reconstructions(tmp_path / "clouds.png", PointNetAutoencoder(), np.zeros((0, 256, 3), np.float32))
     assert not list(tmp_path.iterdir())
 
 
 def test_the_legend_names_what_is_drawn_and_nothing_else() -> None:
     layout = load_layout("crossing", 0)
-    full = [
-        entry.get_label()
-        for entry in figures_panel.legend(layout, [decision(made_up_plan())], candidates=True)
-    ]
-    bare = [
-        entry.get_label()
-        for entry in figures_panel.legend(layout, [decision(random_plan())], candidates=False)
-    ]
+    full = [entry.get_label() for entry in figures_panel.legend(layout, [decision(made_up_plan())], candidates=True)]
+    bare = [entry.get_label() for entry in figures_panel.legend(layout, [decision(random_plan())], candidates=False)]
     assert full == ["bridge", "goal", "target", "seen", "candidates", "subgoals", "predicted", "push"]
     assert bare == ["bridge", "goal", "target", "seen", "push"]
 
@@ -156,9 +144,7 @@ def test_chains_end_where_the_plan_does_and_leave_out_what_hardly_moves(segments
     assert len(chain) == 1 + segments
     assert len(path) == 1 + segments * T
     np.testing.assert_allclose(chain[0], CAMERA.project(seen.centers[0]))
-    np.testing.assert_allclose(
-        chain[-1], CAMERA.project(seen.centers[0] + [0.05 * segments, 0.0, 0.0]), atol=1e-3
-    )
+    np.testing.assert_allclose(chain[-1], CAMERA.project(seen.centers[0] + [0.05 * segments, 0.0, 0.0]), atol=1e-3)
     np.testing.assert_allclose(path[-1], chain[-1], atol=1e-3)
 
 
@@ -209,9 +195,7 @@ def test_every_task_draws_its_region_and_the_goal_where_there_is_one() -> None:
 
 
 @pytest.mark.parametrize("rows", [1, 50])
-def test_training_curves_are_drawn_from_numbers_and_from_words_of_a_csv_file(
-    rows: int, tmp_path: Path
-) -> None:
+def test_training_curves_are_drawn_from_numbers_and_from_words_of_a_csv_file(rows: int, tmp_path: Path) -> None:
     table: list[dict[str, str | float]] = [
         {
             "step": str(100 * number),

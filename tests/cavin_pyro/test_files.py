@@ -78,5 +78,5 @@ def test_an_output_folder_is_made_and_cleared_of_what_a_kill_left(tmp_path: Path
 def test_an_output_folder_below_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for place in ("file", "file/below"):
-        with pytest.raises(UserError, match="cannot be written .*: choose another with output=DIR"):
+        with pytest.raises(UserError, match=r"cannot be written .*: choose another with output=DIR"):
             output_folder(tmp_path / place)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -84,7 +85,7 @@ def test_a_cosine_falls_from_the_learning_rate_to_a_hundredth() -> None:
     assert rates[0] == 1e-3
     assert rates[50] == pytest.approx(0.505e-3)
     assert rates[100] == pytest.approx(1e-5)
-    assert all(later < earlier for earlier, later in zip(rates, rates[1:], strict=False))
+    assert all(later < earlier for earlier, later in itertools.pairwise(rates))
 
 
 def test_the_optimiser_follows_the_schedule(small: SimpleNamespace, tmp_path: Path) -> None:
@@ -109,9 +110,7 @@ def test_training_lowers_the_loss_and_reports_every_term(small: SimpleNamespace,
         "validation_kl_effect_code",
         "validation_kl_motion_code",
     ]
-    assert {"step", "training_loss", "validation_loss", "learning_rate", "windows_per_second", *terms} == set(
-        names
-    )
+    assert {"step", "training_loss", "validation_loss", "learning_rate", "windows_per_second", *terms} == set(names)
     assert read_rows(tmp_path / "run" / "metrics.csv") == run.rows
     assert list((tmp_path / "run" / "tensorboard").iterdir())
     assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").provenance == {"step": run.best_step}
@@ -143,13 +142,9 @@ def test_validation_always_uses_the_same_noise(small: SimpleNamespace, tmp_path:
     run = trainer(small, tmp_path / "run", TrainerSettings(**{**vars(SHORT), "learning_rate": 0.0}))
     run.run()
     assert len({row["validation_loss"] for row in run.rows}) == 1
-    terms = [
-        value for name, value in run.rows[0].items() if name.startswith(("validation_nll", "validation_kl"))
-    ]
+    terms = [value for name, value in run.rows[0].items() if name.startswith(("validation_nll", "validation_kl"))]
     # Every window counts here, and each holds three transitions.
-    latent = [
-        value for name, value in run.rows[0].items() if name.startswith("validation_") and "next" not in name
-    ]
+    latent = [value for name, value in run.rows[0].items() if name.startswith("validation_") and "next" not in name]
     dynamics = sum(terms) - sum(value for value in latent if value != run.rows[0]["validation_loss"])
     assert run.rows[0]["validation_loss"] == pytest.approx(sum(terms) + 2 * dynamics, rel=1e-5)
 

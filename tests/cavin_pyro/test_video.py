@@ -168,9 +168,7 @@ def test_an_episode_is_filmed_from_the_first_push_to_the_last(tmp_path: Path) ->
     path = tmp_path / "episode.mp4"
     with EpisodeVideo(path, env.layout) as video:
         film(env, video)
-        episode = run_episode(
-            env, RandomPlanner(), PointNet(), seed=0, photograph=True, on_decision=video.set_decision
-        )
+        episode = run_episode(env, RandomPlanner(), PointNet(), seed=0, photograph=True, on_decision=video.set_decision)
     env.close()
     images = read(path)
     safe = sum(not push.unsafe for push in episode.pushes)

@@ -15,9 +15,7 @@ from models.pointnet import PointNet
 
 STEPS, OBJECTS = 5, 2
 POSITIONS = STEPS + 1
-EVERY = WindowSettings(
-    validation_fraction=0.5, quiet_fraction=1.0
-)  # keeps also the windows that do not count
+EVERY = WindowSettings(validation_fraction=0.5, quiet_fraction=1.0)  # keeps also the windows that do not count
 FIRST = 3  # the shard's first episode, so that numbers and places differ
 
 
@@ -50,12 +48,12 @@ def write(folder: Path, *shards: Arrays) -> Path:
         "episodes": sum(len(arrays["length"]) for arrays in shards),
         "transitions": 0,
     }
-    write_metadata(folder, {"settings": {}, **counts})
+    write_metadata(folder, {"settings": {"steps": STEPS}, **counts})
     return folder
 
 
 def load(folder: Path, arrays: Arrays, settings: WindowSettings = EVERY) -> WindowTable:
-    return load_windows(write(folder / "data", arrays), PointNet(), settings)
+    return load_windows([write(folder / "data", arrays)], PointNet(), settings)
 
 
 def counted_windows(table: WindowTable) -> set[tuple[int, int]]:
@@ -171,7 +169,7 @@ def test_a_share_of_the_windows_that_do_not_count_is_kept(tmp_path: Path) -> Non
     sizes = {}
     for share in (0.0, 0.25, 1.0):
         settings = WindowSettings(validation_fraction=0.5, quiet_fraction=share)
-        table = load_windows(folder, PointNet(), settings)
+        table = load_windows([folder], PointNet(), settings)
         assert int(table.sequence_mask.sum()) == 12
         sizes[share] = len(table.starts) - 12
     assert (sizes[0.0], sizes[1.0]) == (0, 396 * 3)
@@ -181,9 +179,7 @@ def test_a_share_of_the_windows_that_do_not_count_is_kept(tmp_path: Path) -> Non
 def split(table: WindowTable) -> tuple[set[int], set[int]]:
     """The places of the episodes whose windows are for training and for validation."""
     numbers = (table.training, table.validation)
-    training, validation = (
-        {start // POSITIONS for start in table.starts[chosen].tolist()} for chosen in numbers
-    )
+    training, validation = ({start // POSITIONS for start in table.starts[chosen].tolist()} for chosen in numbers)
     return training, validation
 
 
@@ -198,10 +194,8 @@ def test_no_episode_is_on_both_sides_and_none_is_lost(tmp_path: Path) -> None:
 
 def test_more_data_do_not_change_what_was_held_out(tmp_path: Path) -> None:
     settings = WindowSettings(validation_fraction=0.3)
-    few = load_windows(write(tmp_path / "few", episodes(30)), PointNet(), settings)
-    more = load_windows(
-        write(tmp_path / "more", episodes(30), episodes(70, FIRST + 30)), PointNet(), settings
-    )
+    few = load_windows([write(tmp_path / "few", episodes(30))], PointNet(), settings)
+    more = load_windows([write(tmp_path / "more", episodes(30), episodes(70, FIRST + 30))], PointNet(), settings)
     assert {place for place in split(more)[1] if place < 30} == split(few)[1]
     assert max(split(more)[1]) >= 30
 
@@ -209,7 +203,7 @@ def test_more_data_do_not_change_what_was_held_out(tmp_path: Path) -> None:
 def test_another_seed_holds_out_other_episodes(tmp_path: Path) -> None:
     folder = write(tmp_path / "data", episodes(100))
     first, second = (
-        split(load_windows(folder, PointNet(), WindowSettings(validation_fraction=0.3, seed=seed)))[1]
+        split(load_windows([folder], PointNet(), WindowSettings(validation_fraction=0.3, seed=seed)))[1]
         for seed in (0, 1)
     )
     assert first != second
@@ -219,7 +213,7 @@ def test_a_batch_holds_what_the_arrays_hold(tmp_path: Path) -> None:
     arrays = episodes()
     arrays["mask"][4, 1] = False
     pointnet = PointNet()
-    table = load_windows(write(tmp_path / "data", arrays), pointnet, EVERY)
+    table = load_windows([write(tmp_path / "data", arrays)], pointnet, EVERY)
     numbers = torch.tensor([0, 13, 35, 13])
     window = table.batch(numbers)
     assert window.batch_shape == (4,)
@@ -228,9 +222,7 @@ def test_a_batch_holds_what_the_arrays_hold(tmp_path: Path) -> None:
         episode, step = divmod(number, 3)
         ahead = slice(step, step + 4)
         np.testing.assert_array_equal(window.states.centers[row], arrays["centers"][episode, ahead])
-        np.testing.assert_array_equal(
-            window.states.mask[row], arrays["mask"][episode].repeat(4).reshape(2, 4).T
-        )
+        np.testing.assert_array_equal(window.states.mask[row], arrays["mask"][episode].repeat(4).reshape(2, 4).T)
         np.testing.assert_array_equal(window.actions[row], arrays["actions"][episode, step : step + 3])
         with torch.no_grad():
             features = pointnet(torch.from_numpy(arrays["clouds"][episode, ahead]).float())
@@ -239,21 +231,32 @@ def test_a_batch_holds_what_the_arrays_hold(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("length", [1, 2, 5])
 def test_segments_of_any_length_that_an_episode_holds(length: int, tmp_path: Path) -> None:
-    settings = WindowSettings(
-        segment_length=length, validation_fraction=0.5, quiet_fraction=1.0, minimum_move=0.04
-    )
+    settings = WindowSettings(segment_length=length, validation_fraction=0.5, quiet_fraction=1.0, minimum_move=0.04)
     table = load(tmp_path, episodes(), settings)
     assert len(table.starts) == 12 * (POSITIONS - length)
     assert table.batch(torch.arange(2)).segment_length == length
 
 
+def test_datasets_can_be_joined_if_their_episodes_are_as_long(tmp_path: Path) -> None:
+    first, second = write(tmp_path / "first", episodes()), write(tmp_path / "second", episodes(5, first=70))
+    table = load_windows([first, second], PointNet(), EVERY)
+    assert len(table.starts) == 3 * (12 + 5)
+    joined = table.batch(torch.tensor([36, 50]))
+    arrays = episodes(5, first=70)
+    np.testing.assert_array_equal(joined.actions[0], arrays["actions"][0, :3])
+    np.testing.assert_array_equal(joined.actions[1], arrays["actions"][4, 2:5])
+    write_metadata(second, {"settings": {"steps": 7}, "shards": 1, "episodes": 5, "transitions": 0})
+    with pytest.raises(UserError, match="different length cannot be joined: .*first has steps=5, .*second has steps=7"):
+        load_windows([first, second], PointNet(), EVERY)
+
+
 def test_datasets_without_a_window_are_refused(tmp_path: Path) -> None:
     folder = write(tmp_path / "data", episodes())
     with pytest.raises(UserError, match="5 pushes per episode, too few for windows of T=6"):
-        load_windows(folder, PointNet(), WindowSettings(segment_length=6))
+        load_windows([folder], PointNet(), WindowSettings(segment_length=6))
     for fraction, missing in ((0.0, "validation"), (1.0, "training")):
         with pytest.raises(UserError, match=f"no {missing} window in which an object moved more than 0.1 m"):
-            load_windows(folder, PointNet(), WindowSettings(validation_fraction=fraction))
+            load_windows([folder], PointNet(), WindowSettings(validation_fraction=fraction))
 
 
 def test_the_whole_shards_of_a_damaged_dataset_are_used_if_asked_for(
@@ -262,7 +265,7 @@ def test_the_whole_shards_of_a_damaged_dataset_are_used_if_asked_for(
     folder = write(tmp_path / "data", episodes(), episodes(12, FIRST + 12))
     (folder / "episodes-00000.h5").write_bytes(b"nothing")
     with pytest.raises(UserError, match=r"episodes-00000\.h5"):
-        load_windows(folder, PointNet(), EVERY)
-    table = load_windows(folder, PointNet(), EVERY, skip_corrupt=True)
+        load_windows([folder], PointNet(), EVERY)
+    table = load_windows([folder], PointNet(), EVERY, skip_corrupt=True)
     assert "left out: shard" in capsys.readouterr().out
     assert len(table.starts) == 36

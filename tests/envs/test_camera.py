@@ -66,9 +66,7 @@ def test_the_bare_table_lies_at_height_zero(scene: Scene, put: Callable) -> None
 
 
 @pytest.mark.parametrize("name", ["gelatin_box", "rubiks_cube", "sugar_box"])
-def test_the_cloud_of_a_box_right_under_the_camera_is_centred_on_it(
-    scene: Scene, put: Callable, name: str
-) -> None:
+def test_the_cloud_of_a_box_right_under_the_camera_is_centred_on_it(scene: Scene, put: Callable, name: str) -> None:
     seen = scene.reset([put(name, 0.6, 0.0)], np.random.default_rng(0))
     truth = scene.ground_truth().positions[0]
     # The renderer samples a pixel at its corner, so points lie half a pixel too far along +x and -y; the rest

@@ -150,9 +150,7 @@ def test_overrides_replace_the_fields_that_they_name() -> None:
         ("crossing", {"task": ["crossing"]}, r"unknown task \['crossing'\], choose from"),
     ],
 )
-def test_a_layout_that_makes_no_sense_gets_its_one_line(
-    tmp_path: Path, task: str, change: dict, message: str
-) -> None:
+def test_a_layout_that_makes_no_sense_gets_its_one_line(tmp_path: Path, task: str, change: dict, message: str) -> None:
     path = write(tmp_path, CROSSING | change)
     with pytest.raises(ValueError, match=message) as caught:
         load_layout(task, path)
@@ -198,16 +196,12 @@ def test_a_layout_that_is_no_file_is_told_what_to_give(tmp_path: Path, layout: A
 
 @pytest.mark.parametrize("layout", [3, "3", "17"])
 def test_an_unknown_number_is_told_the_known_ones(layout: Any) -> None:
-    with pytest.raises(
-        ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2 or the path of a YAML file$"
-    ):
+    with pytest.raises(ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2 or the path of a YAML file$"):
         load_layout("crossing", layout)
 
 
 def test_an_unknown_task_is_told_the_known_ones() -> None:
-    with pytest.raises(
-        ValueError, match=r"^unknown task 'juggling': choose from clearing, insertion, crossing$"
-    ):
+    with pytest.raises(ValueError, match=r"^unknown task 'juggling': choose from clearing, insertion, crossing$"):
         load_layout("juggling", 0)
 
 

@@ -23,9 +23,7 @@ def within(area: Area, point: np.ndarray) -> bool:
 
 @settings(deadline=None)
 @given(seed=SEEDS, count=st.integers(1, 5), clearance=st.floats(0.0, 0.18))
-def test_arranged_objects_keep_their_distance_and_their_areas(
-    seed: int, count: int, clearance: float
-) -> None:
+def test_arranged_objects_keep_their_distance_and_their_areas(seed: int, count: int, clearance: float) -> None:
     areas = [TWO_TILES, *[WHOLE_TABLE] * (count - 1)]
     positions = arrange(areas, clearance, np.random.default_rng(seed))
     assert positions.shape == (count, 2)
@@ -43,16 +41,12 @@ def test_every_rectangle_of_an_area_is_used() -> None:
 def test_too_small_an_area_gets_its_one_line() -> None:
     tile: Area = (((0.3, 0.0), (0.4, 0.1)),)
     arrange([tile], 0.15, np.random.default_rng(0))
-    with pytest.raises(
-        ValueError, match=r"^no room for 2 objects at least 0.15 m apart .* fewer objects"
-    ) as caught:
+    with pytest.raises(ValueError, match=r"^no room for 2 objects at least 0.15 m apart .* fewer objects") as caught:
         arrange([tile, tile], 0.15, np.random.default_rng(0))
     assert "\n" not in str(caught.value)
 
 
-RANGES = ObjectRanges(
-    names=("banana", "mug", "sugar_box"), scale=(0.9, 1.1), mass=(2.0, 3.0), friction=(0.6, 0.7)
-)
+RANGES = ObjectRanges(names=("banana", "mug", "sugar_box"), scale=(0.9, 1.1), mass=(2.0, 3.0), friction=(0.6, 0.7))
 
 
 @settings(deadline=None)
@@ -67,9 +61,7 @@ def test_parameters_lie_within_their_ranges(seed: int, count: int) -> None:
         assert 2.0 * shape.mass <= one.mass <= 3.0 * shape.mass
         assert 0.6 <= one.friction <= 0.7
         assert np.linalg.norm(one.orientation) == pytest.approx(1.0)
-        assert (np.array(TABLE_LOW) < one.position[:2]).all() and (
-            np.array(TABLE_HIGH) > one.position[:2]
-        ).all()
+        assert (np.array(TABLE_LOW) < one.position[:2]).all() and (np.array(TABLE_HIGH) > one.position[:2]).all()
 
 
 @settings(deadline=None)

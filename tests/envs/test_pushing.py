@@ -21,9 +21,7 @@ from envs.scene import Observation, PushReport
 from envs.tasks import TaskReward
 from envs.workspace import normalised_push, tile_center
 
-NOTHING = np.array(
-    [-1.0, -1.0, 0.0, 0.0], dtype=np.float32
-)  # in a corner where no builtin task starts objects
+NOTHING = np.array([-1.0, -1.0, 0.0, 0.0], dtype=np.float32)  # in a corner where no builtin task starts objects
 LYING_ALONG_Y = (-0.5, -0.5, -0.5, 0.5)
 BRIDGE = Layout("crossing", ((2, 2), (2, 3), (2, 4)), ((2, 2),), ((2, 4),), ((1, 3), (3, 3)))
 Make = Callable[..., PushingEnv]
@@ -48,9 +46,7 @@ def make() -> Iterator[Make]:
 
 
 def observation(seen: dict[str, np.ndarray]) -> Observation:
-    return Observation(
-        seen["clouds"], seen["centers"], seen["mask"].astype(bool), seen["visible"].astype(bool)
-    )
+    return Observation(seen["clouds"], seen["centers"], seen["mask"].astype(bool), seen["visible"].astype(bool))
 
 
 def assert_equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
@@ -103,9 +99,7 @@ def test_one_to_five_objects_can_be_asked_for(make: Make, objects: int) -> None:
 
 @pytest.mark.parametrize("task", TASK_NAMES)
 @pytest.mark.parametrize("layout", [0, 1, 2])
-def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(
-    make: Make, task: str, layout: int
-) -> None:
+def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(make: Make, task: str, layout: int) -> None:
     env = make(task=task, layout=layout, objects=3)
     reward = TaskReward(env.layout)
     for seed in range(3):
@@ -184,9 +178,7 @@ def test_pushing_the_target_to_the_goal_ends_the_episode_with_success(make: Make
     assert reward == pytest.approx(99 + info["terms"]["progress"])
 
 
-def test_pushing_the_target_off_the_bridge_ends_the_episode_with_a_violation(
-    make: Make, put: Callable
-) -> None:
+def test_pushing_the_target_off_the_bridge_ends_the_episode_with_a_violation(make: Make, put: Callable) -> None:
     x, y = tile_center((2, 4))
     env = make(put("rubiks_cube", x + 0.05, y), layout=BRIDGE, objects=1)
     env.reset(seed=0)
@@ -282,9 +274,7 @@ def test_what_a_caller_does_to_an_observation_changes_no_reward(make: Make) -> N
 def test_a_layout_may_be_a_number_a_file_or_an_object(make: Make, tmp_path: Path) -> None:
     path = tmp_path / "unseen.yaml"
     tiles = {
-        name: [list(tile) for tile in getattr(BRIDGE, name)]
-        for name in BRIDGE.__dataclass_fields__
-        if name != "task"
+        name: [list(tile) for tile in getattr(BRIDGE, name)] for name in BRIDGE.__dataclass_fields__ if name != "task"
     }
     path.write_text(yaml.safe_dump(tiles))
     layouts = [make(layout=one).layout for one in (BRIDGE, path, str(path))]
@@ -325,9 +315,7 @@ def test_a_bad_argument_gets_its_one_line(options: dict, message: str) -> None:
 
 def test_a_layout_without_room_is_refused_at_reset(make: Make) -> None:
     env = make(layout=BRIDGE, objects=5, ranges=ObjectRanges(clearance=0.3))
-    with pytest.raises(
-        ValueError, match=r"^no room for 5 objects at least 0.3 m apart where the layout starts"
-    ):
+    with pytest.raises(ValueError, match=r"^no room for 5 objects at least 0.3 m apart where the layout starts"):
         env.reset(seed=0)
 
 

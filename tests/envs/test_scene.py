@@ -116,9 +116,7 @@ def test_a_pushed_object_moves_forward_and_stops_where_the_tool_stops(
     assert abs(gap(scene, end)) < 0.015
 
 
-def test_a_push_onto_an_object_is_unsafe_and_moves_nothing(
-    scene: Scene, put: Callable, push: Callable
-) -> None:
+def test_a_push_onto_an_object_is_unsafe_and_moves_nothing(scene: Scene, put: Callable, push: Callable) -> None:
     scene.reset([put("rubiks_cube", 0.55, 0.0), put("mug", 0.55, 0.2)], np.random.default_rng(0))
     before = truth(scene)
     report = scene.push(push(0.55, 0.01, 0.1, 0.0))
@@ -135,9 +133,7 @@ def test_a_push_in_empty_space_is_safe_and_ineffective(scene: Scene, put: Callab
     np.testing.assert_allclose(truth(scene), before, atol=1e-5)
 
 
-def test_an_object_that_only_turns_is_not_reported_as_unmoved(
-    scene: Scene, put: Callable, push: Callable
-) -> None:
+def test_an_object_that_only_turns_is_not_reported_as_unmoved(scene: Scene, put: Callable, push: Callable) -> None:
     scene.reset([put("sugar_box", 0.55, 0.0, orientation=LYING_ALONG_Y)], np.random.default_rng(0))
     before = Rotation.from_quat(scene.ground_truth().orientations[0])
     surface = 0.55 - 0.089 / 2 - STICK_RADIUS
@@ -163,14 +159,10 @@ def test_the_tool_leaves_the_view_after_a_push(
     "action",
     [[0.0, 0.0, np.nan, 0.0], [np.inf, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [[0.0] * 4], 0.5],
 )
-def test_an_action_that_is_not_four_finite_numbers_is_refused(
-    scene: Scene, put: Callable, action: list
-) -> None:
+def test_an_action_that_is_not_four_finite_numbers_is_refused(scene: Scene, put: Callable, action: list) -> None:
     scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
     before = truth(scene)
-    with pytest.raises(
-        ValueError, match=r"^an action is four finite numbers \(x, y, dx, dy\), not "
-    ) as caught:
+    with pytest.raises(ValueError, match=r"^an action is four finite numbers \(x, y, dx, dy\), not ") as caught:
         scene.push(np.array(action))
     assert "\n" not in str(caught.value)
     np.testing.assert_array_equal(truth(scene), before)
@@ -196,9 +188,7 @@ def off_the_edge(scene: Scene, put: Callable, push: Callable) -> PushReport:
     box = put("sugar_box", 0.55, 0.50, orientation=LYING_ALONG_Y)
     scene.reset([put("rubiks_cube", 0.45, 0.0), box], np.random.default_rng(0))
     assert scene.ground_truth().positions[1, 2] > 0
-    return max(
-        (scene.push(push(0.55, 0.39 + 0.05 * n, 0.0, 0.1)) for n in range(4)), key=lambda one: one.fallen
-    )
+    return max((scene.push(push(0.55, 0.39 + 0.05 * n, 0.0, 0.1)) for n in range(4)), key=lambda one: one.fallen)
 
 
 def test_an_object_pushed_off_the_table_has_fallen(scene: Scene, put: Callable, push: Callable) -> None:
@@ -251,9 +241,7 @@ def test_an_object_never_seen_is_not_in_the_mask(put: Callable, push: Callable) 
     scene.close()
 
 
-def test_a_later_look_does_not_change_an_earlier_observation(
-    scene: Scene, put: Callable, push: Callable
-) -> None:
+def test_a_later_look_does_not_change_an_earlier_observation(scene: Scene, put: Callable, push: Callable) -> None:
     seen = scene.reset([put("mug", 0.55, 0.0)], np.random.default_rng(0))
     clouds, mask = seen.clouds.copy(), seen.mask.copy()
     scene.push(push(0.45, 0.0, 0.1, 0.0))
@@ -313,13 +301,9 @@ def test_the_time_is_booked_where_it_goes(scene: Scene, put: Callable, push: Cal
 
 
 def test_the_tool_fits_into_a_mug_and_not_into_a_can(scene: Scene, put: Callable) -> None:
-    scene.reset(
-        [put("mug", 0.5, 0.2, scale=1.2), put("tomato_soup_can", 0.5, -0.2)], np.random.default_rng(0)
-    )
+    scene.reset([put("mug", 0.5, 0.2, scale=1.2), put("tomato_soup_can", 0.5, -0.2)], np.random.default_rng(0))
     (mug, can), tool = scene.bodies, scene.robot._tool
-    floor = scene.ground_truth().positions[0, :2] - 1.2 * np.array(
-        [0.008, 0.0]
-    )  # the handle pulls the origin
+    floor = scene.ground_truth().positions[0, :2] - 1.2 * np.array([0.008, 0.0])  # the handle pulls the origin
     inside = []
     for body, place in ((mug, floor), (can, scene.ground_truth().positions[1, :2])):
         scene.world.place(tool, (*place, 0.1), (0.0, 0.0, 0.0))

@@ -62,9 +62,7 @@ def test_boxes_have_their_published_sides(name: str) -> None:
 def test_round_objects_have_their_published_diameter_and_height(name: str) -> None:
     (diameter, height), mass = ROUND[name]
     shape = builtin_shape(name)
-    points = (
-        corners(shape) if name != "mug" else corners(Shape(name, shape.parts[:-3], shape.mass))
-    )  # no handle
+    points = corners(shape) if name != "mug" else corners(Shape(name, shape.parts[:-3], shape.mass))  # no handle
     assert np.ptp(points[:, 2]) == pytest.approx(height, abs=TOLERANCE)
     middle = (points.min(axis=0) + points.max(axis=0))[:2] / 2
     assert 2 * np.linalg.norm(points[:, :2] - middle, axis=1).max() == pytest.approx(diameter, abs=TOLERANCE)
@@ -144,8 +142,6 @@ def test_a_mesh_file_holds_a_group_per_part_and_is_written_once(tmp_path: Path) 
     lines = path.read_text().splitlines()
     assert sum(line.startswith("o ") for line in lines) == len(builtin_shape("mug").parts)
     vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)
-    np.testing.assert_allclose(
-        1000 * vertices.min(axis=0), corners(builtin_shape("mug")).min(axis=0), atol=1e-3
-    )
+    np.testing.assert_allclose(1000 * vertices.min(axis=0), corners(builtin_shape("mug")).min(axis=0), atol=1e-3)
     path.write_text("mine")
     assert write_mesh(builtin_shape("mug"), tmp_path).read_text() == "mine"

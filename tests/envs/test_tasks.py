@@ -290,9 +290,7 @@ def test_padding_within_the_region_to_clear_does_not_hinder_success(layout: Layo
 @pytest.mark.parametrize("layout", [CLEARING, INSERTION, CROSSING])
 def test_the_reward_has_the_precision_of_the_states(layout: Layout, dtype: torch.dtype) -> None:
     before, after = states(tile(2, 4), ASIDE), states(tile(2, 3.9), ASIDE)
-    outcome = TaskReward(layout, reward="dense")(
-        before.to(dtype), after.to(dtype), torch.tensor([True, True])
-    )
+    outcome = TaskReward(layout, reward="dense")(before.to(dtype), after.to(dtype), torch.tensor([True, True]))
     assert outcome.reward.dtype == outcome.progress.dtype == dtype
 
 

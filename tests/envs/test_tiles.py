@@ -20,9 +20,7 @@ def cells(tiles: set[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
     """Centres [C, 2] of a fine grid over table and surroundings, and which of them [C] lie in the union."""
     i, j = np.mgrid[-15:90, -15:120]  # fifteen cells to a tile, a tile's width around the grid
     centers = np.stack([0.22 + (i + 0.5) * CELL, -0.56 + (j + 0.5) * CELL], axis=-1).reshape(-1, 2)
-    inside = [
-        tile in tiles for tile in zip((i // 15).ravel().tolist(), (j // 15).ravel().tolist(), strict=True)
-    ]
+    inside = [tile in tiles for tile in zip((i // 15).ravel().tolist(), (j // 15).ravel().tolist(), strict=True)]
     return centers, np.array(inside)
 
 

@@ -41,13 +41,9 @@ def test_no_push_moves_further_than_a_decimetre_on_an_axis(actions: np.ndarray) 
 
 
 def test_the_corners_of_the_action_are_the_corners_of_the_reach() -> None:
-    start, end = push_endpoints(
-        np.array([[-1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 0.5, -1.0]])
-    )
+    start, end = push_endpoints(np.array([[-1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 0.5, -1.0]]))
     np.testing.assert_allclose(start, [REACH_LOW, REACH_HIGH, (0.55, 0.0)])
-    np.testing.assert_allclose(
-        end, [REACH_LOW, REACH_HIGH, (0.60, -0.1)]
-    )  # the first two are clipped to the box
+    np.testing.assert_allclose(end, [REACH_LOW, REACH_HIGH, (0.60, -0.1)])  # the first two are clipped to the box
 
 
 @settings(deadline=None)

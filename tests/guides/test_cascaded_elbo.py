@@ -81,9 +81,7 @@ def softplus(x: Tensor) -> Tensor:
 
 
 def pushes(w: Weights, effect: list[Tensor], z: Tensor) -> Tensor:
-    mean, scale = w.linear(
-        "action_generator.transform", pool(w, "action_generator.pool.score", effect)
-    ).chunk(2)
+    mean, scale = w.linear("action_generator.transform", pool(w, "action_generator.pool.score", effect)).chunk(2)
     transformed = mean + softplus(scale) * z
     raw = {
         part: w.linear(f"action_generator.{part}.1", w.relu(f"action_generator.{part}.0.0", transformed))
@@ -190,10 +188,7 @@ def noise_of(guide: CascadedGuide, window: Window) -> list[Tensor]:
     traced = poutine.trace(guide).get_trace(window)
     sites = [traced.nodes[name] for name in ("effect_code", "motion_code")]
     normals = [site["fn"].base_dist for site in sites]
-    return [
-        ((site["value"] - normal.loc) / normal.scale).detach()
-        for site, normal in zip(sites, normals, strict=True)
-    ]
+    return [((site["value"] - normal.loc) / normal.scale).detach() for site, normal in zip(sites, normals, strict=True)]
 
 
 def gradients(loss: Tensor, programs: tuple[CascadedModel, CascadedGuide]) -> dict[str, Tensor]:

@@ -35,15 +35,11 @@ def test_model_and_guide_share_no_parameter_and_none_is_held_twice(model: Cascad
     loss = Trace_ELBO()(model, CascadedGuide(model))
     parameters = list(loss.parameters())
     assert len(parameters) == len({parameter.data_ptr() for parameter in parameters})
-    assert sum(p.numel() for p in parameters) == sum(
-        p.numel() for p in set(loss.state_dict(keep_vars=True).values())
-    )
+    assert sum(p.numel() for p in parameters) == sum(p.numel() for p in set(loss.state_dict(keep_vars=True).values()))
     assert not any(name.startswith("guide.") and "encoder" in name for name in loss.state_dict())
 
 
-def test_saved_networks_load_into_fresh_ones(
-    model: CascadedModel, random_window: Callable[..., Window]
-) -> None:
+def test_saved_networks_load_into_fresh_ones(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     window = random_window()
     guide = CascadedGuide(model)
     other = CascadedModel(**SIZES)
@@ -86,9 +82,7 @@ def test_training_lowers_the_loss(model: CascadedModel, random_window: Callable[
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
 
 
-def test_reordering_objects_leaves_the_loss(
-    model: CascadedModel, random_window: Callable[..., Window]
-) -> None:
+def test_reordering_objects_leaves_the_loss(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     window = random_window()
     order = torch.tensor([2, 3, 0, 1])
     shuffled = window._replace(states=type(window.states)(*(field[:, :, order] for field in window.states)))
@@ -101,9 +95,7 @@ def test_reordering_objects_leaves_the_loss(
 
 
 def test_codes_of_a_window_regenerate_it(model: CascadedModel, random_window: Callable[..., Window]) -> None:
-    drawn = Predictive(model, guide=CascadedGuide(model), num_samples=6, parallel=True)(
-        random_window(), generate=True
-    )
+    drawn = Predictive(model, guide=CascadedGuide(model), num_samples=6, parallel=True)(random_window(), generate=True)
     assert drawn["effect_code"].shape == (6, 4, 5)
     assert drawn["actions"].shape == (6, 4, 3, 4)
     assert drawn["next_centers"].shape == (6, 4, 3, 4, 3)

@@ -28,9 +28,7 @@ def test_pool_weights_sum_to_one_over_real_objects() -> None:
 
 
 def test_a_scene_without_objects_gives_numbers() -> None:
-    actions = ActionGenerator(width=8)(
-        torch.zeros(2, 4, 8), torch.zeros(2, 4, dtype=bool), torch.zeros(2, 16)
-    )
+    actions = ActionGenerator(width=8)(torch.zeros(2, 4, 8), torch.zeros(2, 4, dtype=bool), torch.zeros(2, 16))
     assert actions.isfinite().all()
 
 

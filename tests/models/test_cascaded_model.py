@@ -63,9 +63,7 @@ def test_windows_that_do_not_count_touch_only_the_dynamics(
         assert (traced.nodes[name]["log_prob"][[0, 2, 3]] != 0).all()
 
 
-def test_pairs_that_do_not_count_add_nothing(
-    model: CascadedModel, random_window: Callable[..., Window]
-) -> None:
+def test_pairs_that_do_not_count_add_nothing(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     window = random_window()
     none = window._replace(transition_mask=torch.zeros_like(window.transition_mask))
     traced = trace(model, none)
@@ -76,15 +74,11 @@ def test_pairs_that_do_not_count_add_nothing(
 def with_other_padding(window: Window) -> Window:
     states = window.states
     outside = ~states.mask.unsqueeze(-1)
-    other = State(
-        torch.where(outside, 7.0, states.centers), torch.where(outside, -3.0, states.features), states.mask
-    )
+    other = State(torch.where(outside, 7.0, states.centers), torch.where(outside, -3.0, states.features), states.mask)
     return window._replace(states=other)
 
 
-def test_what_stands_in_padding_changes_nothing(
-    model: CascadedModel, random_window: Callable[..., Window]
-) -> None:
+def test_what_stands_in_padding_changes_nothing(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     window = random_window()
     torch.manual_seed(3)
     expected = trace(model, window)
@@ -126,9 +120,7 @@ def test_generated_windows_score_the_same_when_observed(
     first = window.states.step(slice(0, 1))
     centers = torch.cat([first.centers, value["next_centers"]], 1)
     features = torch.cat([first.features, nn.functional.normalize(value["next_features"], dim=-1)], 1)
-    observed = Window(
-        State(centers, features, window.states.mask), value["actions"], window.transition_mask, window[3]
-    )
+    observed = Window(State(centers, features, window.states.mask), value["actions"], window.transition_mask, window[3])
     steps = [generated.nodes[f"next_centers_{step}"]["log_prob"] for step in (1, 2, 3)]
     assert torch.allclose(trace(model, observed).nodes["next_centers"]["log_prob"], sum(steps), rtol=1e-10)
 
@@ -186,9 +178,7 @@ def test_a_prior_is_a_part_like_any_other(random_window: Callable[..., Window]) 
     assert traced.nodes["motion_code"]["value"].mean() < 2
 
 
-def test_windows_of_another_shape_are_refused(
-    model: CascadedModel, random_window: Callable[..., Window]
-) -> None:
+def test_windows_of_another_shape_are_refused(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     with pytest.raises(ValueError, match="window has 2 pushes; this model was made for 3"):
         model(random_window(steps=2))
     with pytest.raises(ValueError, match=r"one batch \[B\]; got leading dimensions \[1, 4\]"):

@@ -25,9 +25,7 @@ def test_trunk_is_a_linear_layer_on_state_and_repeated_context() -> None:
 
 
 @pytest.mark.parametrize("reach", [PUSH_RANGE, SUBGOAL_RANGE])
-def test_centers_move_no_farther_than_the_range_and_up_to_it(
-    random_state: Callable[..., State], reach: float
-) -> None:
+def test_centers_move_no_farther_than_the_range_and_up_to_it(random_state: Callable[..., State], reach: float) -> None:
     change = StateChange(reach=reach, **SIZES)
     state = random_state(500)
     moved = (change(state, 100 * torch.randn(500, 4, 8)).centers - state.centers).abs()

@@ -20,9 +20,7 @@ def near_the_edge(toy: SimpleNamespace) -> RewardFunction:
 
 def test_dense_reward_leads_to_the_known_optimum(toy: SimpleNamespace) -> None:
     # A goal too far to reach, straight ahead: the best is to go 0.15 m its way in each of two segments.
-    planner = CavinPlanner(
-        toy.PointMass(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=4096, horizon=6
-    )
+    planner = CavinPlanner(toy.PointMass(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=4096, horizon=6)
     plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), toy.generators(0, 1, 2, 3))
     progress = plan.expected_return + 6  # without the costs of six steps
     assert (progress <= 0.3).all()
@@ -201,9 +199,7 @@ def test_rewards_see_unbroken_trajectories(toy: SimpleNamespace) -> None:
 def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
     planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=8, horizon=3)
     state = toy.scenes([[START], [(0.0, float("nan"))]])
-    with pytest.raises(
-        ValueError, match=r"^environment 1: none of the 8 returns of effect plans is finite; .*$"
-    ):
+    with pytest.raises(ValueError, match=r"^environment 1: none of the 8 returns of effect plans is finite; .*$"):
         planner.plan(state, toy.generators(0, 1))
 
 
@@ -248,7 +244,5 @@ def test_bad_scenes_are_one_clear_line(toy: SimpleNamespace) -> None:
 def assert_same_plans(batch: Plan, single: Plan, index: int) -> None:
     """Environment `index` of one plan equals the only environment of the other, bit by bit."""
     for name, ours, theirs in zip(Plan._fields, batch, single, strict=True):
-        for field, other in zip(
-            *((x if isinstance(x, State) else (x,)) for x in (ours, theirs)), strict=True
-        ):
+        for field, other in zip(*((x if isinstance(x, State) else (x,)) for x in (ours, theirs)), strict=True):
             assert torch.equal(field[index], other[0]), name

@@ -116,7 +116,5 @@ def test_motions_that_are_not_finite_never_win(toy: SimpleNamespace, motion_hori
 
 
 def test_where_no_motion_is_finite_nothing_is_executed(toy: SimpleNamespace) -> None:
-    with pytest.raises(
-        ValueError, match=r"^environment 0: none of the 3 distances of motion plans .* finite"
-    ):
+    with pytest.raises(ValueError, match=r"^environment 0: none of the 3 distances of motion plans .* finite"):
         replay(toy, EFFECTS, [[float("nan")] * 3, [0.0] * 3])

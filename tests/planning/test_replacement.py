@@ -17,9 +17,7 @@ def flags(*rows: str) -> torch.Tensor:
 
 def test_dead_plans_go_on_from_living_ones_and_all_others_from_themselves(toy: SimpleNamespace) -> None:
     failed = flags("x.x...x.", "......x.")
-    active = flags(
-        ".x.x.x..", "xxxxx..x"
-    )  # plans 4 and 7 of the first environment, 5 of the second: successful
+    active = flags(".x.x.x..", "xxxxx..x")  # plans 4 and 7 of the first environment, 5 of the second: successful
     parents = draw_parents(failed, active, toy.generators(0, 1))
     assert active.gather(1, parents)[failed].all()
     own = torch.arange(8).expand(2, 8)
@@ -52,9 +50,7 @@ def test_a_generator_is_used_only_where_its_environment_replaces_something(toy: 
 def test_tracing_back_follows_every_plan_from_parent_to_parent(data: st.DataObject) -> None:
     segments, plans = data.draw(st.integers(1, 5)), data.draw(st.integers(1, 6))
     numbers = st.integers(0, plans - 1)
-    table = data.draw(
-        st.lists(st.lists(numbers, min_size=plans, max_size=plans), min_size=segments, max_size=segments)
-    )
+    table = data.draw(st.lists(st.lists(numbers, min_size=plans, max_size=plans), min_size=segments, max_size=segments))
     traced = trace_back(torch.tensor(table)[:, None])
     for plan in range(plans):
         number = plan

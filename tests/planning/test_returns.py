@@ -79,9 +79,7 @@ def test_a_step_that_succeeds_and_fails_is_a_failure(toy: SimpleNamespace) -> No
         return toy.Judgement(torch.zeros(both.shape), both, both)
 
     path = walk(toy, 0.0)
-    ended = returns.advance(
-        returns.start(path[0]), contradictory, path[0], path, torch.ones(1, dtype=torch.bool)
-    )
+    ended = returns.advance(returns.start(path[0]), contradictory, path[0], path, torch.ones(1, dtype=torch.bool))
     assert ended.failed
     assert not ended.succeeded
 
