@@ -75,8 +75,10 @@ def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]
     path = Path(config.checkpoint or default_checkpoint())
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     pointnet = pointnet_of(checkpoint, path)
-    if config.planner.pop("model_free"):
-        return construct(config.planner), pointnet
+    options = OmegaConf.to_container(config.planner)
+    assert isinstance(options, dict)
+    if options.pop("model_free"):
+        return construct(options), pointnet
     if "model" not in checkpoint.config:
         raise UserError(f"checkpoint {path} holds no model: give one that train has written")
     known = checkpoint.config["model"].get("maximum_objects", MAXIMUM_OBJECTS)
@@ -87,4 +89,4 @@ def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]
     checkpoint.load_into("model", model, path)
     model.requires_grad_(False).eval()
     torch.manual_seed(config.seed)
-    return construct(config.planner, model=model, reward=reward), pointnet
+    return construct(options, model=model, reward=reward), pointnet

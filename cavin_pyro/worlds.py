@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -43,6 +42,5 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
             raise UserError(f"env.ranges.{name} must be two positive numbers, low then high, not {value}")
     if not isinstance(ranges["clearance"], int | float) or not ranges["clearance"] >= 0:
         raise UserError(f"env.ranges.clearance must be at least 0 metres, not {ranges['clearance']}")
-    assert set(ranges) | {"names"} == {field.name for field in fields(ObjectRanges)}
-    as_tuples = {str(name): tuple(value) if isinstance(value, list) else value for name, value in ranges.items()}
-    return ObjectRanges(names=tuple(names), **as_tuples)
+    scale, mass, friction = (tuple(ranges[name]) for name in ("scale", "mass", "friction"))
+    return ObjectRanges(tuple(names), scale, mass, friction, ranges["clearance"])

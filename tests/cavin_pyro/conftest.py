@@ -14,9 +14,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import hydra
 import pyro
 import pytest
 import torch
+from omegaconf import DictConfig
 
 from cavin_pyro.checkpoint import save_checkpoint
 from cavin_pyro.collection import CollectionSettings, collect
@@ -172,3 +174,15 @@ def checkpoint_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
         save_checkpoint(path, parts=small_parts(), config=small_config(), provenance={"step": 0})
     return path
+
+
+@pytest.fixture(scope="session")
+def configure(checkpoint_file: Path) -> Callable[..., DictConfig]:
+    """The configuration of a short evaluation in one process, from further words."""
+
+    def compose(*words: str) -> DictConfig:
+        few = ["maximum_steps=4", "workers=1", "episodes=3", "objects=2", "output=unused"]
+        with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
+            return hydra.compose("evaluate", overrides=[f"checkpoint={checkpoint_file}", *few, *words])
+
+    return compose

@@ -7,15 +7,18 @@ import json
 import random
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
 import torch
+from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from cavin_pyro.checkpoint import load_checkpoint
+from cavin_pyro.dataset import read_shard, shard_path, write_shard
+from cavin_pyro.evaluation import evaluate
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -40,33 +43,31 @@ def test_training_killed_twice_equals_an_unbroken_run(
 ) -> None:
     words = [
         *("data=pushes", f"pointnet={checkpoint_file}", "model.width=8", "guide.width=8", "seed=2"),
-        *("trainer.steps=300", "trainer.validate_every=10", "trainer.batch_size=8", "trainer.learning_rate=0.003"),
-        *("trainer.schedule=cosine", "windows.minimum_move=0.005", "windows.validation_fraction=0.3"),
+        *("trainer.steps=160", "trainer.validate_every=8", "trainer.batch_size=8", "trainer.learning_rate=0.003"),
+        *("trainer.schedule=cosine", "trainer.patience=1000"),
+        *("windows.minimum_move=0.005", "windows.validation_fraction=0.3"),
     ]
     metrics = tmp_path / "broken" / "metrics.csv"
 
     def validations() -> int:
         return len(metrics.read_text().splitlines()) - 1 if metrics.exists() else 0
 
-    for count in (1, 6):
+    for count in (1, 5):
         kill_after(shell, "train", [*words, "output=broken"], tmp_path, lambda count=count: validations() >= count)
-        assert validations() < 29
+        assert validations() < 20
     for output in ("broken", "whole"):
         answer = shell.run_command("train", *words, f"output={output}", folder=tmp_path)
         assert answer.status == 0, answer.errors
     broken, whole = tmp_path / "broken", tmp_path / "whole"
-    assert len(read_csv(whole / "metrics.csv")) == 30
+    assert len(read_csv(whole / "metrics.csv")) == 20
     assert read_csv(broken / "metrics.csv") == read_csv(whole / "metrics.csv")
     for name in ("checkpoint.safetensors", "resume.safetensors"):
         ours, theirs = load_file(broken / name), load_file(whole / name)
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs), name
     step = load_checkpoint(whole / "checkpoint.safetensors").provenance["step"]
-    assert load_checkpoint(broken / "checkpoint.safetensors").provenance["step"] == step > 10
+    assert load_checkpoint(broken / "checkpoint.safetensors").provenance["step"] == step > 8
     assert not list(broken.glob(".*"))  # nothing half-written remains
-    refused = shell.run_command("train", *words, "output=broken", "trainer.learning_rate=0.1", folder=tmp_path)
-    assert refused.status == 2
-    assert "holds a run with trainer.learning_rate=0.003, not 0.1" in refused.errors
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -79,11 +80,11 @@ def without_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
-    shell: SimpleNamespace, checkpoint_file: Path, tmp_path: Path
+    shell: SimpleNamespace, configure: Callable[..., DictConfig], checkpoint_file: Path, tmp_path: Path
 ) -> None:
     words = [
-        *("task=insertion", f"checkpoint={checkpoint_file}", "objects=2", "maximum_steps=9"),
-        *("planner.samples=16", "planner.horizon=6", "episodes=40", "seed=100"),
+        *("task=insertion", "reward=dense", f"checkpoint={checkpoint_file}", "objects=2", "maximum_steps=4"),
+        *("planner.samples=16", "planner.horizon=6", "episodes=24", "seed=100"),
     ]
     path = tmp_path / "broken" / "episodes.jsonl"
     kill_after(
@@ -94,28 +95,25 @@ def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
         lambda: path.exists() and len(rows_of(path)) >= 3,
     )
     before = rows_of(path)
-    assert 3 <= len(before) < 40
-    for output, workers in (("broken", 2), ("whole", 1)):
-        answer = shell.run_command("evaluate", *words, f"workers={workers}", f"output={output}", folder=tmp_path)
-        assert answer.status == 0, answer.errors
+    assert 3 <= len(before) < 24
+    answer = shell.run_command("evaluate", *words, "workers=2", "output=broken", folder=tmp_path)
+    assert answer.status == 0, answer.errors
     after = rows_of(path)
     assert after[: len(before)] == before  # with the times of the first run
-    assert sorted(row["seed"] for row in after) == list(range(100, 140))
-    broken, whole = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("broken", "whole"))
-    assert without_times(broken["per_episode"]) == without_times(whole["per_episode"])
-    for name in ("episodes", "success", "violation", "fall", "timeout", "steps", "return", "subgoal_distance"):
-        assert broken[name] == whole[name]
+    assert sorted(row["seed"] for row in after) == list(range(100, 124))
+    results = json.loads((tmp_path / "broken" / "results.json").read_text())
+    assert results["per_episode"] == sorted(after, key=lambda row: row["seed"])
+    (tmp_path / "whole").mkdir()
+    whole = evaluate(configure(*words), tmp_path / "whole")  # by a single process
+    assert without_times(results["per_episode"]) == without_times(whole)
     assert len({row["return"] for row in after}) > 1  # the episodes are not all alike
 
 
-@pytest.mark.parametrize("name", ["actions", "centers"])
 def test_a_nan_in_the_data_ends_training_in_one_line(
-    name: str, shell: SimpleNamespace, own_pushes: Path, checkpoint_file: Path, tmp_path: Path
+    shell: SimpleNamespace, own_pushes: Path, checkpoint_file: Path, tmp_path: Path
 ) -> None:
-    from cavin_pyro.dataset import read_shard, shard_path, write_shard
-
     arrays = read_shard(shard_path(own_pushes, 1))
-    arrays[name][:] = float("nan")
+    arrays["actions"][:] = float("nan")
     write_shard(shard_path(own_pushes, 1), arrays)
     words = [
         *("data=pushes", f"pointnet={checkpoint_file}", "model.width=8", "guide.width=8", "output=run"),

@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from cavin_pyro.checkpoint import save_checkpoint
+from cavin_pyro.episodes import OUTCOMES, Episode, observed_state, run_episode
+from cavin_pyro.errors import UserError
+from cavin_pyro.evaluation import episode_row, evaluate
+from cavin_pyro.setups import Setup, set_up
+from envs.pushing import PushingEnv
+from models.pointnet import PointNet
+from planning import CavinPlanner, Plan, RandomPlanner
+
+
+@pytest.fixture
+def env() -> Any:
+    env = PushingEnv(task="crossing", objects=2, maximum_steps=4)
+    yield env
+    env.close()
+
+
+def fast(*words: str) -> list[str]:
+    return ["planner.samples=8", "planner.horizon=6", *words]
+
+
+def happened(episode: Episode) -> list[tuple]:
+    return [(push.action.tolist(), push.reward, push.centers.tolist()) for push in episode.pushes]
+
+
+def test_episodes_are_repeated_by_their_seeds(env: PushingEnv) -> None:
+    pointnet = PointNet()
+    first, second, third = (run_episode(env, RandomPlanner(), pointnet, seed=seed) for seed in (5, 5, 6))
+    assert happened(first) == happened(second)
+    assert happened(first) != happened(third)
+    assert first.seed == 5
+
+
+def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) -> None:
+    called = []
+    episode = run_episode(env, RandomPlanner(3), PointNet(), seed=0, on_decision=called.append, photograph=False)
+    assert called == episode.decisions
+    assert [decision.step for decision in episode.decisions] == [0, 3][: len(called)]
+    assert [push.step for push in episode.pushes] == list(range(1, len(episode.pushes) + 1))
+    for push in episode.pushes:
+        decision = episode.decisions[(push.step - 1) // 3]
+        planned = decision.plan.actions[0, (push.step - 1) % 3].numpy()
+        np.testing.assert_array_equal(push.action, planned)
+    assert episode.outcome in OUTCOMES
+    assert episode.total_reward == sum(push.reward for push in episode.pushes)
+
+
+def test_the_planner_sees_the_cameras_points_without_needless_padding(env: PushingEnv) -> None:
+    pointnet = PointNet()
+    observation, _ = env.reset(seed=0)
+    state = observed_state(observation, pointnet)
+    assert state.centers.shape == (1, 2, 3)
+    assert state.mask.tolist() == [[True, True]]
+    np.testing.assert_array_equal(state.centers[0], observation["centers"][:2])
+    with torch.no_grad():
+        cloud = torch.from_numpy(observation["clouds"][1] - observation["centers"][1])
+        torch.testing.assert_close(state.features[0, 1], pointnet(cloud), rtol=0, atol=1e-6)
+    # An object that was never seen leaves a hole, not a shift.
+    observation["mask"] = np.array([0, 1, 0, 0, 0], np.int8)
+    assert observed_state(observation, pointnet).mask.tolist() == [[False, True]]
+    observation["mask"][:] = 0
+    assert observed_state(observation, pointnet).mask.tolist() == [[False]]
+
+
+def test_subgoal_distances_compare_what_was_wanted_with_what_was_seen(env: PushingEnv) -> None:
+    class Wishful(RandomPlanner):
+        """Wants every object 30 cm above where it is, and does nothing about it."""
+
+        def plan(self, state: Any, generators: Any) -> Plan:
+            plan = super().plan(state, generators)
+            there = state.map(lambda field: field[:, None].clone())
+            there.centers[..., 2] += 0.3
+            return plan._replace(
+                actions=torch.zeros(1, 3, 4), subgoals=there, segments=torch.ones(1, dtype=torch.int64)
+            )
+
+    episode = run_episode(env, Wishful(3), PointNet(), seed=0)
+    distances = [push.subgoal_distance for push in episode.pushes]
+    assert distances[2] == pytest.approx(0.3, abs=0.05)
+    assert np.isnan([distances[0], distances[1]]).all()
+    assert episode_row(episode)["subgoal_distance"] == pytest.approx(distances[2])
+
+
+def test_an_evaluation_runs_only_what_is_missing(
+    configure: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configure("planner=random", "seed=10")
+    first = evaluate(config, tmp_path)
+    assert [row["seed"] for row in first] == [10, 11, 12]
+    lines = (tmp_path / "episodes.jsonl").read_text().splitlines(keepends=True)
+    assert [json.loads(line) for line in lines] == first
+    assert evaluate(config, tmp_path) == first
+    # As after a kill: the second line is missing, and the last one was cut short.
+    (tmp_path / "episodes.jsonl").write_text(lines[0] + lines[2][:-9])
+    config.episodes = 4
+    again = evaluate(config, tmp_path)
+    assert [row["seed"] for row in again] == [10, 11, 12, 13]
+    assert again[0] == first[0]
+    for row, earlier in zip(again, first, strict=False):
+        assert {**row, "planning_ms": 0} == {**earlier, "planning_ms": 0}
+    config.episodes = 2
+    assert evaluate(config, tmp_path) == again[:2]
+
+
+def test_a_kill_while_an_evaluation_begins_again_loses_no_episode(
+    configure: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configure("planner=random")
+    evaluate(config, tmp_path)
+    before = (tmp_path / "episodes.jsonl").read_text()
+
+    def killed(self: Path, text: str, **options: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(config, tmp_path)
+    assert (tmp_path / "episodes.jsonl").read_text() == before
+
+
+def parts(setup: Setup) -> SimpleNamespace:
+    setup.env.close()
+    return SimpleNamespace(**vars(setup))
+
+
+def test_words_reach_the_parts(configure: Any) -> None:
+    setup = parts(set_up(configure(*fast("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7"))))
+    assert isinstance(setup.planner, CavinPlanner)
+    assert (setup.planner.samples, setup.planner.segments) == (8, 2)
+    assert setup.layout.task == "insertion"
+    assert setup.planner.reward.dense and setup.env.reward.dense
+    assert (setup.planner.reward.margin, setup.env.reward.margin) == (0.02, 0.0)
+    assert (setup.env.maximum_steps, setup.env.objects) == (7, 2)
+    assert not any(parameter.requires_grad for parameter in setup.planner.model.parameters())
+    setup = parts(set_up(configure("planner=random", "env.ranges.names=[mug]", "env.ranges.scale=[1,1]")))
+    assert isinstance(setup.planner, RandomPlanner)
+    assert {one.name for one in setup.env.scene.objects} == {"mug"}
+
+
+def test_tiles_on_the_command_line_replace_those_of_the_layout(configure: Any) -> None:
+    plain = parts(set_up(configure("planner=random"))).layout
+    moved = parts(set_up(configure("planner=random", "tiles.goal=[[1,1],[1,2]]"))).layout
+    assert moved.goal == ((1, 1), (1, 2)) != plain.goal
+    assert moved.region == plain.region
+    setup = parts(set_up(configure(*fast("tiles.goal=[[1,1],[1,2]]"))))
+    assert setup.planner.reward.layout == setup.env.layout == moved
+
+
+@pytest.mark.parametrize("task", ["clearing", "insertion", "crossing"])
+@pytest.mark.parametrize("layout", [0, 1, 2])
+def test_every_builtin_layout_has_room_for_five_objects(task: str, layout: int, configure: Any) -> None:
+    setup = parts(set_up(configure("planner=random", f"task={task}", f"layout={layout}", "objects=5")))
+    assert len(setup.env.scene.objects) == 5
+
+
+def test_a_checkpoint_that_knows_fewer_objects_is_refused(
+    configure: Any, small: SimpleNamespace, tmp_path: Path
+) -> None:
+    config = small.config()
+    config["model"]["maximum_objects"] = 2
+    path = tmp_path / "two.safetensors"
+    save_checkpoint(path, parts=small.parts(), config=config, provenance={})
+    parts(set_up(configure(f"checkpoint={path}", "objects=2")))
+    with pytest.raises(UserError, match=r"objects=3, but checkpoint .*two\.safetensors knows at most 2: use objects=2"):
+        set_up(configure(f"checkpoint={path}", "objects=3"))
+    parts(set_up(configure(f"checkpoint={path}", "objects=3", "planner=random")))  # which asks no model
