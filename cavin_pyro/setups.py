@@ -75,8 +75,7 @@ def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]
     path = Path(config.checkpoint or default_checkpoint())
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     pointnet = pointnet_of(checkpoint, path)
-    options = OmegaConf.to_container(config.planner)
-    assert isinstance(options, dict)
+    options = {str(name): value for name, value in config.planner.items()}
     if options.pop("model_free"):
         return construct(options), pointnet
     if "model" not in checkpoint.config:

@@ -47,7 +47,7 @@ class TaskReward:
     Args:
         layout: tiles and task. reward: dense or sparse.
         margin: metres by which to be stricter than the task itself, for those who plan under uncertainty:
-            goals shrink and forbidden places grow. An object that starts within the margin may stay there,
+            forbidden places, and the region to clear, grow. An object that starts within the margin may stay there,
             but come no closer to what is forbidden.
 
     Raises:
@@ -114,4 +114,4 @@ class TaskReward:
 
     def _arrived(self, target: Tensor) -> Tensor:
         assert self._goal is not None
-        return self._goal.signed_distance(target) <= -self.margin
+        return self._goal.signed_distance(target) <= 0.0
