@@ -71,7 +71,7 @@ def test_an_interruption_is_one_line_and_its_own_status(capsys: pytest.CaptureFi
 
 
 def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None:
-    with pytest.raises(UserError, match="^two lines$"), user_input():
+    with pytest.raises(UserError, match=r"^two lines$"), user_input():
         raise ValueError("two\n   lines")
     with pytest.raises(KeyError), user_input():
         raise KeyError("a bug")
@@ -86,7 +86,7 @@ def test_counts_below_one_and_what_is_no_number_are_refused(value: object) -> No
 
 @pytest.mark.parametrize("value", [-1, 2**32, 1.0, True, None])
 def test_seeds_that_a_generator_would_not_take_are_refused(value: object) -> None:
-    with pytest.raises(UserError, match="^seed must be a whole number from 0 to 4294967295, not"):
+    with pytest.raises(UserError, match=r"^seed must be a whole number from 0 to 4294967295, not"):
         check_seed(value)  # type: ignore[arg-type]
     check_seed(0)
     check_seed(2**32 - 1)
