@@ -23,7 +23,7 @@ test: $(installed_for_tests)
 	$(bin)/ruff format --check .
 	$(bin)/mypy
 	$(bin)/lint-imports
-	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 $(installed): pyproject.toml constraints.txt
 	$(if $(PYTHON),,$(error Python 3.11 or 3.10 with its venv module is needed and neither was found; install it, or say where it is: make PYTHON=/path/to/python3.11))

@@ -14,8 +14,6 @@ from safetensors.torch import load_file, save_file
 
 from cavin_pyro.dataset import read_metadata, shard_path, write_metadata
 
-pytestmark = pytest.mark.xdist_group("bad_input")  # one process runs all cases, once
-
 # @name is a file or folder that `material` makes.
 GOOD = {
     "collect": "transitions=2 steps=1 episodes_per_shard=1 workers=1",

@@ -156,7 +156,8 @@ def test_the_time_of_every_file_is_recorded_apart_from_the_data(pushes: Path) ->
     for row in rows:
         _, transitions, cpu, *parts = map(float, row.split(","))
         assert transitions > 0
-        assert 0 < sum(parts) < 2 * cpu + 0.1
+        assert cpu > 0
+        assert min(parts) > 0
 
 
 def test_a_scene_without_room_is_the_users_to_mend(small: SimpleNamespace, tmp_path: Path) -> None:

@@ -18,8 +18,6 @@ from cavin_pyro.checkpoint import load_checkpoint
 from cavin_pyro.dataset import read_metadata
 from cavin_pyro.statistics import wilson
 
-pytestmark = pytest.mark.xdist_group("pipeline")  # one process runs the commands, once
-
 COMMANDS = ("collect", "pretrain", "train", "plan", "evaluate", "demo")
 
 # A task that nobody has seen: an L-shaped bridge.
