@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from cavin_pyro.errors import UserError
 from cavin_pyro.files import replacing
 from cavin_pyro.progress import progress_bar
 from models.pointnet import PointNetAutoencoder
@@ -37,6 +39,9 @@ def pretrain(
     Returns:
         Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, what drawing one and the same
         average cloud every time would cost.
+
+    Raises:
+        UserError: the loss is not finite.
     """
     generator = np.random.default_rng(seed)
     held_out = max(1, len(clouds) // 10)
@@ -50,6 +55,8 @@ def pretrain(
             batch = _augment(training[generator.integers(len(training), size=batch_size)], generator)
             optimizer.zero_grad(set_to_none=True)
             loss = autoencoder.loss(batch)
+            if not math.isfinite(loss.item()):
+                raise UserError(f"pretraining stopped at step {step}: the loss is not finite: lower learning_rate")
             loss.backward()
             optimizer.step()
             schedule.step()

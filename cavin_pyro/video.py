@@ -159,17 +159,16 @@ def film(env: PushingEnv, video: EpisodeVideo) -> None:
 
 
 def _open_writer(path: Path, fps: int) -> Any:
-    return imageio.get_writer(
-        path,
-        format="FFMPEG",
-        mode="I",
-        fps=fps,
-        codec="libx264",
-        pixelformat="yuv420p",  # the only one that all browsers play
-        macro_block_size=2,
-        output_params=["-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    )
+    options: dict[str, Any] = {
+        "format": "FFMPEG",
+        "fps": fps,
+        "codec": "libx264",
+        "pixelformat": "yuv420p",  # the only one that all browsers play
+        "macro_block_size": 2,
+        "output_params": ["-movflags", "+faststart"],
+        "ffmpeg_log_level": "error",
+    }
+    return imageio.get_writer(path, mode="I", **options)
 
 
 def _draw_decision(draw: ImageDraw.ImageDraw, decision: Decision, camera: Camera) -> None:
