@@ -1,0 +1,24 @@
+"""The checkpoint that plan and evaluate load unless told otherwise."""
+
+from __future__ import annotations
+
+from cavin_pyro.building import build_guide, build_model, pointnet_of
+from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
+
+
+def test_the_shipped_checkpoint_is_small_and_builds_with_its_own_configuration() -> None:
+    path = default_checkpoint()
+    assert path.stat().st_size <= 3_000_000
+    checkpoint = load_checkpoint(path)
+    model = build_model(checkpoint.config)
+    checkpoint.load_into("model", model, path)
+    guide = build_guide(checkpoint.config, model)
+    checkpoint.load_into("guide", guide, path)
+    assert not any(parameter.requires_grad for parameter in pointnet_of(checkpoint, path).parameters())
+
+
+def test_the_shipped_checkpoint_tells_where_it_comes_from() -> None:
+    provenance = load_checkpoint(default_checkpoint()).provenance
+    assert sum(data["transitions"] for data in provenance["data"]) >= 100_000
+    assert {"command", "date", "packages", "pointnet", "revision", "step", "metrics"} <= set(provenance)
+    assert provenance["command"].startswith("python -m cavin_pyro.train ")
