@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 KINECT2_FOCAL_LENGTH = 365.5  # pixels at a width of 512 pixels
 KINECT2_WIDTH = 512  # pixels
 NEAR, FAR = 0.2, 3.0  # metres; the clipping planes of the renderer
+# Where in a pixel the ray of PyBullet's software renderer passes, in pixels from the pixel's upper left corner
+# (column, row): not through its middle. Measured on boxes whose poses are known, tests/envs/test_camera.py.
+RAY_COLUMN, RAY_ROW = 0.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,6 @@ class Camera:
     ) -> NDArray[np.float64]:
         """Points in the robot's base frame behind chosen pixels.
 
-        PyBullet's software renderer samples a pixel at its corner, not its middle: what it renders comes out
-        half a pixel (2.6 mm) too far along +x and -y. The data collected so far have this offset.
-
         Args:
             depth: [height, width] metres along the optical axis. rows, columns: [P] pixel indices.
 
@@ -53,13 +53,13 @@ class Camera:
             [P, 3] metres.
         """
         distance = depth[rows, columns]
-        right = (columns + 0.5 - self.width / 2) / self.focal_length * distance
-        down = (rows + 0.5 - self.height / 2) / self.focal_length * distance
+        right = (columns + RAY_COLUMN - self.width / 2) / self.focal_length * distance
+        down = (rows + RAY_ROW - self.height / 2) / self.focal_length * distance
         x, y, z = self.position
         return np.stack([x - down, y - right, z - distance], axis=-1)
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixel coordinates (column, row) [..., 2] of points [..., 3] metres; the inverse of `points`."""
+        """Pixel coordinates (column, row) [..., 2] of points [..., 3] metres; (0, 0) is the upper left corner."""
         points = np.asarray(points, dtype=np.float64)
         x, y, z = self.position
         distance = z - points[..., 2]

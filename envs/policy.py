@@ -30,7 +30,10 @@ REDRAWS = 20  # targets and angles tried before a uniformly random push is made 
 
 @dataclass
 class Intent:
-    """What a run of pushes holds on to, so that they add up to one effect. angle: radians."""
+    """What a run of pushes holds on to, so that they add up to one effect.
+
+    target: number of the object, -1 for a push at random that has none. angle: radians.
+    """
 
     target: int
     angle: float
@@ -61,7 +64,9 @@ class HeuristicPushingPolicy:
                 self._left -= 1
                 return self._perturb(action) if self._perturbed > 0.0 else action
             self._new_intent(observation)
-        return self._generator.uniform(-1.0, 1.0, size=4)
+        action = self._generator.uniform(-1.0, 1.0, size=4)
+        self.intent, self._left = Intent(-1, float(np.arctan2(action[3], action[2]))), 0
+        return action
 
     def _perturb(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """The action, or with probability `perturbed` the same motion from another start."""

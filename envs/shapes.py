@@ -92,11 +92,12 @@ def _mug(diameter: float, height: float) -> list[trimesh.Trimesh]:
 def _banana(thickness: float, length: float) -> list[trimesh.Trimesh]:
     """A tapered tube bent by 100 degrees, lying flat; each part is the hull of two neighbouring sections."""
     bend, cuts = np.radians(100.0), 7
-    bow = length / (2.0 * np.sin(bend / 2))  # metres; the radius whose chord, from end to end, is `length`
+    tip = 0.4 * thickness / 2  # metres; radius of the tube at its ends
+    bow = length / (2.0 * np.sin(bend / 2)) - tip  # metres; the outer corners of the ends are `length` apart
     around = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
     sections = []
     for angle in np.linspace(-bend / 2, bend / 2, cuts):
-        radius = thickness / 2 * (1.0 - 0.6 * (abs(angle) / (bend / 2)) ** 3)
+        radius = thickness / 2 - (thickness / 2 - tip) * (abs(angle) / (bend / 2)) ** 3
         distance = bow + radius * np.cos(around)
         sections.append(
             np.stack([distance * np.sin(angle), distance * np.cos(angle) - bow, radius * np.sin(around)], axis=1)

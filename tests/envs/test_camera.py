@@ -9,13 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.camera import Camera, sample_cloud
+from envs.camera import RAY_COLUMN, RAY_ROW, Camera, sample_cloud
 from envs.physics import Rendering
 from envs.scene import Scene
 from envs.segmentation import segment_by_mask
-
-PIXEL = 0.0053  # metres on an object's top; what one pixel of the default camera shows
-
 
 @settings(deadline=None)
 @given(
@@ -24,7 +21,7 @@ PIXEL = 0.0053  # metres on an object's top; what one pixel of the default camer
     distance=st.floats(0.3, 2.0),
     position=st.tuples(st.floats(0.4, 0.8), st.floats(-0.2, 0.2), st.floats(0.7, 1.5)),
 )
-def test_projecting_a_point_finds_the_middle_of_its_pixel(
+def test_projecting_a_point_finds_where_its_ray_passes_through_the_pixel(
     row: int, column: int, distance: float, position: tuple[float, float, float]
 ) -> None:
     camera = Camera(position=position)
@@ -32,7 +29,7 @@ def test_projecting_a_point_finds_the_middle_of_its_pixel(
     point = camera.points(depth, np.array([row]), np.array([column]))
     assert point.shape == (1, 3)
     assert point[0, 2] == pytest.approx(position[2] - distance)
-    np.testing.assert_allclose(camera.project(point), [[column + 0.5, row + 0.5]], atol=1e-6)
+    np.testing.assert_allclose(camera.project(point), [[column + RAY_COLUMN, row + RAY_ROW]], atol=1e-6)
 
 
 def test_the_images_up_is_x_and_its_left_is_y() -> None:
@@ -69,10 +66,17 @@ def test_the_bare_table_lies_at_height_zero(scene: Scene, put: Callable) -> None
 def test_the_cloud_of_a_box_right_under_the_camera_is_centred_on_it(scene: Scene, put: Callable, name: str) -> None:
     seen = scene.reset([put(name, 0.6, 0.0)], np.random.default_rng(0))
     truth = scene.ground_truth().positions[0]
-    # The renderer samples a pixel at its corner, so points lie half a pixel too far along +x and -y; the rest
-    # is the noise of 256 points.
-    np.testing.assert_allclose(seen.centers[0, :2], truth[:2], atol=PIXEL)
+    np.testing.assert_allclose(seen.centers[0, :2], truth[:2], atol=0.004)  # the noise of 256 points
     assert abs(np.median(seen.clouds[0, :, 2]) - 2 * truth[2]) < 0.002  # the top of the box
+
+
+def test_points_of_boxes_lie_neither_too_far_to_a_side_nor_too_far_ahead(scene: Scene, put: Callable) -> None:
+    errors = []
+    for number in range(60):
+        x, y = 0.6 + 0.0007 * number, 0.0005 * number
+        seen = scene.reset([put("gelatin_box", x, y)], np.random.default_rng(number))
+        errors.append(seen.centers[0, :2] - scene.ground_truth().positions[0, :2])
+    np.testing.assert_allclose(np.mean(errors, axis=0), 0.0, atol=0.001)
 
 
 @settings(deadline=None)
