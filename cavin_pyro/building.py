@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from hydra.errors import InstantiationException
+import hydra
+import yaml
+from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from pyro.infer import ELBO
@@ -17,6 +20,7 @@ from cavin_pyro.errors import UserError, at_least
 from models.pointnet import PointNet
 
 Config = Mapping[str, Any] | DictConfig
+FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
 
 
 def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
@@ -28,11 +32,12 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
     if not config.get("_target_"):
         raise UserError(f"a part has no _target_, the class to build it from: {dict(config)}")
     try:
-        return instantiate(config, *arguments, **keywords)
-    except InstantiationException as error:
+        # In two steps, because Hydra would turn keywords that are dataclasses into configuration.
+        return instantiate(config, _partial_=True, _convert_="all")(*arguments, **keywords)
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
+    except (InstantiationException, TypeError) as error:
         cause = error.__cause__ or error
-        if isinstance(cause, ValueError):
-            raise UserError(" ".join(str(cause).split())) from error
         raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
 
 
@@ -48,23 +53,67 @@ def check_sizes(section: str, config: Config) -> None:
 
 
 def build_model(config: Config) -> PyroModule:
-    """The model program with its priors, from the sections `model` and `prior`."""
-    sizes = config["model"]
+    """The model program with its priors and likelihood scales, from the sections `model`, `prior` and `scales`.
+
+    A model gets a prior for each of its codes, that is, for each of `effect_dimension` and `motion_dimension`
+    that its section has: `model.prior` where that names a class, else the section `prior`.
+
+    Raises:
+        UserError: a part that cannot be built, or a section that lacks a number.
+    """
+    sizes = dict(config["model"])
+    own_prior = sizes.pop("prior", None) or {}
     check_sizes("model", sizes)
     try:
-        priors = {
-            name: construct(config["prior"], dimension=sizes[f"{kind}_dimension"])
+        parts = {
+            name: construct(
+                own_prior if own_prior.get("_target_") else config["prior"],
+                dimension=sizes[f"{kind}_dimension"],
+                feature_dimension=sizes["feature_dimension"],
+                effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
+            )
             for name, kind in (("effect_prior", "effect"), ("motion_prior", "motion"))
+            if f"{kind}_dimension" in sizes
         }
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
-    return construct(sizes, **priors)
+    return construct(sizes, **parts, scales=construct(config.get("scales") or FIXED_SCALES))
 
 
 def build_guide(config: Config, model: PyroModule) -> PyroModule:
-    """The guide program that goes with a model, from the section `guide`."""
+    """The guide program that goes with a model, from the section `guide`.
+
+    Raises:
+        UserError: a guide that cannot be built, or does not fit the model; the guides that do are named.
+    """
     check_sizes("guide", config["guide"])
+    fits = getattr(_class(config["guide"]), "fits", None)
+    if fits is not None and model.name not in fits:
+        choices = ", ".join(_guides_for(model.name)) or "none of ours"
+        raise UserError(
+            f"guide {config['guide']['_target_']} does not fit model {type(model).__name__} (it fits "
+            f"{', '.join(fits) or 'none'}): choose guide= from {choices}"
+        )
     return construct(config["guide"], model)
+
+
+def _class(config: Config) -> Any:
+    """The class that a part names, None if there is no such class."""
+    try:
+        return hydra.utils.get_class(config["_target_"])
+    except (KeyError, HydraException, ImportError, ValueError):
+        return None  # `construct` says it better
+
+
+def _guides_for(model_name: str) -> list[str]:
+    """Words for `guide=` that fit a model."""
+    words = []
+    for file in sorted((resources.files("cavin_pyro") / "conf" / "guide").iterdir(), key=lambda entry: entry.name):
+        if file.name.endswith(".yaml"):
+            guide = _class(yaml.safe_load(file.read_text(encoding="utf-8")))
+            if model_name in getattr(guide, "fits", ()):
+                words.append(file.name.removesuffix(".yaml"))
+    return words
 
 
 def build_objective(config: Config) -> ELBO:

@@ -25,7 +25,7 @@ from cavin_pyro.files import replacing
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
 OWN_MODULES = ("models", "guides")
-BUILT_SECTIONS = ("model", "prior", "guide")  # of the configuration; the others are read by people only
+BUILT_SECTIONS = ("model", "prior", "scales", "guide")  # of the configuration; the others are read by people only
 
 
 @dataclass(frozen=True)

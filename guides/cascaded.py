@@ -5,13 +5,13 @@ from __future__ import annotations
 import pyro
 from pyro import poutine
 
+from guides.guide import Guide
 from guides.inference import EffectInference, MotionInference
 from models.cascaded import CascadedModel
-from models.program import Program
 from models.state import Window
 
 
-class CascadedGuide(Program):
+class CascadedGuide(Guide):
     """Infers the two codes of each window, the motion given the effect.
 
     c ~ q_h(c | s, s')      # effect_code
@@ -25,13 +25,7 @@ class CascadedGuide(Program):
 
         Raises `ValueError` for a model that this guide does not fit.
         """
-        super().__init__()
-        if getattr(model, "name", None) not in self.fits:
-            raise ValueError(
-                f"guide {type(self).__name__} does not fit model {type(model).__name__}; it fits {', '.join(self.fits)}"
-            )
-        # In a tuple, so that the model's parameters are not registered (and saved) here a second time.
-        self._shared = (model,)
+        super().__init__(model)
         self.effect_inference = EffectInference(
             effect_dimension=model.effect_dimension, feature_dimension=model.feature_dimension, width=width
         )
@@ -45,9 +39,8 @@ class CascadedGuide(Program):
 
     def forward(self, window: Window, generate: bool = False) -> None:
         """`window: [B]`. Codes are inferred from the window, also where the model goes on to generate."""
-        (model,) = self._shared
         first, last = window.first, window.last
-        encoded = model.encoder(first)  # the model's state features, trained by this path as well
+        encoded = self.model.encoder(first)  # the model's state features, trained by this path as well
 
         counted = poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]
         with pyro.plate("windows", len(window.actions)), counted:

@@ -61,8 +61,8 @@ class CascadedModel(Program):
         self.action_generator = ActionGenerator(
             segment_length=segment_length, motion_dimension=motion_dimension, width=width
         )
-        self.prior_of_effects = effect_prior or StandardPrior(effect_dimension)
-        self.prior_of_motions = motion_prior or StandardPrior(motion_dimension)
+        self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
+        self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
 
     def forward(self, window: Window, generate: bool = False) -> None:
         """Run the process for `window: [B]`, a batch of training examples.

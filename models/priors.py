@@ -11,9 +11,16 @@ from models.state import State
 
 
 class StandardPrior(nn.Module):
-    """N(0, I), whatever the state. A learned prior has the same two arguments and reads them."""
+    """N(0, I), whatever the state.
 
-    def __init__(self, dimension: int = 16) -> None:
+    Every prior is built with the same three numbers and called with the same two arguments; a learned one
+    reads them.
+    """
+
+    def __init__(
+        self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None
+    ) -> None:
+        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s)."""
         super().__init__()
         self.dimension = dimension
 

@@ -113,11 +113,12 @@ def small_parts(seed: int = 0) -> dict[str, torch.nn.Module]:
 
 def small_config() -> dict[str, Any]:
     """How to build `small_parts` again."""
-    sizes = {"effect_dimension": 4, "motion_dimension": 4, "width": 8, "maximum_objects": 5}
+    sizes = {"effect_dimension": 4, "motion_dimension": 4, "feature_dimension": 64, "width": 8, "maximum_objects": 5}
     return {
         "model": {"_target_": "models.cascaded.CascadedModel", "segment_length": 3, **sizes},
         "guide": {"_target_": "guides.cascaded.CascadedGuide", "width": 8},
         "prior": {"_target_": "models.priors.StandardPrior"},
+        "scales": {"_target_": "models.likelihoods.LikelihoodScales"},
     }
 
 

@@ -39,7 +39,10 @@ def test_a_model_gets_a_prior_of_its_own_size_for_each_code(small: SimpleNamespa
 def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNamespace) -> None:
     with pytest.raises(UserError) as caught:
         build_guide(small.config(), AnotherModel())
-    assert str(caught.value) == "guide CascadedGuide does not fit model AnotherModel; it fits cascaded"
+    assert str(caught.value) == (
+        "guide guides.cascaded.CascadedGuide does not fit model AnotherModel (it fits cascaded): "
+        "choose guide= from none of ours"
+    )
 
 
 def test_the_guide_of_a_model_has_its_dimensions(small: SimpleNamespace) -> None:

@@ -14,6 +14,7 @@ from envs.physics import Rendering
 from envs.scene import Scene
 from envs.segmentation import segment_by_mask
 
+
 @settings(deadline=None)
 @given(
     row=st.integers(0, 211),

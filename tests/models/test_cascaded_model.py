@@ -172,7 +172,7 @@ def test_a_prior_is_a_part_like_any_other(random_window: Callable[..., Window]) 
         def forward(self, state, effect_code=None):
             return pyro.distributions.Normal(super().forward(state, effect_code).mean + 9, 1.0).to_event(1)
 
-    model = CascadedModel(**SIZES, effect_prior=Shifted(5))
+    model = CascadedModel(**SIZES, effect_prior=Shifted(dimension=5))
     traced = trace(model, random_window())
     assert traced.nodes["effect_code"]["value"].mean() > 7
     assert traced.nodes["motion_code"]["value"].mean() < 2

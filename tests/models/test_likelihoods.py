@@ -68,7 +68,7 @@ def test_starts_are_weighted_more_than_motions() -> None:
 
 
 def test_standard_prior_has_the_batch_of_state_and_code(random_state: Callable[..., State]) -> None:
-    prior = StandardPrior(5)
+    prior = StandardPrior(dimension=5)
     effects = prior(random_state(2, 3))
     assert (effects.batch_shape, effects.event_shape) == ((2, 3), (5,))
     motions = prior(random_state(2, 1), torch.zeros(2, 3, 7))
