@@ -12,11 +12,11 @@ import yaml
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from pyro.infer import ELBO
 from pyro.nn import PyroModule
 
 from cavin_pyro.checkpoint import Checkpoint, load_checkpoint
-from cavin_pyro.errors import UserError, at_least
+from cavin_pyro.errors import UserError, at_least, user_input
+from cavin_pyro.objectives import Objective, as_objective
 from models.pointnet import PointNet
 
 Config = Mapping[str, Any] | DictConfig
@@ -116,10 +116,19 @@ def _guides_for(model_name: str) -> list[str]:
     return words
 
 
-def build_objective(config: Config) -> ELBO:
-    """What training minimises, from the section `objective`."""
-    check_sizes("objective", config["objective"])
-    return construct(config["objective"])
+def build_objective(config: Config, model: PyroModule) -> Objective:
+    """What training minimises, from the section `objective`.
+
+    Raises:
+        UserError: an objective that cannot be built, or that the model lacks something for.
+    """
+    section = config["objective"]
+    check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
+    check_sizes("objective.elbo", section.get("elbo") or {})
+    with user_input():
+        objective = as_objective(construct(section))
+        objective.check(model)
+    return objective
 
 
 def check_fit(model: PyroModule, pointnet: PointNet, objects: int) -> None:

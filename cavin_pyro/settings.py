@@ -5,7 +5,7 @@ from __future__ import annotations
 from omegaconf import DictConfig
 
 from cavin_pyro.errors import UserError, at_least, check_seed, fraction
-from cavin_pyro.training import SCHEDULES, TrainerSettings
+from cavin_pyro.training import BATCHES, PRODUCTS, SCHEDULES, TrainerSettings
 from cavin_pyro.windows import WindowSettings
 
 
@@ -22,8 +22,9 @@ def trainer_settings(config: DictConfig) -> TrainerSettings:
     for name in ("learning_rate", "clip_norm"):
         if not isinstance(trainer[name], int | float) or not trainer[name] > 0:
             raise UserError(f"trainer.{name} must be a positive number, not {trainer[name]}")
-    if trainer.schedule not in SCHEDULES:
-        raise UserError(f"unknown trainer.schedule {trainer.schedule!r}: choose from {', '.join(SCHEDULES)}")
+    for name, choices in (("schedule", SCHEDULES), ("batches", BATCHES), ("products", PRODUCTS)):
+        if trainer[name] not in choices:
+            raise UserError(f"unknown trainer.{name} {trainer[name]!r}: choose from {', '.join(choices)}")
     return TrainerSettings(**{str(name): value for name, value in trainer.items()}, seed=config.seed)
 
 

@@ -31,7 +31,7 @@ def main(config: DictConfig) -> None:
     torch.manual_seed(config.seed)
     model = build_model(config)
     guide = build_guide(config, model)
-    objective = build_objective(config)
+    objective = build_objective(config, model)
     source = Path(config.pointnet or default_checkpoint())
     pointnet = load_pointnet(source)
     check_fit(model, pointnet, MAXIMUM_OBJECTS)

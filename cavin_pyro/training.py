@@ -17,7 +17,6 @@ from typing import Any
 
 import pyro
 import torch
-from pyro.infer import ELBO
 from pyro.nn import PyroModule
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
@@ -27,10 +26,13 @@ from torch.utils.tensorboard import SummaryWriter
 from cavin_pyro.elbo import elbo_terms, first_unsound, mean_terms
 from cavin_pyro.errors import UserError
 from cavin_pyro.files import replacing
+from cavin_pyro.objectives import Objective
 from cavin_pyro.progress import progress_bar
 from cavin_pyro.windows import WindowTable
 
 SCHEDULES = ("constant", "cosine")
+BATCHES = ("mixed", "alike")
+PRODUCTS = {"float32": "highest", "bfloat16": "medium"}  # to torch's names
 Row = dict[str, float]
 
 
@@ -41,6 +43,8 @@ class TrainerSettings:
     Attributes:
         steps: gradient steps at most. batch_size: windows per step. learning_rate: Adam's.
         schedule: constant, or cosine from learning_rate down to a hundredth of it.
+        batches: mixed, or alike: every batch of windows with one number of objects, which saves the work on padding.
+        products: what matrix products round their factors to, float32 or bfloat16.
         clip_norm: largest norm of the gradient of the mean loss per window.
         validate_every: steps between validations, which are also the points where a killed run resumes.
         validation_windows: windows per validation, at most. patience: validations without a new best before stopping.
@@ -51,6 +55,8 @@ class TrainerSettings:
     batch_size: int = 64
     learning_rate: float = 1e-4
     schedule: str = "constant"
+    batches: str = "mixed"
+    products: str = "float32"
     clip_norm: float = 250.0
     validate_every: int = 1000
     validation_windows: int = 4096
@@ -68,7 +74,7 @@ class Trainer:
     """Trains one model and guide on one table of windows.
 
     Args:
-        objective: any Pyro ELBO. folder: where metrics and the resume file go.
+        objective: what is minimised. folder: where metrics and the resume file go.
         save: called with the step and the metrics whenever the validation loss is the best so far.
     """
 
@@ -76,7 +82,7 @@ class Trainer:
         self,
         model: PyroModule,
         guide: PyroModule,
-        objective: ELBO,
+        objective: Objective,
         windows: WindowTable,
         settings: TrainerSettings,
         folder: Path,
@@ -84,9 +90,10 @@ class Trainer:
     ) -> None:
         self.model, self.guide, self.windows, self.settings = model, guide, windows, settings
         self.folder, self._save = folder, save
-        self._loss = objective(model, guide)
+        self._loss = objective.bind(model, guide)
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=settings.learning_rate, fused=True)
         self._batches = torch.Generator().manual_seed(settings.seed)
+        torch.set_float32_matmul_precision(PRODUCTS[settings.products])
         torch.manual_seed(settings.seed)
         self.step, self.best, self.best_step, self.stale = 0, math.inf, 0, 0
         self.rows: list[Row] = []
@@ -124,13 +131,13 @@ class Trainer:
                     bar.set_postfix(validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}")
 
     def _update(self) -> float:
-        settings, numbers = self.settings, self.windows.training
-        choice = torch.randint(len(numbers), (settings.batch_size,), generator=self._batches)
-        window = self.windows.batch(numbers[choice])
+        settings = self.settings
+        numbers = self.windows.draw(settings.batch_size, self._batches, alike=settings.batches == "alike")
+        window = self.windows.batch(numbers)
         for group in self._optimizer.param_groups:
             group["lr"] = settings.rate(self.step)
         self._optimizer.zero_grad(set_to_none=True)
-        loss = self._loss(window) / settings.batch_size
+        loss = self._loss(window, self.step) / settings.batch_size
         if not math.isfinite(loss.item()):
             self._stop_at(first_unsound(elbo_terms(self.model, self.guide, window)) or "loss")
         loss.backward()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -57,12 +58,33 @@ class WindowTable:
         self.sequence_mask = torch.empty(0, dtype=torch.bool)
         self.training = torch.empty(0, dtype=torch.int64)
         self.validation = torch.empty(0, dtype=torch.int64)
+        # Objects up to the last real one, at each position.
+        self._objects = (states.mask * torch.arange(1, states.objects + 1)).amax(-1)
+
+    @cached_property
+    def _alike(self) -> dict[int, Tensor]:
+        """Training windows by their number of objects."""
+        objects = self._objects[self.starts[self.training]]
+        return {int(count): self.training[objects == count] for count in objects.unique()}
+
+    def draw(self, count: int, generator: torch.Generator, *, alike: bool = False) -> Tensor:
+        """Numbers [count] of training windows, drawn with replacement.
+
+        `alike`: windows with the same number of objects as one that is drawn first. Every window is as likely as
+        ever, and a batch needs no padding, which is most of the work for small numbers of objects.
+        """
+        numbers = self.training
+        if alike:
+            first = numbers[torch.randint(len(numbers), (1,), generator=generator)]
+            numbers = self._alike[int(self._objects[self.starts[first]])]
+        return numbers[torch.randint(len(numbers), (count,), generator=generator)]
 
     def batch(self, numbers: Tensor) -> Window:
-        """The windows with these numbers [B]."""
+        """The windows with these numbers [B], without padding that none of them needs."""
         positions = self.starts[numbers, None] + self._steps
+        objects = int(self._objects[positions].max())
         return Window(
-            states=self._states.map(lambda field: field[positions]),
+            states=self._states.map(lambda field: field[:, :objects][positions]),
             actions=self._actions[positions[:, :-1]],
             transition_mask=self._transition_mask[positions[:, :-1]],
             sequence_mask=self.sequence_mask[numbers],

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from models.action_generator import ActionGenerator
 from models.dynamics import Dynamics, MetaDynamics
 from models.encoder import StateEncoder
-from models.likelihoods import LikelihoodScales
+from models.likelihoods import LikelihoodScales, Scales
 from models.priors import StandardPrior
 from models.program import Program
 from models.state import State, Window
@@ -43,7 +43,7 @@ class CascadedModel(Program):
         maximum_objects: int = 5,
         effect_prior: nn.Module | None = None,
         motion_prior: nn.Module | None = None,
-        scales: LikelihoodScales | None = None,
+        scales: Scales | None = None,
     ) -> None:
         super().__init__()
         self.segment_length = segment_length

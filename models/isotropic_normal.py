@@ -1,4 +1,4 @@
-"""A Gaussian with one fixed standard deviation for all its components."""
+"""A Gaussian with one standard deviation for all its components."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ class IsotropicNormal(TorchDistribution):
     """N(loc, scale^2 I) for `loc: [..., D]`: batch `[...]`, event `[D]`.
 
     Equal to `Normal(loc, scale).to_event(1)`, in a third of the passes over memory: the scale stays a
-    number, and squared errors are summed before they are weighted.
+    number (or a scalar tensor, to be learned), and squared errors are summed before they are weighted.
     """
 
     arg_constraints: dict[str, Any] = {"loc": constraints.real_vector}
     support = constraints.real_vector
     has_rsample = True
 
-    def __init__(self, loc: Tensor, scale: float, validate_args: bool | None = None) -> None:
+    def __init__(self, loc: Tensor, scale: float | Tensor, validate_args: bool | None = None) -> None:
         """Raises `ValueError` for a scale that is not positive."""
         if not scale > 0:
             raise ValueError(f"scale must be positive, not {scale}")
         self.loc = loc
-        self.scale = float(scale)
+        self.scale = scale
         super().__init__(loc.shape[:-1], loc.shape[-1:], validate_args=validate_args)
 
     @property
@@ -36,7 +36,7 @@ class IsotropicNormal(TorchDistribution):
 
     @property
     def variance(self) -> Tensor:
-        return torch.full_like(self.loc, self.scale**2)
+        return torch.ones_like(self.loc) * self.scale**2
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> IsotropicNormal:
         new = self._get_checked_instance(IsotropicNormal, _instance)
@@ -54,5 +54,6 @@ class IsotropicNormal(TorchDistribution):
         if self._validate_args:
             self._validate_sample(value)
         squared_error = (value - self.loc).square().sum(-1)
-        constant = self.loc.shape[-1] * (math.log(self.scale) + 0.5 * math.log(2 * math.pi))
+        log_scale = self.scale.log() if isinstance(self.scale, Tensor) else math.log(self.scale)
+        constant = self.loc.shape[-1] * (log_scale + 0.5 * math.log(2 * math.pi))
         return squared_error * (-0.5 / self.scale**2) - constant

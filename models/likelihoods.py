@@ -1,25 +1,26 @@
-"""Gaussian likelihoods with fixed scales: f, h and g around their networks' means (paper, section 3.3)."""
+"""Gaussian likelihoods with one scale per quantity: f, h and g around their networks' means (paper, section 3.3)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import torch
 from pyro import distributions
 from pyro.distributions import TorchDistribution
-from torch import Tensor
+from torch import Tensor, nn
 
 from models.isotropic_normal import IsotropicNormal
 from models.state import State
 
 
-@dataclass(frozen=True)
-class LikelihoodScales:
-    """Standard deviations; they take the place of loss weights."""
+class Scales:
+    """Likelihoods around the networks' means, for whoever has standard deviations of these names."""
 
-    center: float = 0.01  # metres
-    feature: float = 0.1  # of a vector of unit length
-    start: float = 0.077  # normalised
-    motion: float = 0.245  # normalised
+    center: float | Tensor  # metres
+    feature: float | Tensor  # of a vector of unit length
+    start: float | Tensor  # normalised
+    motion: float | Tensor  # normalised
 
     def centers(self, mean: State, mask: Tensor, *, event_dims: int = 1) -> TorchDistribution:
         """Observed centers around `mean`: event `[M, 3]`, or `[T, M, 3]` for `event_dims=2`.
@@ -34,9 +35,38 @@ class LikelihoodScales:
 
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
-        scale = mean.new_tensor((self.start, self.start, self.motion, self.motion))
-        return distributions.Normal(mean, scale).to_event(2)
+        each = (torch.as_tensor(scale, dtype=mean.dtype) for scale in (self.start, self.motion))
+        return distributions.Normal(mean, torch.stack(tuple(each)).repeat_interleave(2)).to_event(2)
 
 
-def _masked_normal(mean: Tensor, scale: float, mask: Tensor, event_dims: int) -> TorchDistribution:
+@dataclass(frozen=True)
+class LikelihoodScales(Scales):
+    """Fixed standard deviations; they take the place of loss weights (the paper's and the default choice)."""
+
+    center: float = 0.01  # metres
+    feature: float = 0.1  # of a vector of unit length
+    start: float = 0.077  # normalised
+    motion: float = 0.245  # normalised
+
+
+class LearnedScales(Scales, nn.Module):
+    """Standard deviations that are parameters, shared by f and h, and by all windows."""
+
+    def __init__(
+        self, *, center: float = 0.01, feature: float = 0.1, start: float = 0.077, motion: float = 0.245
+    ) -> None:
+        """Values to begin with. Raises `ValueError` for one that is not positive."""
+        super().__init__()
+        for name, value in (("center", center), ("feature", feature), ("start", start), ("motion", motion)):
+            if not value > 0:
+                raise ValueError(f"scales.{name} must be positive, not {value:g}")
+            self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(value).log()))
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("center", "feature", "start", "motion"):
+            return self.get_parameter(f"log_{name}").exp()
+        return super().__getattr__(name)
+
+
+def _masked_normal(mean: Tensor, scale: float | Tensor, mask: Tensor, event_dims: int) -> TorchDistribution:
     return IsotropicNormal(mean, scale).mask(mask).to_event(event_dims)

@@ -8,11 +8,11 @@ from torch.nn import functional
 
 from models.dynamics import Dynamics
 from models.encoder import StateEncoder
-from models.likelihoods import LikelihoodScales
+from models.likelihoods import Scales
 from models.state import State, Window, stack_steps
 
 
-def observe_transitions(dynamics: Dynamics, scales: LikelihoodScales, window: Window, encoded: Tensor) -> None:
+def observe_transitions(dynamics: Dynamics, scales: Scales, window: Window, encoded: Tensor) -> None:
     """s_t+1 ~ f(. | s_t, a_t) at the T observed pairs of `window: [B]`, all at once.
 
     Sites next_centers, event `[T, M, 3]`, and next_features, event `[T, M, F]`. Counted are the pairs of
@@ -29,7 +29,7 @@ def observe_transitions(dynamics: Dynamics, scales: LikelihoodScales, window: Wi
 
 
 def generate_transitions(
-    dynamics: Dynamics, encoder: StateEncoder, scales: LikelihoodScales, state: State, actions: Tensor
+    dynamics: Dynamics, encoder: StateEncoder, scales: Scales, state: State, actions: Tensor
 ) -> None:
     """Draw s_t+1 ~ f(. | s_t, a_t) push by push from `state: [B]` under `actions: [..., B, T, 4]`.
 

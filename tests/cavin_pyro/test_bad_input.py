@@ -37,7 +37,11 @@ BAD = [
     ("train", "model=nonsense", "unknown model 'nonsense': choose from cascaded"),
     ("train", "guide=nonsense", "unknown guide 'nonsense': choose from cascaded"),
     ("train", "prior=nonsense", "unknown prior 'nonsense': choose from standard"),
-    ("train", "objective=nonsense", "unknown objective 'nonsense': choose from trace_elbo"),
+    (
+        "train",
+        "objective=nonsense",
+        "unknown objective 'nonsense': choose from counterfactual, iwae, mean_field_elbo, trace_elbo",
+    ),
     ("train", "trainer.schedule=linear", "unknown trainer.schedule 'linear': choose from constant, cosine"),
     ("evaluate", "task=juggling", "choose from clearing, insertion, crossing"),
     # Words that are not there.
@@ -112,7 +116,7 @@ BAD = [
             "collect": "transitions workers steps hold minimum_objects episodes_per_shard",
             "pretrain": "steps batch_size autoencoder.width",
             "train": "trainer.steps trainer.batch_size trainer.validate_every trainer.validation_windows "
-            "trainer.patience model.segment_length model.width guide.width objective.num_particles",
+            "trainer.patience model.segment_length model.width guide.width objective.elbo.num_particles",
             "evaluate": "episodes workers",
         }.items()
         for word in words.split()

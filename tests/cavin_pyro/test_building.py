@@ -79,11 +79,11 @@ def test_sizes_are_counts() -> None:
             check_sizes("model", {"width": value})
 
 
-def test_an_objective_is_any_elbo_of_pyro() -> None:
+def test_an_objective_is_any_elbo_of_pyro(small: SimpleNamespace) -> None:
     config = {"objective": {"_target_": "pyro.infer.Trace_ELBO", "num_particles": 3, "vectorize_particles": True}}
-    objective = build_objective(config)
-    assert isinstance(objective, Trace_ELBO)
-    assert objective.num_particles == 3
+    objective = build_objective(config, build_model(small.config()))
+    assert isinstance(objective.elbo, Trace_ELBO)
+    assert objective.elbo.num_particles == 3
 
 
 def test_a_model_must_take_the_features_and_the_objects_that_there_are(small: SimpleNamespace) -> None:

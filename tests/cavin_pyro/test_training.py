@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from cavin_pyro.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.errors import UserError
+from cavin_pyro.objectives import Objective
 from cavin_pyro.training import Row, Trainer, TrainerSettings, read_rows
 from cavin_pyro.windows import WindowSettings, WindowTable
 from models.state import State
@@ -61,7 +62,7 @@ def trainer(
             hook(run, step)
 
     folder.mkdir(exist_ok=True)
-    run = Trainer(parts["model"], parts["guide"], Trace_ELBO(), windows(), settings, folder, save)
+    run = Trainer(parts["model"], parts["guide"], Objective(Trace_ELBO()), windows(), settings, folder, save)
     return run
 
 
