@@ -42,13 +42,13 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
 
 
 def check_sizes(section: str, config: Config) -> None:
-    """Make sure that every whole number of a section is at least 1.
+    """Make sure that every whole number of a section, apart from weights, is at least 1.
 
     Raises:
         UserError: one is not.
     """
     for name, value in config.items():
-        if type(value) is int:
+        if type(value) is int and not str(name).endswith("_weight"):
             at_least(f"{section}.{name!s}", value, 1)
 
 
