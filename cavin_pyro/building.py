@@ -20,6 +20,7 @@ from cavin_pyro.objectives import Objective, as_objective
 from models.pointnet import PointNet
 
 Config = Mapping[str, Any] | DictConfig
+STANDARD_PRIOR = "models.priors.StandardPrior"
 FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
 
 
@@ -42,13 +43,13 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
 
 
 def check_sizes(section: str, config: Config) -> None:
-    """Make sure that every whole number of a section is at least 1.
+    """Make sure that every whole number of a section, apart from weights, is at least 1.
 
     Raises:
         UserError: one is not.
     """
     for name, value in config.items():
-        if type(value) is int:
+        if type(value) is int and not str(name).endswith("_weight"):
             at_least(f"{section}.{name!s}", value, 1)
 
 
@@ -77,7 +78,11 @@ def build_model(config: Config) -> PyroModule:
         }
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
-    return construct(sizes, **parts, scales=construct(config.get("scales") or FIXED_SCALES))
+    model = construct(sizes, **parts, scales=construct(config.get("scales") or FIXED_SCALES))
+    chosen = own_prior.get("_target_") or config["prior"]["_target_"]
+    if not parts and chosen != STANDARD_PRIOR:
+        raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
+    return model
 
 
 def build_guide(config: Config, model: PyroModule) -> PyroModule:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pyro
-from pyro import poutine
 
 from guides.guide import Guide
-from guides.inference import EffectInference, MotionInference
+from guides.networks import effect_inference, motion_inference
 from models.cascaded import CascadedModel
+from models.plate import counted_sequences, windows_plate
 from models.state import Window
 
 
@@ -26,24 +26,15 @@ class CascadedGuide(Guide):
         Raises `ValueError` for a model that this guide does not fit.
         """
         super().__init__(model)
-        self.effect_inference = EffectInference(
-            effect_dimension=model.effect_dimension, feature_dimension=model.feature_dimension, width=width
-        )
-        self.motion_inference = MotionInference(
-            segment_length=model.segment_length,
-            effect_dimension=model.effect_dimension,
-            motion_dimension=model.motion_dimension,
-            width=width,
-            encoder_width=model.width,
-        )
+        self.effect_inference = effect_inference(model, width=width)
+        self.motion_inference = motion_inference(model, width=width, reads_effect=True)
 
     def forward(self, window: Window, generate: bool = False) -> None:
         """`window: [B]`. Codes are inferred from the window, also where the model goes on to generate."""
         first, last = window.first, window.last
         encoded = self.model.encoder(first)  # the model's state features, trained by this path as well
 
-        counted = poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]
-        with pyro.plate("windows", len(window.actions)), counted:
+        with windows_plate(window), counted_sequences(window):
             effect_code = pyro.sample("effect_code", self.effect_inference(first, last))
             motion = self.motion_inference(encoded, first.mask, window.actions, effect_code)
             pyro.sample("motion_code", motion)

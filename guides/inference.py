@@ -28,20 +28,35 @@ class GaussianCode(nn.Module):
         return distributions.Normal(mean, functional.softplus(scale) + SCALE_FLOOR).to_event(1)
 
 
-class EffectInference(nn.Module):
-    """q_h(c | s, s'): which effect turned s into s'.
+def push_features(width: int) -> nn.Sequential:
+    """FC of each push, concatenated over T: `[..., T, 4] -> [..., T * width]`."""
+    return nn.Sequential(fully_connected(4, width), nn.Flatten(-2))
 
-    Per object two FC on (s, s' - s), centers and features; masked sum over objects; FC; Gaussian.
+
+class EffectInference(nn.Module):
+    """q_h(c | s, s'): which effect turned s into s'; with `reads_actions`, q(c | s, s', a).
+
+    Per object two FC on (s, s' - s), centers and features; masked sum over objects, and FC of each push,
+    concatenated over T, if they are read; FC; Gaussian.
     """
 
-    def __init__(self, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64) -> None:
+    def __init__(
+        self,
+        *,
+        effect_dimension: int = 16,
+        feature_dimension: int = 64,
+        width: int = 64,
+        reads_actions: bool = False,
+        segment_length: int = 3,
+    ) -> None:
         super().__init__()
         self.objects = nn.Sequential(fully_connected(2 * (3 + feature_dimension), width), fully_connected(width, width))
-        self.scene = fully_connected(width, width)
+        self.pushes = push_features(width) if reads_actions else None
+        self.scene = fully_connected(width + segment_length * width if reads_actions else width, width)
         self.code = GaussianCode(effect_dimension, width=width)
 
-    def forward(self, state: State, subgoal: State) -> TorchDistribution:
-        """`state, subgoal: [...]` -> batch `[...]`; objects count that are real in both."""
+    def forward(self, state: State, subgoal: State, actions: Tensor | None = None) -> TorchDistribution:
+        """`state, subgoal: [...]`, `actions: [..., T, 4]` -> batch `[...]`; objects count that are real in both."""
         parts = (
             relative_positions(state.centers),
             state.features,
@@ -50,11 +65,13 @@ class EffectInference(nn.Module):
         )
         real = (state.mask & subgoal.mask).unsqueeze(-1)
         pooled = (self.objects(torch.cat(parts, -1)) * real).sum(-2)
+        if self.pushes is not None:
+            pooled = torch.cat((pooled, self.pushes(actions)), -1)
         return self.code(self.scene(pooled))
 
 
 class MotionInference(nn.Module):
-    """q_g(z | s, a, c): which motion brought the effect about.
+    """q_g(z | s, a, c): which motion brought the effect about; with `effect_dimension=None`, q(z | s, a).
 
     (s, c) pooled as in the action generator; FC of each push, concatenated over T; FC of both; Gaussian.
     """
@@ -63,7 +80,7 @@ class MotionInference(nn.Module):
         self,
         *,
         segment_length: int = 3,
-        effect_dimension: int = 16,
+        effect_dimension: int | None = 16,
         motion_dimension: int = 16,
         width: int = 64,
         encoder_width: int = 64,
@@ -71,12 +88,14 @@ class MotionInference(nn.Module):
         super().__init__()
         self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=encoder_width)
         self.pool = ObjectPool(width)
-        self.pushes = nn.Sequential(fully_connected(4, width), nn.Flatten(-2))
+        self.pushes = push_features(width)
         self.from_pushes = nn.Linear(segment_length * width, width)
         self.from_pooled = nn.Linear(width, width, bias=False)
         self.code = GaussianCode(motion_dimension, width=width)
 
-    def forward(self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor) -> TorchDistribution:
+    def forward(
+        self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor | None = None
+    ) -> TorchDistribution:
         """Leading dimensions broadcast.
 
         Args:

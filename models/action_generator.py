@@ -17,29 +17,38 @@ class ActionGenerator(nn.Module):
     pooled      = softmax-weighted mean of the effect features of (s, c) over real objects
     transformed = mean(pooled) + scale(pooled) * z
     starts      = 5 tanh(x / 5) of FC(transformed), motions = tanh of FC(transformed)
+
+    Without a motion code (`motion_dimension=None`) there is nothing to transform: the pushes are read off
+    the pooled feature.
     """
 
-    def __init__(self, *, segment_length: int = 3, motion_dimension: int = 16, width: int = 64) -> None:
+    def __init__(self, *, segment_length: int = 3, motion_dimension: int | None = 16, width: int = 64) -> None:
         super().__init__()
         self.pool = ObjectPool(width)
-        self.transform = nn.Linear(width, 2 * motion_dimension)
-        self.starts = nn.Sequential(
-            fully_connected(motion_dimension, width),
-            nn.Linear(width, 2 * segment_length),
-            nn.Unflatten(-1, (segment_length, 2)),
-        )
-        self.motions = nn.Sequential(
-            fully_connected(motion_dimension, width),
-            nn.Linear(width, 2 * segment_length),
-            nn.Unflatten(-1, (segment_length, 2)),
-        )
+        self.transform = None if motion_dimension is None else nn.Linear(width, 2 * motion_dimension)
+        inputs = motion_dimension or width
+        self.starts = _coordinates(inputs, segment_length, width)
+        self.motions = _coordinates(inputs, segment_length, width)
 
-    def forward(self, effect: Tensor, mask: Tensor, motion_code: Tensor) -> Tensor:
+    def forward(self, effect: Tensor, mask: Tensor, motion_code: Tensor | None = None) -> Tensor:
         """`effect: [..., M, width]`, `mask: [..., M]`, `motion_code: [..., D]` -> `[..., T, 4]`.
 
-        Leading dimensions broadcast.
+        Leading dimensions broadcast. Raises `ValueError` if a motion code is missing.
         """
-        mean, scale = self.transform(self.pool(effect, mask)).chunk(2, -1)
-        transformed = mean + functional.softplus(scale) * motion_code
-        starts = START_LIMIT * (self.starts(transformed) / START_LIMIT).tanh()
-        return torch.cat((starts, self.motions(transformed).tanh()), -1)
+        feature = self.pool(effect, mask)
+        if self.transform is not None:
+            if motion_code is None:
+                raise ValueError("these pushes depend on a motion code; none was given")
+            mean, scale = self.transform(feature).chunk(2, -1)
+            feature = mean + functional.softplus(scale) * motion_code
+        starts = START_LIMIT * (self.starts(feature) / START_LIMIT).tanh()
+        return torch.cat((starts, self.motions(feature).tanh()), -1)
+
+
+def _coordinates(inputs: int, segment_length: int, width: int) -> nn.Sequential:
+    """Two numbers for each of the T pushes: `[..., inputs] -> [..., T, 2]`."""
+    return nn.Sequential(
+        fully_connected(inputs, width),
+        nn.Linear(width, 2 * segment_length),
+        nn.Unflatten(-1, (segment_length, 2)),
+    )

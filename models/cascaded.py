@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pyro
-from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from models.action_generator import ActionGenerator
-from models.dynamics import Dynamics, MetaDynamics
-from models.encoder import StateEncoder
-from models.likelihoods import LikelihoodScales, Scales
+from models.dynamics import MetaDynamics
+from models.model import Model
+from models.plate import counted_sequences, windows_plate
 from models.priors import StandardPrior
-from models.program import Program
 from models.state import State, Window
-from models.transitions import generate_transitions, observe_transitions
+from models.transitions import sample_subgoal
 
 
-class CascadedModel(Program):
+class CascadedModel(Model):
     """Effects, motions and their outcomes, for each window with states s = s_0, ..., s_T = s'.
 
     c ~ p(c | s)                     # effect_code
@@ -35,31 +35,21 @@ class CascadedModel(Program):
     def __init__(
         self,
         *,
-        segment_length: int = 3,
         effect_dimension: int = 16,
         motion_dimension: int = 16,
-        feature_dimension: int = 64,
-        width: int = 64,
-        maximum_objects: int = 5,
         effect_prior: nn.Module | None = None,
         motion_prior: nn.Module | None = None,
-        scales: Scales | None = None,
+        **shared: Any,
     ) -> None:
-        super().__init__()
-        self.segment_length = segment_length
+        """`shared` are the arguments of `Model`."""
+        super().__init__(**shared)
         self.effect_dimension = effect_dimension
         self.motion_dimension = motion_dimension
-        self.feature_dimension = feature_dimension
-        self.width = width
-        self.maximum_objects = maximum_objects
-        self.scales = scales or LikelihoodScales()
-        self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects)
-        self.dynamics = Dynamics(feature_dimension=feature_dimension, width=width)
         self.meta_dynamics = MetaDynamics(
-            effect_dimension=effect_dimension, feature_dimension=feature_dimension, width=width
+            effect_dimension=effect_dimension, feature_dimension=self.feature_dimension, width=self.width
         )
         self.action_generator = ActionGenerator(
-            segment_length=segment_length, motion_dimension=motion_dimension, width=width
+            segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width
         )
         self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
         self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
@@ -71,32 +61,20 @@ class CascadedModel(Program):
         instead of observed (next states push by push, see `models/transitions.py`).
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
-        self._check(window)
         # Reading a network off the program may announce its parameters to Pyro: read each once.
-        encoder, meta_dynamics, scales = self.encoder, self.meta_dynamics, self.scales
-        first, last = window.first, window.last
-        real = first.mask if generate else first.mask & last.mask
-        before = window.states.step(slice(0, 1) if generate else slice(0, -1))
-        encoded = encoder(before)  # [B, T, M, 3 * width]; only the first state when generating
+        meta_dynamics, scales = self.meta_dynamics, self.scales
+        encoded, first = self.encode(window, generate), window.first
 
-        def seen(value: Tensor) -> Tensor | None:
-            return None if generate else value
-
-        counted = poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]
-        with pyro.plate("windows", len(window.actions)):
-            with counted:
+        with windows_plate(window):
+            with counted_sequences(window):
                 effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
                 effect = meta_dynamics.effect(encoded[:, 0], effect_code)
-                subgoal = meta_dynamics(first, effect)
-                pyro.sample("subgoal_centers", scales.centers(subgoal, real), obs=seen(last.centers))
-                pyro.sample("subgoal_features", scales.features(subgoal, real), obs=seen(last.features))
+                sample_subgoal(scales, meta_dynamics(first, effect), window, generate)
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first, effect_code))
                 mean = self.action_generator(effect, first.mask, motion_code)
-                actions = pyro.sample("actions", scales.actions(mean), obs=seen(window.actions))
-            if generate:
-                generate_transitions(self.dynamics, encoder, scales, first, actions)
-            else:
-                observe_transitions(self.dynamics, scales, window, encoded)
+                observed = None if generate else window.actions
+                actions = pyro.sample("actions", scales.actions(mean), obs=observed)
+            self.sample_transitions(window, encoded, actions, generate)
 
     def effect_prior(self, state: State) -> TorchDistribution:
         """p(c | s): `state: [...]` -> batch `[...]`, event `[C]`."""
@@ -115,15 +93,3 @@ class CascadedModel(Program):
         """Mean of g: `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]` -> `[..., T, 4]`."""
         effect = self.meta_dynamics.effect(self.encoder(state), effect_code)
         return self.action_generator(effect, state.mask, motion_code)
-
-    def next_state(self, state: State, action: Tensor) -> State:
-        """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
-        return self.dynamics(state, self.encoder(state), action)
-
-    def _check(self, window: Window) -> None:
-        if len(window.batch_shape) != 1:
-            raise ValueError(f"windows come as one batch [B]; got leading dimensions {[*window.batch_shape]}")
-        if window.segment_length != self.segment_length:
-            raise ValueError(
-                f"window has {window.segment_length} pushes; this model was made for {self.segment_length}"
-            )

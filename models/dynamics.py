@@ -13,24 +13,29 @@ SUBGOAL_RANGE = 0.5  # metres, farthest that a segment of pushes moves an object
 
 
 class EffectTrunk(nn.Module):
-    """What a context (an action or an effect code) does to each object: the effect feature."""
+    """What a context (an action or an effect code) does to each object: the effect feature.
 
-    def __init__(self, context_dimension: int, *, width: int = 64, encoder_width: int = 64) -> None:
+    Without a context (`context_dimension=None`) its layers are not there, and the feature is of the state alone.
+    """
+
+    def __init__(self, context_dimension: int | None, *, width: int = 64, encoder_width: int = 64) -> None:
         super().__init__()
-        self.context = fully_connected(context_dimension, width)
+        self.context = None if context_dimension is None else fully_connected(context_dimension, width)
         self.from_state = nn.Linear(3 * encoder_width, width)
-        self.from_context = nn.Linear(width, width, bias=False)
+        self.from_context = None if context_dimension is None else nn.Linear(width, width, bias=False)
         self.second = fully_connected(width, width)
 
-    def forward(self, encoded: Tensor, context: Tensor) -> Tensor:
+    def forward(self, encoded: Tensor, context: Tensor | None = None) -> Tensor:
         """`encoded: [..., M, 3 * encoder_width]`, `context: [..., context_dimension]` -> `[..., M, width]`.
 
         The leading dimensions of both broadcast.
         """
-        # A linear layer on (state feature, context repeated per object), whose part for the context
-        # is computed once per scene instead of once per object.
-        from_context = self.from_context(self.context(context)).unsqueeze(-2)
-        return self.second((self.from_state(encoded) + from_context).relu_())
+        feature = self.from_state(encoded)
+        if self.context is not None and self.from_context is not None:
+            # A linear layer on (state feature, context repeated per object), whose part for the context
+            # is computed once per scene instead of once per object.
+            feature = feature + self.from_context(self.context(context)).unsqueeze(-2)
+        return self.second(feature.relu_())
 
 
 class StateChange(nn.Module):

@@ -1,4 +1,4 @@
-"""The dynamics f as a piece of a Pyro program, shared by every model that has one (paper, equation 1)."""
+"""The dynamics f and the meta-dynamics h as pieces of Pyro programs (paper, equations 1 and 2)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,18 @@ from models.dynamics import Dynamics
 from models.encoder import StateEncoder
 from models.likelihoods import Scales
 from models.state import State, Window, stack_steps
+
+
+def sample_subgoal(scales: Scales, mean: State, window: Window, generate: bool) -> None:
+    """s' ~ h(. | s, c) for `window: [B]` around `mean: [..., B]`, observed unless `generate`.
+
+    Sites subgoal_centers, event `[M, 3]`, and subgoal_features, event `[M, F]`. Counted are the objects that
+    are real in s and s', or in s alone where s' is drawn.
+    """
+    first, last = window.first, window.last
+    counted = first.mask if generate else first.mask & last.mask
+    pyro.sample("subgoal_centers", scales.centers(mean, counted), obs=None if generate else last.centers)
+    pyro.sample("subgoal_features", scales.features(mean, counted), obs=None if generate else last.features)
 
 
 def observe_transitions(dynamics: Dynamics, scales: Scales, window: Window, encoded: Tensor) -> None:

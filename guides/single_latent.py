@@ -1,0 +1,36 @@
+"""The guide beside `models/single_latent.py` (paper, appendix A.2)."""
+
+from __future__ import annotations
+
+import pyro
+
+from guides.guide import Guide
+from guides.networks import effect_inference
+from models.plate import counted_sequences, windows_plate
+from models.single_latent import SingleLatentModel
+from models.state import Window
+
+
+class SingleLatentGuide(Guide):
+    """Infers the one code of each window from its states.
+
+    c ~ q_h(c | s, s')      # effect_code
+
+    As SeCTAR's encoder, which sees states only, and as the cascade's effect inference network, which has no
+    layer that this model would not use. With `reads_actions` it is q(c | s, s', a), since c decodes them too.
+    """
+
+    fits = ("single_latent",)
+
+    def __init__(self, model: SingleLatentModel, *, width: int = 64, reads_actions: bool = False) -> None:
+        """Dimensions are the model's; `width` is that of the guide's own layers.
+
+        Raises `ValueError` for a model that this guide does not fit.
+        """
+        super().__init__(model)
+        self.effect_inference = effect_inference(model, width=width, reads_actions=reads_actions)
+
+    def forward(self, window: Window, generate: bool = False) -> None:
+        """`window: [B]`. The code is inferred from the window, also where the model goes on to generate."""
+        with windows_plate(window), counted_sequences(window):
+            pyro.sample("effect_code", self.effect_inference(window.first, window.last, window.actions))

@@ -1,0 +1,28 @@
+"""The dynamics alone, for MPC on raw actions, as a Pyro program (paper, appendix A.2)."""
+
+from __future__ import annotations
+
+from models.model import Model
+from models.plate import windows_plate
+from models.state import Window
+
+
+class DynamicsModel(Model):
+    """Outcomes of given pushes a_0, ..., a_T-1, for each window with states s_0, ..., s_T.
+
+    s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
+
+    Pair t counts where `transition_mask` is set, and there the objects that are real in both states.
+    """
+
+    name = "dynamics"
+
+    def forward(self, window: Window, generate: bool = False) -> None:
+        """Run the process for `window: [B]`, a batch of training examples.
+
+        With `generate=True` only the first states and the actions are read; next states are drawn.
+        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        """
+        encoded = self.encode(window, generate)
+        with windows_plate(window):
+            self.sample_transitions(window, encoded, window.actions, generate)

@@ -1,0 +1,69 @@
+"""Motions without effects, CVAE-MPC, as a Pyro program (paper, appendix A.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyro
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from models.action_generator import ActionGenerator
+from models.dynamics import EffectTrunk
+from models.model import Model
+from models.plate import counted_sequences, windows_plate
+from models.priors import StandardPrior
+from models.state import State, Window
+
+
+class FlatModel(Model):
+    """Motions and their outcomes, for each window with states s = s_0, ..., s_T.
+
+    z ~ p(z | s)                     # motion_code
+    a ~ g(a | s, z)                  # actions, T pushes
+    s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
+
+    What counts is as in `CascadedModel`, whose networks these are but for h and the layers that read c.
+    """
+
+    name = "flat"
+
+    def __init__(
+        self,
+        *,
+        motion_dimension: int = 32,
+        motion_prior: nn.Module | None = None,
+        **shared: Any,
+    ) -> None:
+        """`shared` are the arguments of `Model`."""
+        super().__init__(**shared)
+        self.motion_dimension = motion_dimension
+        self.trunk = EffectTrunk(None, width=self.width, encoder_width=self.width)
+        self.action_generator = ActionGenerator(
+            segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width
+        )
+        self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
+
+    def forward(self, window: Window, generate: bool = False) -> None:
+        """Run the process for `window: [B]`, a batch of training examples.
+
+        With `generate=True` only the first states are read; all else is drawn.
+        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        """
+        encoded, first = self.encode(window, generate), window.first
+
+        with windows_plate(window):
+            with counted_sequences(window):
+                motion_code = pyro.sample("motion_code", self.prior_of_motions(first))
+                mean = self.action_generator(self.trunk(encoded[:, 0]), first.mask, motion_code)
+                observed = None if generate else window.actions
+                actions = pyro.sample("actions", self.scales.actions(mean), obs=observed)
+            self.sample_transitions(window, encoded, actions, generate)
+
+    def motion_prior(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
+        """p(z | s): `state: [...]` -> batch `[...]`, event `[Z]`; no effect code is read."""
+        return self.prior_of_motions(state)
+
+    def actions(self, state: State, effect_code: Tensor | None = None, *, motion_code: Tensor) -> Tensor:
+        """Mean of g: `state: [...]`, `motion_code: [..., Z]` -> `[..., T, 4]`; no effect code is read."""
+        return self.action_generator(self.trunk(self.encoder(state)), state.mask, motion_code)

@@ -1,0 +1,93 @@
+"""One latent for states and actions, SeCTAR, as a Pyro program (paper, appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pyro
+from pyro import poutine
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from models.action_generator import ActionGenerator
+from models.dynamics import MetaDynamics
+from models.model import Model
+from models.plate import counted_sequences, windows_plate
+from models.priors import StandardPrior
+from models.state import State, Window
+from models.transitions import sample_subgoal
+
+
+class SingleLatentModel(Model):
+    """Effects that settle the pushes as well, for each window with states s = s_0, ..., s_T = s'.
+
+    c ~ p(c | s)                     # effect_code
+    s' ~ h(s' | s, c)                # subgoal_centers, subgoal_features
+    a ~ g(a | s, c)                  # actions, T pushes; log-density times action_weight
+    s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
+
+    What counts is as in `CascadedModel`, whose networks these are but for the layers that read z.
+    """
+
+    name = "single_latent"
+
+    def __init__(
+        self,
+        *,
+        effect_dimension: int = 32,
+        effect_prior: nn.Module | None = None,
+        action_weight: float = 1.0,
+        **shared: Any,
+    ) -> None:
+        """`shared` are the arguments of `Model`.
+
+        `action_weight` is the balance between the two reconstructions, which the paper says needs care
+        (section 4.2): a weight w is, but for a constant, standard deviations of the pushes divided by sqrt(w).
+        Only with 1 is the objective a bound on the evidence. Raises `ValueError` unless it is above 0.
+        """
+        if not 0 < action_weight < math.inf:
+            raise ValueError(f"action_weight must be a positive number, not {action_weight}")
+        super().__init__(**shared)
+        self.effect_dimension = effect_dimension
+        self.action_weight = action_weight
+        self.meta_dynamics = MetaDynamics(
+            effect_dimension=effect_dimension, feature_dimension=self.feature_dimension, width=self.width
+        )
+        self.action_generator = ActionGenerator(
+            segment_length=self.segment_length, motion_dimension=None, width=self.width
+        )
+        self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
+
+    def forward(self, window: Window, generate: bool = False) -> None:
+        """Run the process for `window: [B]`, a batch of training examples.
+
+        With `generate=True` only the first states are read; all else is drawn.
+        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        """
+        meta_dynamics, scales = self.meta_dynamics, self.scales
+        encoded, first = self.encode(window, generate), window.first
+
+        with windows_plate(window):
+            with counted_sequences(window):
+                effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
+                effect = meta_dynamics.effect(encoded[:, 0], effect_code)
+                sample_subgoal(scales, meta_dynamics(first, effect), window, generate)
+                mean = self.action_generator(effect, first.mask)
+                observed = None if generate else window.actions
+                with poutine.scale(scale=self.action_weight):
+                    actions = pyro.sample("actions", scales.actions(mean), obs=observed)
+            self.sample_transitions(window, encoded, actions, generate)
+
+    def effect_prior(self, state: State) -> TorchDistribution:
+        """p(c | s): `state: [...]` -> batch `[...]`, event `[C]`."""
+        return self.prior_of_effects(state)
+
+    def subgoal(self, state: State, effect_code: Tensor) -> State:
+        """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T pushes ahead."""
+        meta_dynamics = self.meta_dynamics
+        return meta_dynamics(state, meta_dynamics.effect(self.encoder(state), effect_code))
+
+    def actions(self, state: State, effect_code: Tensor, motion_code: Tensor | None = None) -> Tensor:
+        """Mean of g: `state: [...]`, `effect_code: [..., C]` -> `[..., T, 4]`; no motion code is read."""
+        return self.action_generator(self.meta_dynamics.effect(self.encoder(state), effect_code), state.mask)
