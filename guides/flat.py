@@ -30,7 +30,7 @@ class FlatGuide(Guide):
     def forward(self, window: Window, generate: bool = False) -> None:
         """`window: [B]`. The code is inferred from the window, also where the model goes on to generate."""
         first = window.first
-        encoded = self.model.encoder(first)  # the model's state features, trained by this path as well
+        encoded = self.model.encode(window, generate, for_guide=True)[:, 0]
 
         with windows_plate(window), counted_sequences(window):
             pyro.sample("motion_code", self.motion_inference(encoded, first.mask, window.actions))

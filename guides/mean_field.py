@@ -32,7 +32,7 @@ class MeanFieldGuide(Guide):
     def forward(self, window: Window, generate: bool = False) -> None:
         """`window: [B]`. Codes are inferred from the window, also where the model goes on to generate."""
         first, last = window.first, window.last
-        encoded = self.model.encoder(first)
+        encoded = self.model.encode(window, generate, for_guide=True)[:, 0]
 
         with windows_plate(window), counted_sequences(window):
             pyro.sample("effect_code", self.effect_inference(first, last))

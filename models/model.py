@@ -8,6 +8,7 @@ from torch import Tensor
 
 from models.dynamics import Dynamics
 from models.encoder import StateEncoder
+from models.encoding import SharedEncoding
 from models.likelihoods import LikelihoodScales, Scales
 from models.program import Program
 from models.state import State, Window
@@ -52,14 +53,16 @@ class Model(Program):
         self.scales = scales or LikelihoodScales()
         self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects)
         self.dynamics = Dynamics(feature_dimension=feature_dimension, width=width)
+        self._shared_encoding = SharedEncoding()
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
         return self.dynamics(state, self.encoder(state), action)
 
-    def encode(self, window: Window, generate: bool) -> Tensor:
+    def encode(self, window: Window, generate: bool, *, for_guide: bool = False) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 
+        What a guide asks for with `for_guide=True` is kept for the model, which needs the same.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
         if len(window.batch_shape) != 1:
@@ -68,7 +71,14 @@ class Model(Program):
             raise ValueError(
                 f"window has {window.segment_length} pushes; this model was made for {self.segment_length}"
             )
-        return self.encoder(window.states.step(slice(0, 1) if generate else slice(0, -1)))
+        encoder = self.encoder
+        if generate:
+            return encoder(window.states.step(slice(0, 1)))
+        kept = None if for_guide else self._shared_encoding.take(encoder, window)
+        encoded = encoder(window.states.step(slice(0, -1))) if kept is None else kept
+        if for_guide:
+            self._shared_encoding.keep(encoder, window, encoded)
+        return encoded
 
     def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
         """The sites of f, observed or drawn from the first states on (see `models/transitions.py`).
