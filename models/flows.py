@@ -22,7 +22,7 @@ class FlowDistribution(TorchDistribution):
 
     What was drawn last is scored at no cost. No KL divergence has a closed form here, so `TraceMeanField_ELBO` takes
     the one-sample estimate that `Trace_ELBO` takes. (`pyro.contrib.zuko.ZukoToPyro` has neither `sample`, which
-    planning calls, nor bounds to its cache.)
+    planning calls, nor a bound to its cache.)
     """
 
     arg_constraints: dict[str, Any] = {}
@@ -46,7 +46,9 @@ class FlowDistribution(TorchDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         if self._drawn is not None and value is self._drawn[0]:
-            return self._drawn[1]
+            density = self._drawn[1]
+            if density.requires_grad or not torch.is_grad_enabled():  # else drawn without gradients, scored with them
+                return density
         if self._validate_args:
             self._validate_sample(value)
         return self.flow.log_prob(value.expand(torch.broadcast_shapes(value.shape, self.shape())))
@@ -57,7 +59,7 @@ class CodeFlow(nn.Module):
 
     Each coupling moves one half of the numbers of a code, x_b' = exp(s) x_b + t with (s, t) from the other half and the
     context by a network with one hidden layer; halves alternate. Couplings, because they are as fast backwards as
-    forwards: guides draw, training scores, planning draws. An autoregressive flow takes D passes one of both ways.
+    forwards: guides draw, training scores, planning draws. An autoregressive flow needs D passes one of the two ways.
 
     `from_base` says which way the couplings run. From base to code (guides) a code is drawn and scored in one pass, and
     a foreign code is scored in two; from code to base (priors) a foreign code is scored in one pass.

@@ -88,6 +88,15 @@ def test_what_was_drawn_is_scored_as_any_other_code(from_base: bool) -> None:
     assert all(torch.allclose(*pair, atol=1e-10) for pair in zip(*gradients, strict=True))
 
 
+def test_codes_drawn_without_gradients_are_scored_with_them() -> None:
+    """As wake-sleep does."""
+    flow = stirred(CodeFlow(5, 3, width=8, from_base=True))
+    distribution = flow(standard(4, 5), numbers(4, 3))
+    with torch.no_grad():
+        drawn = distribution.rsample()
+    assert distribution.log_prob(drawn).requires_grad
+
+
 @given(
     batch=st.lists(st.integers(1, 3), max_size=2),
     samples=st.lists(st.integers(1, 3), max_size=2),
