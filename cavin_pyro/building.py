@@ -66,9 +66,11 @@ def build_model(config: Config) -> PyroModule:
     own_prior = sizes.pop("prior", None) or {}
     check_sizes("model", sizes)
     try:
+        prior = own_prior if own_prior.get("_target_") else config["prior"]
+        check_sizes("prior", prior)
         parts = {
             name: construct(
-                own_prior if own_prior.get("_target_") else config["prior"],
+                prior,
                 dimension=sizes[f"{kind}_dimension"],
                 feature_dimension=sizes["feature_dimension"],
                 effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,

@@ -3,29 +3,12 @@
 from __future__ import annotations
 
 import torch
-from pyro import distributions
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
-from torch.nn import functional
 
 from models.dynamics import EffectTrunk
-from models.layers import POSITION_UNIT, ObjectPool, fully_connected, relative_positions
+from models.layers import POSITION_UNIT, GaussianCode, ObjectPool, fully_connected, relative_positions
 from models.state import State
-
-SCALE_FLOOR = 1e-6  # keeps the density of a code finite
-
-
-class GaussianCode(nn.Module):
-    """A diagonal Gaussian over a code, from a feature."""
-
-    def __init__(self, dimension: int, *, width: int = 64) -> None:
-        super().__init__()
-        self.head = nn.Linear(width, 2 * dimension)
-
-    def forward(self, feature: Tensor) -> TorchDistribution:
-        """`feature: [..., width]` -> batch `[...]`, event `[dimension]`."""
-        mean, scale = self.head(feature).chunk(2, -1)
-        return distributions.Normal(mean, functional.softplus(scale) + SCALE_FLOOR).to_event(1)
 
 
 def push_features(width: int) -> nn.Sequential:
@@ -53,7 +36,7 @@ class EffectInference(nn.Module):
         self.objects = nn.Sequential(fully_connected(2 * (3 + feature_dimension), width), fully_connected(width, width))
         self.pushes = push_features(width) if reads_actions else None
         self.scene = fully_connected(width + segment_length * width if reads_actions else width, width)
-        self.code = GaussianCode(effect_dimension, width=width)
+        self.code: nn.Module = GaussianCode(effect_dimension, width=width)
 
     def forward(self, state: State, subgoal: State, actions: Tensor | None = None) -> TorchDistribution:
         """`state, subgoal: [...]`, `actions: [..., T, 4]` -> batch `[...]`; objects count that are real in both."""
@@ -91,7 +74,7 @@ class MotionInference(nn.Module):
         self.pushes = push_features(width)
         self.from_pushes = nn.Linear(segment_length * width, width)
         self.from_pooled = nn.Linear(width, width, bias=False)
-        self.code = GaussianCode(motion_dimension, width=width)
+        self.code: nn.Module = GaussianCode(motion_dimension, width=width)
 
     def forward(
         self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor | None = None

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
+from pyro import distributions
+from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
+from torch.nn import functional
 
 TABLE_CENTER = (0.6, 0.0, 0.0)  # metres, in the robot's base frame
 POSITION_UNIT = 0.1  # metres; a push moves things by about this much, so networks see numbers of size one
+SCALE_FLOOR = 1e-6  # keeps the density of a code finite
 
 
 def fully_connected(inputs: int, outputs: int) -> nn.Sequential:
@@ -36,3 +42,24 @@ class ObjectPool(nn.Module):
         # The smallest finite number, not -inf: a scene without objects then gives numbers, not NaN.
         scores = scores.masked_fill(~mask, torch.finfo(scores.dtype).min)
         return (scores.softmax(-1).unsqueeze(-1) * objects).sum(-2)
+
+
+class GaussianCode(nn.Module):
+    """A diagonal Gaussian over a code, from a feature."""
+
+    def __init__(self, dimension: int, *, width: int = 64) -> None:
+        super().__init__()
+        self.head = nn.Linear(width, 2 * dimension)
+
+    def forward(self, feature: Tensor) -> TorchDistribution:
+        """`feature: [..., width]` -> batch `[...]`, event `[dimension]`."""
+        mean, scale = self.head(feature).chunk(2, -1)
+        return distributions.Normal(mean, functional.softplus(scale) + SCALE_FLOOR).to_event(1)
+
+    def begin_at_standard(self) -> GaussianCode:
+        """Set the weights so that the code is N(0, I) whatever the feature; returns itself."""
+        mean, scale = self.head.bias.detach().chunk(2)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(mean)
+        nn.init.constant_(scale, math.log(math.expm1(1 - SCALE_FLOOR)))
+        return self

@@ -36,7 +36,7 @@ BAD = [
     ("plan", "env.ranges.names=[fork]", "unknown object 'fork' in env.ranges.names: choose from sugar_box"),
     ("train", "model=nonsense", "unknown model 'nonsense': choose from cascaded"),
     ("train", "guide=nonsense", "unknown guide 'nonsense': choose from cascaded"),
-    ("train", "prior=nonsense", "unknown prior 'nonsense': choose from standard"),
+    ("train", "prior=nonsense", "unknown prior 'nonsense': choose from conditional, flow, standard"),
     (
         "train",
         "objective=nonsense",

@@ -3,7 +3,10 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import hydra
 import pytest
+import torch
+from omegaconf import OmegaConf
 from pyro.infer import Trace_ELBO
 
 from cavin_pyro.building import (
@@ -15,7 +18,7 @@ from cavin_pyro.building import (
     construct,
     load_pointnet,
 )
-from cavin_pyro.checkpoint import save_checkpoint
+from cavin_pyro.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.errors import UserError
 from models.pointnet import PointNet
 from models.program import Program
@@ -34,6 +37,41 @@ def test_a_model_gets_a_prior_of_its_own_size_for_each_code(small: SimpleNamespa
     assert model.prior_of_effects.dimension == 4
     assert model.prior_of_motions.dimension == 6
     assert model.width == 8
+
+
+@pytest.mark.parametrize("prior", ["standard", "conditional", "flow"])
+@pytest.mark.parametrize("guide", ["cascaded", "flow"])
+def test_words_for_priors_and_guides_build_what_a_checkpoint_builds_again(
+    prior: str, guide: str, tmp_path: Path
+) -> None:
+    words = [f"prior={prior}", f"guide={guide}", "model.width=8", "guide.width=8"]
+    with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
+        config = OmegaConf.to_container(hydra.compose("train", overrides=words))
+    model = build_model(config)
+    parts = {"model": model, "guide": build_guide(config, model)}
+    save_checkpoint(tmp_path / "a.safetensors", parts=parts, config=config, provenance={})
+    checkpoint = load_checkpoint(tmp_path / "a.safetensors")
+    again = build_model(checkpoint.config)
+    for part, module in {"model": again, "guide": build_guide(checkpoint.config, again)}.items():
+        checkpoint.load_into(part, module, "a.safetensors")
+        weights = parts[part].state_dict()
+        assert all(torch.equal(value, weights[name]) for name, value in module.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ({"width": 0}, "^prior.width must be at least 1, not 0$"),
+        ({"transforms": -1}, "^prior.transforms must be at least 1, not -1$"),
+        ({"depth": 3}, "models.learned_priors.FlowPrior cannot be built: .*'depth'"),
+    ],
+)
+def test_options_that_a_prior_does_not_take_are_named(option: dict, said: str, small: SimpleNamespace) -> None:
+    config = small.config()
+    config["prior"] = {"_target_": "models.learned_priors.FlowPrior", **option}
+    with pytest.raises(UserError, match=said) as caught:
+        build_model(config)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNamespace) -> None:

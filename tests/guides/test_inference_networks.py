@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from guides.inference import SCALE_FLOOR, EffectInference, GaussianCode, MotionInference
+from guides.inference import EffectInference, MotionInference
+from models.layers import SCALE_FLOOR, GaussianCode
 from models.state import State, Window
 
 

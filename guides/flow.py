@@ -1,0 +1,48 @@
+"""The cascaded guide with normalising flows in the place of its Gaussians."""
+
+from __future__ import annotations
+
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from guides.cascaded import CascadedGuide
+from models.cascaded import CascadedModel
+from models.flows import CodeFlow
+
+
+class FlowCode(nn.Module):
+    """A flow on top of a diagonal Gaussian over a code, both from one feature."""
+
+    def __init__(
+        self, gaussian: nn.Module, dimension: int, context_dimension: int, *, width: int, transforms: int
+    ) -> None:
+        super().__init__()
+        self.gaussian = gaussian
+        self.flow = CodeFlow(dimension, context_dimension, width=width, transforms=transforms, from_base=True)
+
+    def forward(self, feature: Tensor) -> TorchDistribution:
+        """`feature: [..., context_dimension]` -> batch `[...]`, event `[dimension]`."""
+        return self.flow(self.gaussian(feature), feature)
+
+
+class FlowGuide(CascadedGuide):
+    """Infers the two codes of each window, the motion given the effect, without the assumption that they are Gaussian.
+
+    c ~ flow over q_h(c | s, s')      # effect_code
+    z ~ flow over q_g(z | s, a, c)    # motion_code
+
+    The flows begin as the identity: before training this is the guide that it extends.
+    """
+
+    def __init__(self, model: CascadedModel, *, width: int = 64, flow_width: int = 32, transforms: int = 4) -> None:
+        """`flow_width` is that of the hidden layer in each of the `transforms` couplings of a flow.
+
+        Raises `ValueError` for a model that this guide does not fit.
+        """
+        super().__init__(model, width=width)
+        # Around the Gaussians that are there, so that equal seeds give both guides equal weights to begin with.
+        for inference, dimension in (
+            (self.effect_inference, model.effect_dimension),
+            (self.motion_inference, model.motion_dimension),
+        ):
+            inference.code = FlowCode(inference.code, dimension, width, width=flow_width, transforms=transforms)

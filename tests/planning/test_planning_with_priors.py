@@ -1,0 +1,77 @@
+"""Planning draws from whatever prior the model has, with no change to the planner."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+from models.cascaded import CascadedModel
+from models.learned_priors import ConditionalPrior, FlowPrior
+from models.priors import StandardPrior
+from models.state import State
+from planning import CavinPlanner
+
+each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior])
+
+
+def model_with(kind: type) -> CascadedModel:
+    torch.manual_seed(0)
+    model = CascadedModel(
+        effect_dimension=5,
+        motion_dimension=4,
+        feature_dimension=1,
+        width=8,
+        effect_prior=kind(dimension=5, feature_dimension=1),
+        motion_prior=kind(dimension=4, feature_dimension=1, effect_dimension=5),
+    )
+    for name, parameter in model.named_parameters():
+        if name.startswith("prior"):
+            nn.init.normal_(parameter, std=0.1)
+    return model
+
+
+def scenes(toy: SimpleNamespace) -> State:
+    return toy.scenes([[(0.5, 0.1), (0.7, -0.1)], [(0.4, -0.2), (0.6, 0.3)]], [1.0, 1.0])
+
+
+def planner(toy: SimpleNamespace, kind: type, horizon: str = "first_segment") -> CavinPlanner:
+    reward = toy.GoalDisc((0.8, 0.0))
+    return CavinPlanner(model_with(kind), reward, samples=32, horizon=9, motion_horizon=horizon)
+
+
+@each_prior
+@pytest.mark.parametrize("horizon", ["first_segment", "full_horizon"])
+def test_a_plan_comes_out_and_again_from_the_same_seed(kind: type, horizon: str, toy: SimpleNamespace) -> None:
+    planners = [planner(toy, kind, horizon) for _ in range(2)]
+    global_state = torch.get_rng_state()
+    plans = [one.plan(scenes(toy), toy.generators(3, 4)) for one in planners]
+    assert torch.equal(torch.get_rng_state(), global_state)
+    assert plans[0].actions.shape == (2, 3, 4)
+    assert plans[0].effect_codes.shape == (2, 3, 5)
+    assert plans[0].actions.isfinite().all()
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+@each_prior
+def test_an_environment_does_not_see_the_others(kind: type, toy: SimpleNamespace) -> None:
+    both = planner(toy, kind).plan(scenes(toy), toy.generators(3, 4))
+    alone = planner(toy, kind).plan(scenes(toy).scene(slice(1, 2)), toy.generators(4))
+    assert torch.allclose(both.candidate_returns[1], alone.candidate_returns[0], atol=1e-5)
+    assert torch.allclose(both.actions[1], alone.actions[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior])
+def test_what_the_prior_has_learned_is_what_is_considered(kind: type, toy: SimpleNamespace) -> None:
+    """A prior trained on codes near 2 proposes codes near 2."""
+    plan = planner(toy, kind)
+    prior, state = plan.model.prior_of_effects, scenes(toy).scene(slice(0, 1)).expand((64,))
+    optimizer = torch.optim.Adam(prior.parameters(), 3e-2)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (-prior(state).log_prob(2 + 0.1 * torch.randn(64, 5))).mean().backward()
+        optimizer.step()
+    first = plan.plan(scenes(toy), toy.generators(3, 4)).effect_codes[0, 0]
+    assert (first - 2).abs().max() < 1
