@@ -45,7 +45,8 @@ def assess_elbo(subject: Subject, *, windows: int = 2000, draws: int = 4, batch:
     differences = {
         term: {
             "mean": held_out["mean"] - values["training"][term]["mean"],
-            "standard_error": (held_out["standard_error"] ** 2 + values["training"][term]["standard_error"] ** 2) ** 0.5,
+            "standard_error": (held_out["standard_error"] ** 2 + values["training"][term]["standard_error"] ** 2)
+            ** 0.5,
         }
         for term, held_out in values["validation"].items()
     }
@@ -114,7 +115,9 @@ def _draw(values: dict[str, dict[str, dict[str, float]]]) -> Picture:
     for panel, term in zip(figure.subplots(1, len(terms), squeeze=False)[0], terms, strict=True):
         for place, (name, color) in enumerate(COLORS.items()):
             value = values[name][term]
-            panel.errorbar(place, value["mean"], 2 * value["standard_error"], color=color, marker="o", capsize=4, label=name)
+            panel.errorbar(
+                place, value["mean"], 2 * value["standard_error"], color=color, marker="o", capsize=4, label=name
+            )
         panel.set_title(term.replace(": ", "\n"), fontsize=9)
         panel.set(xlim=(-0.6, 1.6), xticks=[])
         panel.tick_params(labelsize=8)

@@ -171,7 +171,9 @@ def _draw(found: dict[str, Weights]) -> Picture:
         rises.errorbar(list(weights.bounds), heights, bars, color=COLORS[name], marker="o", label=LABELS[name])
         # A line, not bars: where several cumulative shares lie above one another, all stay visible.
         ordered = weights.shapes.clamp(-0.5, 2.0).sort().values
-        tails.plot(ordered, torch.arange(1, len(ordered) + 1) / len(ordered), color=COLORS[name], drawstyle="steps-post")
+        tails.plot(
+            ordered, torch.arange(1, len(ordered) + 1) / len(ordered), color=COLORS[name], drawstyle="steps-post"
+        )
     rises.set(xscale="log", xlabel="particles K", ylabel="bound minus ELBO (nats)")
     tails.axvline(UNRELIABLE, color="#9A9A9A", linestyle="--", linewidth=1.0)
     tails.set(xlabel="k-hat (cut off at -0.5 and 2)", ylabel="share of windows below", xlim=(-0.55, 2.05), ylim=(0, 1))
