@@ -16,11 +16,12 @@ from torch import Tensor
 from models.state import Window
 
 EFFECT_AND_MOTION_SITES = ("subgoal_centers", "subgoal_features", "actions", "effect_code", "motion_code")
+Program = Callable[..., Any]  # a Pyro program, or one with a handler around it; called with a window
 
 
 def window_terms(
-    model: PyroModule,
-    guide: PyroModule,
+    model: Program,
+    guide: Program,
     window: Window,
     *,
     particles: int | None = None,
@@ -54,7 +55,7 @@ def window_terms(
     return terms
 
 
-def hold(program: Callable[..., Any], values: Mapping[str, Tensor]) -> Callable[..., Any]:
+def hold(program: Program, values: Mapping[str, Tensor]) -> Program:
     """A program that takes these values at these sites, as if it had drawn them."""
     held = poutine.Trace()
     for name, value in values.items():

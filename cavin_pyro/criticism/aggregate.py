@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy.stats import ks_2samp
 from torch import Tensor
 
+from cavin_pyro.criticism.information import ACTIVE, posterior_mean_variance
 from cavin_pyro.criticism.sampling import SYMBOLS, draw_guide, draw_prior, seeded, some_windows, without_codes
 from cavin_pyro.criticism.section import Picture, Section, Subject, Table
 from cavin_pyro.criticism.two_sample import TwoSample, energy_test
@@ -18,6 +19,7 @@ NAME, TITLE = "aggregate_posterior", "Whether inferred codes are spread like the
 COLORS = {"guide": "#0072B2", "prior": "#D55E00"}
 LEVEL = 0.05
 WORST = 4  # dimensions drawn
+DRAWS = 64  # of each window's codes, to tell which dimensions are active
 
 
 class Comparison(NamedTuple):
@@ -26,6 +28,7 @@ class Comparison(NamedTuple):
     guide: Tensor
     prior: Tensor
     whole: TwoSample
+    active: TwoSample | None  # over the active dimensions only; the others, equal to the prior, would dilute it
     statistics: Tensor  # Kolmogorov-Smirnov, [D]
     p_values: Tensor  # times D (Bonferroni), at most 1, [D]
 
@@ -46,16 +49,18 @@ def assess_aggregate(subject: Subject, *, windows: int = 1000, permutations: int
         return without_codes(NAME, TITLE)
     window = some_windows(subject.validation, windows, subject.seed)
     with seeded(subject.seed):
-        inferred = {name: value[0] for name, value in draw_guide(subject.guide, window, 1).items()}
+        draws = draw_guide(subject.guide, window, DRAWS)
+        inferred = {name: value[0] for name, value in draws.items()}
         expected = draw_prior(subject.model, window)
+    keywords: dict[str, Any] = {"permutations": permutations, "seed": subject.seed}
     found = {
-        name: compare(inferred[name], expected[name], permutations=permutations, seed=subject.seed)
+        name: compare(inferred[name], expected[name], active=posterior_mean_variance(draws[name]) > ACTIVE, **keywords)
         for name in subject.codes
     }
     together = None
     if len(found) > 1:
         pair = [torch.cat([codes[name] for name in found], -1) for codes in (inferred, expected)]
-        together = energy_test(*pair, permutations=permutations, seed=subject.seed)
+        together = energy_test(*pair, **keywords)
     explanation = (
         f"One code from the guide and one from the prior for each of {len(window.actions)} validation windows. The "
         "distance is the energy distance over its largest value (0: the same, 1: apart). With so many windows small "
@@ -65,17 +70,20 @@ def assess_aggregate(subject: Subject, *, windows: int = 1000, permutations: int
     pictures = [_draw(name, comparison) for name, comparison in found.items()]
     values = {name: _values(comparison) for name, comparison in found.items()}
     if together is not None:
-        values["together"] = {"distance": together.distance, "p_value": together.p_value}
+        values["together"] = together._asdict()
     return Section(NAME, TITLE, explanation, _findings(found, together), values, _tables(found, together), pictures)
 
 
-def compare(guide: Tensor, prior: Tensor, *, permutations: int = 999, seed: int = 0) -> Comparison:
-    """Tests of codes `[N, D]` against codes `[N, D]`, paired by row."""
+def compare(guide: Tensor, prior: Tensor, *, active: Tensor, permutations: int = 999, seed: int = 0) -> Comparison:
+    """Tests of codes `[N, D]` against codes `[N, D]`, paired by row; `active: [D]` bool."""
     tests = [ks_2samp(x.numpy(), y.numpy()) for x, y in zip(guide.double().T, prior.double().T, strict=True)]
     p_values = torch.tensor([float(test.pvalue) for test in tests], dtype=torch.float64)
     statistics = torch.tensor([float(test.statistic) for test in tests], dtype=torch.float64)
     whole = energy_test(guide, prior, permutations=permutations, seed=seed)
-    return Comparison(guide, prior, whole, statistics, (p_values * len(tests)).clamp(max=1.0))
+    part = (
+        energy_test(guide[:, active], prior[:, active], permutations=permutations, seed=seed) if active.any() else None
+    )
+    return Comparison(guide, prior, whole, part, statistics, (p_values * len(tests)).clamp(max=1.0))
 
 
 def projection(comparison: Comparison) -> Tensor:
@@ -88,8 +96,8 @@ def projection(comparison: Comparison) -> Tensor:
 def _values(comparison: Comparison) -> dict[str, Any]:
     return {
         "windows": len(comparison.guide),
-        "distance": comparison.whole.distance,
-        "p_value": comparison.whole.p_value,
+        "all_dimensions": comparison.whole._asdict(),
+        "active_dimensions": comparison.active._asdict() if comparison.active else None,
         "dimension_statistics": comparison.statistics.tolist(),
         "dimension_p_values": comparison.p_values.tolist(),
         "means": comparison.guide.double().mean(0).tolist(),
@@ -103,22 +111,32 @@ def _findings(found: dict[str, Comparison], together: TwoSample | None) -> list[
     sentences = []
     for name, comparison in found.items():
         differing = int((comparison.p_values < LEVEL).sum())
-        verdict = "differ from" if comparison.whole.p_value < LEVEL else "cannot be told from"
+        tests = {"all dimensions": comparison.whole, "active dimensions": comparison.active}
+        told = "; ".join(f"{label}: {_outcome(test)}" for label, test in tests.items() if test)
+        differ = any(test.p_value < LEVEL for test in tests.values() if test)
+        verdict = "differ from" if differ else "cannot be told from"
         ratio = (comparison.guide.double().std(0) / comparison.prior.double().std(0)).tolist()
         sentences.append(
-            f"Inferred {SYMBOLS[name]} {verdict} the prior as a whole (distance {comparison.whole.distance:.4f}, "
-            f"p = {comparison.whole.p_value:.3g}); {differing} of {len(ratio)} dimensions differ on their own. Their "
-            f"spread is {min(ratio):.2f} to {max(ratio):.2f} times the prior's."
+            f"Inferred {SYMBOLS[name]} {verdict} the prior's ({told}). {differing} of {len(ratio)} dimensions differ "
+            f"on their own; their spread is {min(ratio):.2f} to {max(ratio):.2f} times the prior's."
         )
     if together is not None:
-        sentences.append(f"Both codes together: distance {together.distance:.4f}, p = {together.p_value:.3g}.")
+        sentences.append(f"Both codes together: {_outcome(together)}.")
     return sentences
 
 
+def _outcome(test: TwoSample) -> str:
+    return f"distance {test.distance:.4f}, {test.chance:.4f} by chance, p = {test.p_value:.3g}"
+
+
 def _tables(found: dict[str, Comparison], together: TwoSample | None) -> list[Table]:
-    rows = [[SYMBOLS[name], one.whole.distance, one.whole.p_value] for name, one in found.items()]
+    rows: list[list[Any]] = []
+    for name, one in found.items():
+        rows.append([SYMBOLS[name], *one.whole])
+        if one.active is not None:
+            rows.append([f"{SYMBOLS[name]}, active dimensions", *one.active])
     if together is not None:
-        rows.append(["both", together.distance, together.p_value])
+        rows.append(["both", *together])
     worst: list[list[Any]] = []
     for name, one in found.items():
         for index in one.worst[:WORST]:
@@ -127,7 +145,7 @@ def _tables(found: dict[str, Comparison], together: TwoSample | None) -> list[Ta
                 [f"{SYMBOLS[name]}[{index}]", *moments, one.statistics[index].item(), one.p_values[index].item()]
             )
     header = ["dimension", "mean", "deviation", "prior's mean", "prior's deviation", "KS statistic", "p (corrected)"]
-    return [Table(["code", "energy distance", "p"], rows, digits=4), Table(header, worst)]
+    return [Table(["code", "energy distance", "by chance", "p"], rows, digits=4), Table(header, worst)]
 
 
 def _moments(values: Tensor) -> tuple[float, float]:
@@ -164,7 +182,7 @@ def _draw(name: str, comparison: Comparison) -> Picture:
 
 
 def _histogram(panel: Axes, guide: Tensor, prior: Tensor) -> None:
-    edges = torch.linspace(min(guide.min(), prior.min()).item(), max(guide.max(), prior.max()).item(), 31).numpy()
+    edges = torch.linspace(min(guide.min(), prior.min()).item(), max(guide.max(), prior.max()).item(), 31).tolist()
     for label, values in (("guide", guide), ("prior", prior)):
         panel.hist(
             values.numpy(), edges, density=True, histtype="step", linewidth=1.5, color=COLORS[label], label=label

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -45,7 +47,7 @@ def assess_amortisation(
     bounds = [evidence_bounds(log, [draws])[draws] for log in logs]
     left = bounds[1] - logs[1].mean(0)
     tails = [(pareto_shapes(log) > UNRELIABLE).double().mean().item() for log in logs]
-    values = {
+    values: dict[str, Any] = {
         "windows": len(gap),
         "elbo": mean_with_error(logs[0].mean(0)),
         "refined_elbo": mean_with_error(logs[1].mean(0)),
@@ -56,29 +58,30 @@ def assess_amortisation(
         "bound_gained": mean_with_error(bounds[1] - bounds[0]),
     }
     explanation = (
-        f"Each of {len(gap)} validation windows gets a shift and a stretch of its own for every dimension of its codes, "
-        f"on top of the guide, by {steps} steps of Adam on the same ELBO. What this gains is the amortisation gap; what "
-        f"the bound of {draws} particles of the refined guide still lies above its ELBO is (at least) the approximation "
-        "gap."
+        f"Each of {len(gap)} validation windows gets a shift and a stretch of its own for every dimension of its "
+        f"codes, on top of the guide, by {steps} steps of Adam on the same ELBO. What this gains is the amortisation "
+        f"gap; what the bound of {draws} particles of the refined guide still lies above its ELBO is (at least) the "
+        "approximation gap."
     )
     return Section(
         NAME, TITLE, explanation, _findings(values), values, [_table(values, steps, draws)], [_draw(gap, left)]
     )
 
 
-def _findings(values: dict) -> list[str]:
+def _findings(values: dict[str, Any]) -> list[str]:
     gap, left, tails = values["gap"], values["approximation_gap"], values["pareto_k_above_0.7"]
     share = gap["mean"] / max(gap["mean"] + left["mean"], 1e-12)
     return [
         f"Refining the guide for each window gains {gap['mean']:.2f} ± {gap['standard_error']:.2f} nats (median "
         f"{values['gap_median']:.2f}); at least {left['mean']:.2f} ± {left['standard_error']:.2f} nats are left to the "
         "shape of the guide.",
-        f"So {min(max(share, 0.0), 1.0):.0%} of the known error of the guide is its network's, and the rest its family's. "
-        f"k-hat is above {UNRELIABLE} for {tails['guide']:.0%} of the windows before and {tails['refined']:.0%} after.",
+        f"So {min(max(share, 0.0), 1.0):.0%} of the known error of the guide is its network's, and the rest its "
+        f"family's. k-hat is above {UNRELIABLE} for {tails['guide']:.0%} of the windows before and "
+        f"{tails['refined']:.0%} after.",
     ]
 
 
-def _table(values: dict, steps: int, draws: int) -> Table:
+def _table(values: dict[str, Any], steps: int, draws: int) -> Table:
     names = {
         "elbo": "ELBO of the guide",
         "refined_elbo": f"ELBO after {steps} steps for each window",
@@ -95,7 +98,7 @@ def _draw(gap: Tensor, left: Tensor) -> Picture:
     panel = figure.subplots()
     # The few windows with huge gaps would leave one bar for all others.
     end = torch.cat((gap, left)).quantile(0.95).item()
-    edges = torch.linspace(min(0.0, gap.min().item(), left.min().item()), max(end, 1e-3), 31).numpy()
+    edges = torch.linspace(min(0.0, gap.min().item(), left.min().item()), max(end, 1e-3), 31).tolist()
     for name, values, color in (("amortisation", gap, "#0072B2"), ("approximation (at least)", left, "#D55E00")):
         panel.hist(values.clamp(max=edges[-1]).numpy(), edges, histtype="step", linewidth=1.6, color=color, label=name)
         panel.axvline(values.mean().item(), color=color, linestyle="--", linewidth=1.0)

@@ -84,10 +84,11 @@ def _findings(values: dict[str, Any], codes: tuple[str, ...]) -> list[str]:
     for name in codes:
         one = values[name]
         low, high = one["information"]["lower"], min(one["information"]["upper"], one["kl"]["mean"])
+        rate, aggregate = one["kl"], max(one["aggregate_kl"]["high"], 0.0)
         sentences.append(
             f"{SYMBOLS[name]} has {one['active']} active dimensions of {one['dimensions']} and costs "
-            f"{one['kl']['mean']:.2f} ± {one['kl']['standard_error']:.2f} nats; between {min(low, high):.2f} and {high:.2f} of "
-            f"them tell windows apart, so KL(aggregate | prior) is at most {max(one['aggregate_kl']['high'], 0.0):.2f}."
+            f"{rate['mean']:.2f} ± {rate['standard_error']:.2f} nats; between {min(low, high):.2f} and {high:.2f} of "
+            f"them tell windows apart, so KL(aggregate | prior) is at most {aggregate:.2f}."
         )
     return sentences
 

@@ -22,7 +22,6 @@ LABELS = {
     "kl_motion_code": "KL of z",
 }
 TOTAL = "-ELBO"
-COLORS = {"training": "#0072B2", "validation": "#D55E00"}
 Terms = dict[str, Tensor]
 
 
@@ -35,20 +34,18 @@ def assess_elbo(subject: Subject, *, windows: int = 2000, draws: int = 4, batch:
     Args:
         windows: at most so many of each. batch: bounds the memory.
     """
-    chosen = {"training": subject.training, "validation": subject.validation}
+    parts = {
+        name: some_windows(window, windows, subject.seed)
+        for name, window in (("training", subject.training), ("validation", subject.validation))
+    }
     with seeded(subject.seed):
-        terms = {
-            name: terms_by_window(subject, some_windows(window, windows, subject.seed), draws, batch)
-            for name, window in chosen.items()
-        }
+        terms = {name: terms_by_window(subject, part, draws, batch) for name, part in parts.items()}
     values = {name: {term: mean_with_error(value) for term, value in found.items()} for name, found in terms.items()}
+    covariates = torch.cat([scene_sizes(part) for part in parts.values()])
+    held_out = torch.arange(len(covariates)) >= len(parts["training"].actions)
     differences = {
-        term: {
-            "mean": held_out["mean"] - values["training"][term]["mean"],
-            "standard_error": (held_out["standard_error"] ** 2 + values["training"][term]["standard_error"] ** 2)
-            ** 0.5,
-        }
-        for term, held_out in values["validation"].items()
+        term: adjusted_difference(torch.cat([found[term] for found in terms.values()]), held_out, covariates)
+        for term in terms["training"]
     }
     counts = {name: len(found[TOTAL]) for name, found in terms.items()}
     rows = [
@@ -60,7 +57,8 @@ def assess_elbo(subject: Subject, *, windows: int = 2000, draws: int = 4, batch:
     explanation = (
         "Nats per window; every term is minus a log density (or a KL), so smaller is better. Densities are of metres "
         "and unit vectors, so likelihood terms may be negative: read their differences. ± is one standard error over "
-        "windows; windows of one episode overlap, which makes it a little small. "
+        "windows; windows of one episode overlap, which makes it a little small. The difference is taken at equal "
+        "numbers of objects (by linear regression), which density terms grow with. "
         f"{counts['training']} training and {counts['validation']} validation windows."
     )
     return Section(
@@ -70,7 +68,7 @@ def assess_elbo(subject: Subject, *, windows: int = 2000, draws: int = 4, batch:
         _findings(differences),
         {**values, "difference": differences, "windows": counts},
         [Table(["term", "training", "validation", "validation - training"], rows)],
-        [_draw(values)],
+        [_draw(differences)],
     )
 
 
@@ -88,6 +86,30 @@ def terms_by_window(subject: Subject, window: Window, draws: int, batch: int) ->
         for label, term in terms.items():
             found.setdefault(label, []).append(term)
     return {label: torch.cat(parts) for label, parts in found.items()}
+
+
+def scene_sizes(window: Window) -> Tensor:
+    """What likelihood terms grow with, whatever the model: real objects, and objects in transitions that count.
+
+    `[B, 2]` float64.
+    """
+    before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
+    moves = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
+    subgoals = window.first.mask & window.last.mask
+    return torch.stack((subgoals.sum(-1), moves.sum((-2, -1))), -1).double()
+
+
+def adjusted_difference(values: Tensor, held_out: Tensor, covariates: Tensor) -> dict[str, float]:
+    """Mean of `values: [N]` where `held_out: [N]` less the mean elsewhere, at equal `covariates: [N, C]`.
+
+    The coefficient of a linear regression, with its heteroscedastic standard error (White, 1980).
+    """
+    centered = covariates - covariates.mean(0)
+    design = torch.cat((torch.stack((torch.ones(len(values)), held_out), -1).double(), centered), -1)
+    inverse = torch.linalg.pinv(design)  # [2 + C, N]; covariates may depend on each other
+    coefficients = inverse @ values
+    error = (inverse[1] * (values - design @ coefficients)).square().sum().sqrt()
+    return {"mean": coefficients[1].item(), "standard_error": error.item()}
 
 
 def _with_error(value: dict[str, float]) -> str:
@@ -109,22 +131,17 @@ def _findings(differences: dict[str, dict[str, float]]) -> list[str]:
     return sentences
 
 
-def _draw(values: dict[str, dict[str, dict[str, float]]]) -> Picture:
-    terms = list(values["training"])
-    figure = Figure(figsize=(1.5 + 1.25 * len(terms), 3.2), layout="constrained")
-    for panel, term in zip(figure.subplots(1, len(terms), squeeze=False)[0], terms, strict=True):
-        for place, (name, color) in enumerate(COLORS.items()):
-            value = values[name][term]
-            panel.errorbar(
-                place, value["mean"], 2 * value["standard_error"], color=color, marker="o", capsize=4, label=name
-            )
-        panel.set_title(term.replace(": ", "\n"), fontsize=9)
-        panel.set(xlim=(-0.6, 1.6), xticks=[])
-        panel.tick_params(labelsize=8)
-        panel.grid(axis="y", color="#DDDDDD", linewidth=0.6)
-        panel.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].set_ylabel("nats per window", fontsize=9)
-    handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    caption = "Each term on its own scale, with two standard errors; lower is better."
+def _draw(differences: dict[str, dict[str, float]]) -> Picture:
+    terms = list(differences)
+    figure = Figure(figsize=(6.5, 0.9 + 0.34 * len(terms)), layout="constrained")
+    panel = figure.subplots()
+    means = [differences[term]["mean"] for term in terms]
+    errors = [2 * differences[term]["standard_error"] for term in terms]
+    panel.errorbar(means, range(len(terms)), xerr=errors, color="#0072B2", marker="o", linestyle="", capsize=3)
+    panel.axvline(0.0, color="#9A9A9A", linestyle="--", linewidth=1.0)
+    panel.set(yticks=range(len(terms)), yticklabels=terms, xlabel="validation minus training (nats per window)")
+    panel.invert_yaxis()
+    panel.grid(axis="x", color="#DDDDDD", linewidth=0.6)
+    panel.spines[["top", "right"]].set_visible(False)
+    caption = "Each term on windows held out, less the same on training windows, with two standard errors."
     return Picture("elbo_terms", caption, figure)

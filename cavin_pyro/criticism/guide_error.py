@@ -19,6 +19,7 @@ from cavin_pyro.criticism.sampling import (
     without_codes,
 )
 from cavin_pyro.criticism.section import Picture, Section, Subject, Table
+from models.state import Window
 
 NAME, TITLE = "guide_error", "How far the guide is from the posterior"
 LABELS = {
@@ -77,7 +78,7 @@ def assess_guide_error(
         return without_codes(NAME, TITLE)
     model, guide = subject.model, subject.guide
     window = some_windows(subject.validation, windows, subject.seed)
-    draws, found = max(particles), {}
+    draws = max(particles)
     with seeded(subject.seed):
         logs = {"joint": log_weights(model, guide, window, draws)}
         if len(subject.codes) > 1:
@@ -87,8 +88,7 @@ def assess_guide_error(
             logs["effect_code_given_subgoal"] = log_weights(model, guide, window, draws, without=later)
             held = {"effect_code": draw_guide(guide, window, 1)["effect_code"][0]}
             logs["motion_code"] = log_weights(model, guide, window, draws, held=held)
-    for name, log in logs.items():
-        found[name] = Weights(evidence_bounds(log, particles), pareto_shapes(log))
+    found = {name: Weights(evidence_bounds(log, particles), pareto_shapes(log)) for name, log in logs.items()}
     return Section(NAME, TITLE, _explanation(found), _findings(found), _values(found), [_table(found)], [_draw(found)])
 
 
@@ -106,9 +106,9 @@ def _explanation(found: dict[str, Weights]) -> str:
     joint = found["joint"]
     draws, count = max(joint.bounds), len(joint.shapes)
     text = (
-        f"The ELBO falls short of log p(observed) by KL(guide | posterior). The bound of K particles, one logarithm for "
-        f"each window, comes nearer to it as K grows, so its rise from K = 1 is a lower bound on that shortfall. k-hat is "
-        f"the shape of the tail of the {draws} importance weights of a window: above {UNRELIABLE} the guide misses "
+        "The ELBO falls short of log p(observed) by KL(guide | posterior). The bound of K particles, one logarithm for "
+        "each window, comes nearer to it as K grows, so its rise from K = 1 is a lower bound on that shortfall. k-hat "
+        f"is the shape of the tail of the {draws} importance weights of a window: above {UNRELIABLE} the guide misses "
         f"parts of the posterior that matter. {count} validation windows."
     )
     if "effect_code" in found:

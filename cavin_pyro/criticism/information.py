@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pyro
 import torch
 from pyro import distributions, poutine
-from pyro.nn import PyroModule
 from torch import Tensor
 
 from cavin_pyro.criticism.sampling import Codes, guide_density
+from cavin_pyro.elbo import Program
 from models.state import Window
 
 ACTIVE = 0.01  # variance of the posterior mean, of codes whose prior has a variance of about one
@@ -27,7 +27,7 @@ def posterior_mean_variance(draws: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def dimension_kl(model: PyroModule, guide: PyroModule, window: Window, *, draws: int = 16) -> Codes:
+def dimension_kl(model: Program, guide: Program, window: Window, *, draws: int = 16) -> Codes:
     """KL(q | p) of each dimension of each code and window: `[B, D]` nats by code.
 
     Exact given the codes before it, over which it is averaged by draws. Codes are left out whose guide or prior is not
@@ -39,13 +39,13 @@ def dimension_kl(model: PyroModule, guide: PyroModule, window: Window, *, draws:
     found = {}
     for name in joint.stochastic_nodes:
         if name in guided:
-            pair = [_normal(trace.nodes[name]["fn"]) for trace in (guided, joint)]
-            if all(one is not None for one in pair):
-                found[name] = torch.distributions.kl_divergence(*pair).double().mean(0)
+            q, p = _normal(guided.nodes[name]["fn"]), _normal(joint.nodes[name]["fn"])
+            if q is not None and p is not None:
+                found[name] = torch.distributions.kl_divergence(q, p).double().mean(0)
     return found
 
 
-def _normal(distribution: distributions.TorchDistribution) -> distributions.Normal | None:
+def _normal(distribution: Any) -> torch.distributions.Normal | None:
     """The Normal within a diagonal Gaussian, None for anything else."""
     if isinstance(distribution, distributions.Independent):
         distribution = distribution.base_dist
@@ -61,7 +61,7 @@ class Information(NamedTuple):
     upper_error: float
 
 
-def mutual_information(guide: PyroModule, window: Window, codes: Codes, site: str) -> Information:
+def mutual_information(guide: Program, window: Window, codes: Codes, site: str) -> Information:
     """Bounds on I(code; what it is inferred from) when windows come as in the data and codes from the guide.
 
     E [log q(code_i | window_i) - log q(code_i)], with the aggregate posterior q(code) estimated as the mean of

@@ -8,11 +8,10 @@ import torch
 from pyro import distributions, poutine
 from pyro.distributions import transforms
 from pyro.infer.reparam.reparam import Reparam, ReparamResult
-from pyro.nn import PyroModule
 from torch import Tensor
 
 from cavin_pyro.criticism.sampling import draw_guide
-from cavin_pyro.elbo import window_terms
+from cavin_pyro.elbo import Program, window_terms
 from models.state import Window
 
 DRAWS_FOR_SPREAD = 64
@@ -41,14 +40,14 @@ class WindowwiseAffine(Reparam):
 
 
 def refine(
-    model: PyroModule,
-    guide: PyroModule,
+    model: Program,
+    guide: Program,
     window: Window,
     *,
     steps: int = 200,
     particles: int = 8,
     learning_rate: float = 0.1,
-) -> PyroModule:
+) -> Program:
     """The guide with the best shift and stretch for each window `[B]`, by Adam on the same ELBO.
 
     The rate falls linearly to zero. Windows do not share anything, so they are refined side by side. Neither the
@@ -59,7 +58,8 @@ def refine(
     """
     draws = draw_guide(guide, window, DRAWS_FOR_SPREAD)
     affine = {name: WindowwiseAffine(value) for name, value in draws.items()}
-    refined = poutine.reparam(guide, config=affine)
+    config: dict[str, Reparam] = {**affine}
+    refined = poutine.reparam(guide, config=config)
     free = [tensor for code in affine.values() for tensor in (code.shift, code.stretch)]
     optimizer = torch.optim.Adam(free, lr=learning_rate)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)

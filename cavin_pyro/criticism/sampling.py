@@ -9,12 +9,11 @@ from typing import Any
 import pyro
 import torch
 from pyro import poutine
-from pyro.nn import PyroModule
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from cavin_pyro.criticism.section import Section
-from cavin_pyro.elbo import hold, window_terms
+from cavin_pyro.elbo import Program, hold, window_terms
 from models.state import Window
 
 ROWS = 4096  # particles times windows at once: some 100 MB with five objects
@@ -38,8 +37,8 @@ def some_windows(windows: Window, number: int, seed: int) -> Window:
 
 @torch.no_grad()
 def log_weights(
-    model: PyroModule,
-    guide: PyroModule,
+    model: Program,
+    guide: Program,
     window: Window,
     particles: int,
     *,
@@ -69,7 +68,7 @@ def log_weights(
 
 
 @torch.no_grad()
-def draw_guide(guide: PyroModule, window: Window, draws: int, *, rows: int = ROWS) -> Codes:
+def draw_guide(guide: Program, window: Window, draws: int, *, rows: int = ROWS) -> Codes:
     """Codes `[draws, B, D]` of each window `[B]` from the guide."""
     pieces: dict[str, list[Tensor]] = {}
     step = max(1, rows // max(1, len(window.actions)))
@@ -82,14 +81,14 @@ def draw_guide(guide: PyroModule, window: Window, draws: int, *, rows: int = ROW
 
 
 @torch.no_grad()
-def draw_prior(model: PyroModule, window: Window) -> Codes:
+def draw_prior(model: Program, window: Window) -> Codes:
     """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first."""
     codes = _codes(poutine.trace(model).get_trace(window))
     return {name: site["value"] for name, site in codes.items()}
 
 
 @torch.no_grad()
-def guide_density(guide: PyroModule, window: Window, values: Codes, site: str, *, rows: int = ROWS) -> Tensor:
+def guide_density(guide: Program, window: Window, values: Codes, site: str, *, rows: int = ROWS) -> Tensor:
     """log q(value | window) at one site for `values: [K, B, D]` of all sites: `[K, B]` float64."""
     particles, found = len(values[site]), []
     step = max(1, rows // max(1, len(window.actions)))

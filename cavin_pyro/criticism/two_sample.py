@@ -12,6 +12,7 @@ class TwoSample(NamedTuple):
     """Outcome of a test."""
 
     distance: float  # energy distance over its largest value: 0 for equal distributions, 1 for separate points
+    chance: float  # its mean over permutations: what equal distributions come to with so few draws
     p_value: float
 
 
@@ -36,4 +37,5 @@ def energy_test(first: Tensor, second: Tensor, *, permutations: int = 999, seed:
     energies = -(signs * (distances @ signs)).sum(0)
     across = 2 * distances[:count, count:].mean()
     p_value = (energies >= energies[0] * (1 - 1e-9)).double().mean().item()  # counts the first itself
-    return TwoSample((energies[0] / across).item() if across > 0 else 0.0, p_value)
+    scaled = energies / across.clamp(min=1e-12)
+    return TwoSample(scaled[0].item(), scaled[1:].mean().item(), p_value)
