@@ -1,0 +1,132 @@
+"""What the codes carry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+
+from cavin_pyro.criticism.information import (
+    ACTIVE,
+    dimension_kl,
+    mutual_information,
+    posterior_mean_variance,
+)
+from cavin_pyro.criticism.sampling import (
+    SYMBOLS,
+    draw_guide,
+    mean_with_error,
+    seeded,
+    some_windows,
+    without_codes,
+)
+from cavin_pyro.criticism.section import Picture, Section, Subject, Table
+from cavin_pyro.elbo import window_terms
+
+NAME, TITLE = "codes", "What the codes carry"
+
+
+def assess_codes(subject: Subject, *, windows: int = 1000, draws: int = 64, pairs: int = 400) -> Section:
+    """Active dimensions, nats per dimension, and information, on validation windows.
+
+    Args:
+        windows: for dimensions and KL. draws: of the codes of each. pairs: windows among which the aggregate
+            posterior is estimated (its cost grows with the square).
+    """
+    if not subject.codes:
+        return without_codes(NAME, TITLE)
+    model, guide = subject.model, subject.guide
+    window = some_windows(subject.validation, windows, subject.seed)
+    few = some_windows(subject.validation, pairs, subject.seed)
+    with seeded(subject.seed), torch.no_grad():
+        posterior = draw_guide(guide, window, draws)
+        kl = dimension_kl(model, guide, window)
+        terms = window_terms(model, guide, window, particles=4)
+        single = {name: value[0] for name, value in draw_guide(guide, few, 1).items()}
+        information = {name: mutual_information(guide, few, single, name) for name in subject.codes}
+    values: dict[str, Any] = {}
+    for name in subject.codes:
+        variance = posterior_mean_variance(posterior[name])
+        # Exact where it can be had; the estimate from draws otherwise.
+        whole = kl[name].sum(-1) if name in kl else terms[f"kl_{name}"].double().mean(0)
+        rate = mean_with_error(whole)
+        values[name] = {
+            "dimensions": len(variance),
+            "active": int((variance > ACTIVE).sum()),
+            "mean_variance": variance.tolist(),
+            "kl": rate,
+            "kl_by_dimension": kl[name].mean(0).tolist() if name in kl else None,
+            "information": information[name]._asdict(),
+            "aggregate_kl": {
+                "low": rate["mean"] - min(information[name].upper, rate["mean"]),
+                "high": rate["mean"] - information[name].lower,
+            },
+        }
+    values["windows"] = {"dimensions": len(window.actions), "information": len(few.actions)}
+    explanation = (
+        f"A dimension is active where its posterior mean varies by more than {ACTIVE} over windows. E KL(q | p) is an "
+        "upper bound on the information I(c; s'|s), or I(z; a|s, c). The part of it that is not information is "
+        "KL(aggregate posterior | prior). The aggregate posterior is estimated as the mean of q over other windows: "
+        "without the window itself for the upper, with it for the lower bound, which cannot exceed the logarithm of "
+        f"the number of windows ({len(few.actions)}). These bounds are on the information between a code and all that "
+        "it is inferred from, I(c; s, s') and I(z; s, a, c): to condition on the state one would need several windows "
+        "from each. Conditioned on s, c can only carry less."
+    )
+    return Section(
+        NAME, TITLE, explanation, _findings(values, subject.codes), values, [_table(values, subject.codes)],
+        [_draw(values, subject.codes)],
+    )  # fmt: skip
+
+
+def _findings(values: dict[str, Any], codes: tuple[str, ...]) -> list[str]:
+    sentences = []
+    for name in codes:
+        one = values[name]
+        low, high = one["information"]["lower"], min(one["information"]["upper"], one["kl"]["mean"])
+        rate, aggregate = one["kl"], max(one["aggregate_kl"]["high"], 0.0)
+        sentences.append(
+            f"{SYMBOLS[name]} has {one['active']} active dimensions of {one['dimensions']} and costs "
+            f"{rate['mean']:.2f} ± {rate['standard_error']:.2f} nats; between {min(low, high):.2f} and {high:.2f} of "
+            f"them tell windows apart, so KL(aggregate | prior) is at most {aggregate:.2f}."
+        )
+    return sentences
+
+
+def _table(values: dict[str, Any], codes: tuple[str, ...]) -> Table:
+    header = [
+        "code",
+        "dimensions",
+        "active",
+        "E KL(q | p)",
+        "information, at least",
+        "at most",
+        "aggregate KL, at most",
+    ]
+    rows = []
+    for name in codes:
+        one = values[name]
+        bounds = one["information"]
+        row = [SYMBOLS[name], one["dimensions"], one["active"], one["kl"]["mean"], bounds["lower"]]
+        rows.append([*row, min(bounds["upper"], one["kl"]["mean"]), one["aggregate_kl"]["high"]])
+    return Table(header, rows, digits=2)
+
+
+def _draw(values: dict[str, Any], codes: tuple[str, ...]) -> Picture:
+    figure = Figure(figsize=(5.0 * len(codes), 4.4), layout="constrained")
+    for column, name in zip(figure.subplots(2, len(codes), squeeze=False).T, codes, strict=True):
+        one, places = values[name], range(values[name]["dimensions"])
+        column[0].bar(places, [max(value, 1e-4) for value in one["mean_variance"]], color="#0072B2")
+        column[0].axhline(ACTIVE, color="#9A9A9A", linestyle="--", linewidth=1.0)
+        column[0].set(yscale="log", ylim=(1e-4, 3.0), title=SYMBOLS[name], ylabel="variance of the mean")
+        if one["kl_by_dimension"] is not None:
+            column[1].bar(places, one["kl_by_dimension"], color="#D55E00")
+        column[1].set(xlabel="dimension", ylabel="mean KL (nats)")
+        for panel in column:
+            panel.spines[["top", "right"]].set_visible(False)
+            panel.tick_params(labelsize=8)
+    caption = (
+        "Per dimension: how much the posterior mean varies over windows (above the dashed line a dimension is active), "
+        "and how many nats it costs. Nothing is shown below where the guide or the prior is no diagonal Gaussian."
+    )
+    return Picture("codes", caption, figure)
