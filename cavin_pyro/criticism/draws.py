@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -72,7 +73,11 @@ def repeated(window: Window, copies: int) -> Iterator[tuple[int, Window]]:
     each = max(1, min(copies, WINDOWS_AT_ONCE // len(window.actions)))
     for made in range(0, copies, each):
         count = min(each, copies - made)
-        yield count, window.map(lambda field, count=count: field.repeat(count, *[1] * (field.dim() - 1)))
+        yield count, window.map(partial(_tile, count))
+
+
+def _tile(count: int, field: Tensor) -> Tensor:
+    return field.repeat(count, *[1] * (field.dim() - 1))
 
 
 class _Means(Messenger):

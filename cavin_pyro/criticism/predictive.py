@@ -5,17 +5,14 @@ After Gelman, Meng and Stern, "Posterior predictive assessment of model fitness 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Sequence
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from cavin_pyro.criticism.draws import Outcome, generated, observed, repeated, seeded
+from cavin_pyro.criticism.draws import Outcome, generated, observed, seeded
 from cavin_pyro.criticism.predictive_pictures import draw_histograms
 from cavin_pyro.criticism.pushing import Nearness, Statistic, statistics_of
+from cavin_pyro.criticism.replicates import compare, replicate, summaries
 from cavin_pyro.criticism.section import Picture, Section, Subject, Table
 
 SOURCES = {
@@ -24,22 +21,23 @@ SOURCES = {
     "guide_means": "guide, means",
     "guide": "guide, as drawn",
 }
-QUANTILE = 0.95
 EXTREME = 0.01  # a tail probability this near to 0 or 1 tells of a misfit
 
-Values = dict[str, Tensor]  # of each statistic: [R, B] or [R, B, T]
+# statistic -> source -> mean or q95 -> numbers of `replicates.compare`
+Results = dict[str, dict[str, dict[str, dict[str, float]]]]
 
 EXPLANATION = """
-{replicates} replicated datasets were generated, each with one draw for each of {windows} held-out windows, from their
-first states alone. The windows are a selection, as in training: some object moved more than 0.1 m, none more than
-0.5 m, and every push was safe. The codes come from the prior, which is what planning samples (prior predictive), or from
-the guide, which has seen the whole window (posterior predictive). "As drawn" is the program with the noise of its
-likelihoods; "means" and "as planned" have codes drawn and all else at the likelihoods' means, as a planner has it.
-The tail probability is the share of replicated datasets whose mean (or 95 % quantile) is at least the observed one (ties
-count half): near 0 the model makes too little of it, near 1 too much. Only centres are predicted, so objects stand for discs: two are taken
-to be inside each other where their centres are nearer than {pair:.1f} cm in the plane, nearer than in all but 1 % of real
-windows; a push touches where its path comes within {tool:.1f} cm of a centre, a distance that as many real pushes come
-within as move an object by 1 cm. A push moves an object that goes more than 3 cm.
+{replicates} replicated datasets were generated, each with one draw for each of {windows} held-out windows, from
+their first states alone. The windows are a selection, as in training: some object moved more than 0.1 m, none
+more than 0.5 m, and every push was safe. The codes come from the prior, which is what planning samples (prior
+predictive), or from the guide, which has seen the whole window (posterior predictive). "As drawn" is the program
+with the noise of its likelihoods; "means" and "as planned" have codes drawn and all else at the likelihoods'
+means, as a planner has it. The tail probability is the share of replicated datasets whose mean (or 95 % quantile)
+is at least the observed one (ties count half): near 0 the model makes too little of it, near 1 too much. Only
+centres are predicted, so objects stand for discs: two are taken to be inside each other where their centres are
+nearer than {pair:.1f} cm in the plane, nearer than in all but 1 % of the training windows; a push touches where
+its path comes within {tool:.1f} cm of a centre, a distance that as many pushes in training windows come within as
+move an object by 1 cm. The object that a push moves is the one that goes farthest, if that is more than 3 cm.
 """
 
 
@@ -52,141 +50,81 @@ def assess_predictive(subject: Subject, *, windows: int = 400, replicates: int =
     """
     window = subject.validation.map(lambda field: field[:windows])
     nearness = Nearness.of(observed(subject.training))
+    sources = [name for name in SOURCES if subject.codes or name.startswith("prior")]
+    drawn, real = {}, {}
     with seeded(subject.seed):
-        sources = {
-            name: (subject.guide if name.startswith("guide") else None, name.endswith("means"))
-            for name in SOURCES
-            if subject.codes or name.startswith("prior")
-        }
-        first = generated(subject.model, window)
-        statistics = [
-            statistic
-            for statistic in statistics_of(nearness, window.segment_length)
-            if not (statistic.part == "h" and first.subgoal is None)
-            and not (statistic.part == "g" and not first.chosen)
-        ]
-        drawn = {
-            name: _replicate(subject, window, statistics, guide, means, replicates)
-            for name, (guide, means) in sources.items()
-        }
-    real = {statistic.name: statistic.function(observed(window)) for statistic in statistics}
-    results = {
-        statistic.name: {
-            "observed": _summary(real[statistic.name].unsqueeze(0), statistic),
-            **{
-                source: _compared(values[statistic.name], real[statistic.name], statistic)
-                for source, values in drawn.items()
-            },
-        }
-        for statistic in statistics
-    }
-    observed_of = {name: value.numpy().ravel() for name, value in real.items()}
-    drawn_of = {
-        source: {name: value.numpy().ravel() for name, value in values.items()} for source, values in drawn.items()
-    }
-    figure = draw_histograms(statistics, observed_of, drawn_of, {name: SOURCES[name] for name in drawn}, results)
+        statistics = _that_exist(statistics_of(nearness, window.segment_length), generated(subject.model, window))
+        for source in sources:
+            drawn[source] = replicate(
+                subject.model,
+                window,
+                statistics,
+                replicates=replicates,
+                guide=subject.guide if source.startswith("guide") else None,
+                means=subject.codes if source.endswith("means") else None,
+            )
+    results: Results = {}
+    for statistic in statistics:
+        name = statistic.name
+        real[name] = statistic.function(observed(window))
+        target = summaries(real[name].unsqueeze(0), statistic)
+        results[name] = {"observed": {key: {"mean": float(value[0])} for key, value in target.items()}}
+        results[name] |= {source: compare(drawn[source][name], real[name], statistic) for source in sources}
+    numbers = {"replicates": replicates, "windows": len(window.actions)}
+    distances = {"pair": 100 * nearness.pair, "tool": 100 * nearness.tool}
     return Section(
         name="predictive",
         title="Do generated pushes and their outcomes look real?",
-        explanation=" ".join(
-            EXPLANATION.format(
-                replicates=replicates,
-                windows=len(window.actions),
-                pair=100 * nearness.pair,
-                tool=100 * nearness.tool,
-            ).split()
-        ),
+        explanation=" ".join(EXPLANATION.format(**numbers, **distances).split()),
         findings=list(_findings(statistics, results)),
         values={
-            "windows": len(window.actions),
-            "replicates": replicates,
+            **numbers,
             "pair_distance": nearness.pair,
             "tool_distance": nearness.tool,
-            "statistics": {
-                name: {
-                    source: {key: _plain(value) for key, value in summary.items()} for source, summary in rows.items()
-                }
-                for name, rows in results.items()
-            },
+            "statistics": results,
         },
-        tables=_tables(statistics, results, list(drawn)),
+        tables=_tables(statistics, results, sources),
         pictures=[
             Picture(
                 "predictive_checks",
-                "Observed windows (grey) and generated ones. P is the tail probability of the mean for codes of the "
-                "prior as planned, and of the guide with means, where there is one.",
-                figure,
+                "Observed windows (grey) and generated ones; the last bin holds all that is beyond. P is the tail "
+                "probability of the mean, for codes from the prior as planned and for the guide's with means.",
+                draw_histograms(statistics, real, drawn, {source: SOURCES[source] for source in sources}, results),
             )
         ],
     )
 
 
-def _replicate(
-    subject: Subject, window: Any, statistics: list[Statistic], guide: Any, means: bool, replicates: int
-) -> Values:
-    parts: dict[str, list[Tensor]] = {statistic.name: [] for statistic in statistics}
-    for count, copies in repeated(window, replicates):
-        outcome: Outcome = generated(subject.model, copies, guide=guide, means=subject.codes if means else None)
-        for statistic in statistics:
-            parts[statistic.name].append(statistic.function(outcome).unflatten(0, (count, -1)))
-    return {name: torch.cat(values) for name, values in parts.items()}
+def _that_exist(statistics: Sequence[Statistic], outcome: Outcome) -> list[Statistic]:
+    """Those of the parts that the model has."""
+    missing = [part for part, here in (("h", outcome.subgoal is not None), ("g", outcome.chosen)) if not here]
+    return [statistic for statistic in statistics if statistic.part not in missing]
 
 
-def _summary(values: Tensor, statistic: Statistic) -> dict[str, NDArray[np.float64]]:
-    """Test statistics of datasets `values: [R, ...]`: the mean and, of continuous ones, a quantile, each `[R]`."""
-    flat = values.flatten(1).double()
-    summary = {"mean": flat.nanmean(1)}
-    if statistic.counts is None:
-        summary[f"q{100 * QUANTILE:.0f}"] = flat.nanquantile(QUANTILE, 1)
-    return {name: value.numpy() for name, value in summary.items()}
-
-
-def _compared(values: Tensor, real: Tensor, statistic: Statistic) -> dict[str, dict[str, float]]:
-    """Each test statistic of the replicates: its mean, central 95 % interval, and P(T(rep) >= T(obs)), ties half."""
-    target = _summary(real.unsqueeze(0), statistic)
-    compared = {}
-    for name, each in _summary(values, statistic).items():
-        each = each[np.isfinite(each)]
-        if len(each) == 0 or not np.isfinite(target[name][0]):
-            compared[name] = dict.fromkeys(("mean", "low", "high", "tail"), float("nan"))
-            continue
-        low, high = np.quantile(each, (0.025, 0.975))
-        tail = float((each > target[name][0]).mean() + (each == target[name][0]).mean() / 2)
-        compared[name] = {"mean": float(each.mean()), "low": float(low), "high": float(high), "tail": tail}
-    return compared
-
-
-def _plain(value: Any) -> Any:
-    return float(value[0]) if isinstance(value, np.ndarray) else value
-
-
-def _tables(statistics: list[Statistic], results: Mapping[str, Any], sources: list[str]) -> list[Table]:
+def _tables(statistics: Sequence[Statistic], results: Results, sources: Sequence[str]) -> list[Table]:
     rows, tails = [], []
     for statistic in statistics:
         result = results[statistic.name]
         for key, value in result["observed"].items():
-            label = f"{key} of {statistic.label}{f' ({statistic.unit})' if statistic.unit else ''}"
-            rows.append([label, _plain(value), *(result[source][key]["mean"] for source in sources)])
+            label = f"{statistic.label}: {key}{f' ({statistic.unit})' if statistic.unit else ''}"
+            rows.append([label, value["mean"], *(result[source][key]["mean"] for source in sources)])
             tails.append([label, *(result[source][key]["tail"] for source in sources)])
     names = [SOURCES[source] for source in sources]
-    return [
-        Table(["test statistic", "observed", *names], rows),
-        Table(["tail probability of", *names], tails),
-    ]
+    return [Table(["test statistic", "observed", *names], rows), Table(["tail probability", *names], tails)]
 
 
-def _findings(statistics: list[Statistic], results: Mapping[str, Any]) -> Iterator[str]:
+def _findings(statistics: Sequence[Statistic], results: Results) -> Iterator[str]:
     for statistic in statistics:
-        result = results[statistic.name]
-        real, planned = _plain(result["observed"]["mean"]), result["prior_means"]["mean"]
-        sentence = (
-            f"{statistic.label[0].upper()}{statistic.label[1:]}: {_amount(real, statistic)} on average in real "
-            f"windows, {_amount(planned['mean'], statistic)} with codes from the prior as planned"
-        )
-        if "guide_means" in result:
-            sentence += f" and {_amount(result['guide_means']['mean']['mean'], statistic)} with codes from the guide"
-        odd = planned["tail"] <= EXTREME or planned["tail"] >= 1 - EXTREME
-        yield f"{sentence} (P = {planned['tail']:.2f} for the prior{', a misfit' if odd else ''})."
+        means = {source: result["mean"] for source, result in results[statistic.name].items()}
+        texts = {source: _amount(mean["mean"], statistic) for source, mean in means.items()}
+        tail = means["prior_means"]["tail"]
+        inferred = f" and {texts['guide_means']} with codes from the guide" if "guide_means" in texts else ""
+        odd = ", a misfit" if min(tail, 1 - tail) <= EXTREME else ""
+        yield (
+            f"{statistic.label[0].upper()}{statistic.label[1:]}: {texts['observed']} on average in real windows, "
+            f"{texts['prior_means']} {'with codes from the prior' if inferred else ''} as planned{inferred} "
+            f"(tail probability {tail:.2f} as planned{odd})."
+        ).replace("  ", " ")
 
 
 def _amount(value: float, statistic: Statistic) -> str:

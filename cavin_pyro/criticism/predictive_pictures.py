@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cavin_pyro.criticism.pushing import Statistic
 
@@ -18,7 +20,7 @@ OBSERVED = "#BBBBBB"
 BINS = 32
 COLUMNS = 3
 
-Samples = Mapping[str, NDArray[np.floating]]  # of each statistic: [n]
+Samples = Mapping[str, Tensor]  # of each statistic, any shape
 
 
 def draw_histograms(
@@ -38,10 +40,12 @@ def draw_histograms(
     axes = figure.subplots(rows, COLUMNS, squeeze=False)
     for panel, statistic in zip(axes.flat, statistics, strict=False):
         name = statistic.name
-        edges = _edges(statistic, [observed[name], *(samples[name] for samples in generated.values())])
-        _fill(panel, observed[name], edges)
-        for source, samples in generated.items():
-            _line(panel, samples[name], edges, COLORS[source], dashed=not source.endswith("means"))
+        real, drawn = _finite(observed[name]), {key: _finite(samples[name]) for key, samples in generated.items()}
+        edges = _edges(statistic, [real, *drawn.values()])
+        panel.stairs(_shares(real, edges), edges, fill=True, color=OBSERVED)
+        for source, values in drawn.items():
+            style = "-" if source.endswith("means") else "--"
+            panel.stairs(_shares(values, edges), edges, color=COLORS[source], linewidth=1.6, linestyle=style)
         tails = [
             f"P = {results[name][source]['mean']['tail']:.2f} {source.partition('_')[0]}"
             for source in ("prior_means", "guide_means")
@@ -53,43 +57,38 @@ def draw_histograms(
         panel.set_axis_off()
     for row in axes:
         row[0].set_ylabel("share", fontsize=9)
-    handles, _ = axes.flat[0].get_legend_handles_labels()
-    names = ["observed", *(labels[source] for source in generated)]
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=10, frameon=False)
+    handles: list[Any] = [Patch(color=OBSERVED, label="observed")]
+    for source in generated:
+        style = "-" if source.endswith("means") else "--"
+        handles.append(Line2D([], [], color=COLORS[source], linestyle=style, label=labels[source]))
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=10, frameon=False)
     return figure
 
 
+def _finite(values: Tensor) -> NDArray[np.floating]:
+    flat = values.flatten().numpy()
+    return flat[np.isfinite(flat)]
+
+
 def _edges(statistic: Statistic, samples: Sequence[NDArray[np.floating]]) -> NDArray[np.floating]:
-    pooled = np.concatenate([values[np.isfinite(values)] for values in samples])
-    if len(pooled) == 0:
-        return np.array([0.0, 1.0])
+    """Ends of the bins: around each possible value, or evenly over nearly all of the samples [n]."""
     if statistic.counts is not None:
-        highest = round(float(pooled.max()) / statistic.counts)
+        highest = max(round(float(values.max(initial=0.0)) / statistic.counts) for values in samples)
         return (np.arange(max(highest, 1) + 2) - 0.5) * statistic.counts
-    high = max(
-        float(np.quantile(values[np.isfinite(values)], 0.995)) for values in samples if np.isfinite(values).any()
-    )
+    high = max(float(np.quantile(values, 0.98)) for values in samples if len(values)) if any(map(len, samples)) else 1
     return np.linspace(0.0, max(high, 1e-3), BINS + 1)
 
 
 def _shares(values: NDArray[np.floating], edges: NDArray[np.floating]) -> NDArray[np.floating]:
-    """What share of the values lies in each bin; the last one takes all that is higher."""
-    finite = values[np.isfinite(values)]
-    counts, _ = np.histogram(np.clip(finite, edges[0], edges[-1]), edges)
-    return counts / max(1, len(finite))
-
-
-def _fill(panel: Axes, values: NDArray[np.floating], edges: NDArray[np.floating]) -> None:
-    panel.stairs(_shares(values, edges), edges, fill=True, color=OBSERVED, label="observed")
-
-
-def _line(panel: Axes, values: NDArray[np.floating], edges: NDArray[np.floating], color: str, *, dashed: bool) -> None:
-    style = "--" if dashed else "-"
-    panel.stairs(_shares(values, edges), edges, color=color, linewidth=1.6, linestyle=style, label=color)
+    """What share of the values [n] lies in each bin; the last one takes all that is higher."""
+    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+    return counts / max(1, len(values))
 
 
 def _label(panel: Axes, statistic: Statistic, edges: NDArray[np.floating]) -> None:
-    panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    if statistic.name.startswith("close_pairs"):  # rare, so that its share shows on a log axis only
+        panel.set(yscale="log", ylim=(1e-4, 1.5))
+    panel.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
     panel.spines[["top", "right"]].set_visible(False)
     panel.tick_params(labelsize=8)
     if statistic.unit == "m":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -59,60 +60,53 @@ class Statistic:
 
 def statistics_of(nearness: Nearness, segment_length: int) -> list[Statistic]:
     """All statistics. Those of h look at its subgoal, those of f at the states after each push."""
-    pair = f"pairs of centres nearer than {100 * nearness.pair:.1f} cm"
-    chosen = []
-    for part, end in (("h", _subgoal), ("f", _last_step)):
-        chosen += [
-            Statistic(
-                f"farthest_move_{part}",
-                f"farthest move over the segment, {part}",
-                lambda outcome, end=end: _moves(outcome, end(outcome)).amax(-1),
-                part,
-                "m",
-            ),
-            Statistic(
-                f"moved_objects_{part}",
-                f"objects that move more than 1 cm, {part}",
-                lambda outcome, end=end: (_moves(outcome, end(outcome)) > MOVED).sum(-1).float(),
-                part,
-                counts=1.0,
-            ),
-            Statistic(
-                f"close_pairs_{part}",
-                f"{pair}, {part}",
-                lambda outcome, end=end: (
-                    (_pair_distances(end(outcome), outcome.first.mask) < nearness.pair).sum((-1, -2)) / 2
-                ),
-                part,
-                counts=1.0,
-            ),
+    pair, tool = 100 * nearness.pair, 100 * nearness.tool  # centimetres
+    found = []
+    for part in ("h", "f"):
+        move, moved = f"farthest move over the segment, {part}", f"objects that move more than 1 cm, {part}"
+        near = f"pairs of centres nearer than {pair:.1f} cm, {part}"
+        found += [
+            Statistic(f"farthest_move_{part}", move, partial(_farthest_move, part), part, "m"),
+            Statistic(f"moved_objects_{part}", moved, partial(_moved_objects, part), part, counts=1.0),
+            Statistic(f"close_pairs_{part}", near, partial(_close_pairs, part, nearness.pair), part, counts=1.0),
         ]
+    touching, share = f"pushes that pass within {tool:.1f} cm of a centre, share", 1.0 / segment_length
     return [
-        *chosen,
+        *found,
         Statistic("start_to_nearest", "from a push's start to the nearest centre", _start_to_nearest, "g", "m"),
         Statistic("start_to_moved", "from a push's start to the object it moves", _start_to_moved, "g", "m"),
-        Statistic(
-            "touching",
-            f"pushes that pass within {100 * nearness.tool:.1f} cm of a centre, share",
-            lambda outcome: (_path_distances(outcome).amin(-1) < nearness.tool).float().mean(-1),
-            "g",
-            counts=1.0 / segment_length,
-        ),
+        Statistic("touching", touching, partial(_touching, nearness.tool), "g", counts=share),
     ]
 
 
-def _subgoal(outcome: Outcome) -> Tensor:
+def _end(part: str, outcome: Outcome) -> Tensor:
+    """Centres `[B, M, 3]` after the segment, as h or f has them."""
+    if part == "f":
+        return outcome.steps[:, -1]
     assert outcome.subgoal is not None
     return outcome.subgoal
 
 
-def _last_step(outcome: Outcome) -> Tensor:
-    return outcome.steps[:, -1]
+def _moves(part: str, outcome: Outcome) -> Tensor:
+    """How far each object goes over the segment: `[B, M]` metres, 0 for padding."""
+    return (_end(part, outcome) - outcome.first.centers).norm(dim=-1) * outcome.first.mask
 
 
-def _moves(outcome: Outcome, end: Tensor) -> Tensor:
-    """How far each object goes from s to `end: [B, M, 3]`: `[B, M]` metres, 0 for padding."""
-    return (end - outcome.first.centers).norm(dim=-1) * outcome.first.mask
+def _farthest_move(part: str, outcome: Outcome) -> Tensor:
+    return _moves(part, outcome).amax(-1)
+
+
+def _moved_objects(part: str, outcome: Outcome) -> Tensor:
+    return (_moves(part, outcome) > MOVED).sum(-1).float()
+
+
+def _close_pairs(part: str, near: float, outcome: Outcome) -> Tensor:
+    # Every pair stands in the matrix twice.
+    return (_pair_distances(_end(part, outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
+
+
+def _touching(near: float, outcome: Outcome) -> Tensor:
+    return (_path_distances(outcome).amin(-1) < near).float().mean(-1)
 
 
 def _before(outcome: Outcome) -> Tensor:
