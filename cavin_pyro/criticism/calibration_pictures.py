@@ -29,13 +29,13 @@ def draw_calibration(transforms: Mapping[str, Mapping[str, Mapping[str, Tensor]]
     rows = len(transforms)
     figure = Figure(figsize=(14.0, 0.8 + 2.9 * rows), dpi=100, layout="constrained")
     axes = figure.subplots(rows, len(TITLES) + 1, squeeze=False)
-    for line, (name, groups) in zip(axes, transforms.items(), strict=True):
+    for number, (line, (name, groups)) in enumerate(zip(axes, transforms.items(), strict=True)):
         line[0].set_ylabel(f"{name}\n\ndensity", fontsize=10)
         for panel, (group, title) in zip(line, TITLES.items(), strict=False):
             _histogram(panel, groups[group])
             count = len(groups[group]["x"])
             panel.set_title(f"{title} ({count})", fontsize=10)
-        _coverage(line[-1], groups)
+        _coverage(line[-1], groups, legend=number == 0)
     handles = [Line2D([], [], color=color, label=name) for name, color in COLORS.items()]
     handles.append(Line2D([], [], color="black", linestyle=":", label="calibrated"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=10, frameon=False)
@@ -56,7 +56,7 @@ def _histogram(panel: Axes, pits: Mapping[str, Tensor]) -> None:
     _tidy(panel)
 
 
-def _coverage(panel: Axes, groups: Mapping[str, Mapping[str, Tensor]]) -> None:
+def _coverage(panel: Axes, groups: Mapping[str, Mapping[str, Tensor]], *, legend: bool) -> None:
     for group, (style, color) in STYLES.items():
         planar = torch.cat((groups[group]["x"], groups[group]["y"]))
         if len(planar):
@@ -67,7 +67,8 @@ def _coverage(panel: Axes, groups: Mapping[str, Mapping[str, Tensor]]) -> None:
     panel.set_title("x and y within central intervals", fontsize=10)
     panel.set_xlabel("nominal share", fontsize=9)
     panel.set_ylabel("observed share", fontsize=9)
-    panel.legend(fontsize=8, frameon=False, loc="lower right")
+    if legend:
+        panel.legend(fontsize=8, frameon=False, loc="lower right")
     _tidy(panel)
 
 
