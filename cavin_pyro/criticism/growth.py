@@ -150,8 +150,8 @@ def _findings(results: Mapping[str, list[dict[str, float]]]) -> Iterator[str]:
         if name == "nothing_moves":
             continue
         begin, end = results[name][first]["mean"], results[name][last]["mean"]
-        still = [nothing[number]["mean"] for number in (first, last)]
+        share, share_at_end = begin / nothing[first]["mean"], end / nothing[last]["mean"]
         yield (
-            f"The error of {CURVES[name]}, is {100 * begin:.1f} cm after {first + 1} segment ({begin / still[0]:.0%} of "
-            f"that of the guess that nothing moves) and {100 * end:.1f} cm after {last + 1} ({end / still[1]:.0%})."
+            f"The error of {CURVES[name]}, is {100 * begin:.1f} cm after {first + 1} segment, {share:.0%} of that of "
+            f"the guess that nothing moves, and {100 * end:.1f} cm after {last + 1}, {share_at_end:.0%}."
         )
