@@ -94,10 +94,11 @@ def _findings(way: tuple[str, str], numbers: Mapping[str, Any]) -> list[str]:
         ]
     if math.isnan(numbers["relative"]):
         return [f"{name}: no subgoal moves an object by more than {100 * MOVING:g} cm; {pushes}."]
+    low, left, high = (100 * numbers[key] for key in ("low", "relative", "high"))
     return [
         f"{name}: objects that are to move {100 * numbers['wanted']:.1f} cm end "
-        f"{100 * numbers['from_subgoal']:.1f} cm from the subgoal, so that {100 * numbers['relative']:.0f} % of the way is left ({100 * numbers['low']:.0f} to "
-        f"{100 * numbers['high']:.0f} %); f expected {100 * numbers['predicted_from_subgoal']:.1f} cm; {pushes}."
+        f"{100 * numbers['from_subgoal']:.1f} cm from the subgoal, so that {left:.0f} % of the way is left "
+        f"({low:.0f} to {high:.0f} %); f expected {100 * numbers['predicted_from_subgoal']:.1f} cm; {pushes}."
     ]
 
 
