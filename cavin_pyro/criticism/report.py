@@ -70,7 +70,9 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
     )
     source = (resources.files("cavin_pyro.criticism") / "report.html").read_text(encoding="utf-8")
     details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
-    return environment.from_string(source).render(about=about, details=details, sections=parts)
+    # Old checkpoints may tell less.
+    trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
+    return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
 
 
 def plain(value: Any) -> Any:

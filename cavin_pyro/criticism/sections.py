@@ -14,9 +14,9 @@ from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section, Subject
 from cavin_pyro.errors import UserError
 from cavin_pyro.files import read_json, write_json
-from cavin_pyro.progress import progress_bar
 
-# In the order of the report. Each takes the subject, and what `sizes.<name>` of conf/check.yaml holds.
+# In the order of the report. Each takes the subject, and what `sizes.<name>` of conf/check.yaml holds; long ones show
+# their progress themselves.
 SECTIONS: dict[str, Callable[..., Section]] = {
     "consistency": assess_consistency,
 }
@@ -49,18 +49,14 @@ def run_sections(
     kept = folder / "sections"
     kept.mkdir(exist_ok=True)
     parts = []
-    with progress_bar("checking", total=len(names), unit="section") as bar:
-        for name in names:
-            bar.set_postfix_str(name)
-            part = _finished(kept / f"{name}.json", mark)
-            if part is None:
-                pyro.set_rng_seed(subject.seed)
-                part = render(
-                    SECTIONS[name](subject, **{str(key): value for key, value in sizes.get(name, {}).items()})
-                )
-                write_json(kept / f"{name}.json", {"mark": mark, "part": part})
-            parts.append(part)
-            bar.update()
+    for number, name in enumerate(names, 1):
+        print(f"section {number} of {len(names)}: {name}", flush=True)
+        part = _finished(kept / f"{name}.json", mark)
+        if part is None:
+            pyro.set_rng_seed(subject.seed)
+            part = render(SECTIONS[name](subject, **{str(key): value for key, value in sizes.get(name, {}).items()}))
+            write_json(kept / f"{name}.json", {"mark": mark, "part": part})
+        parts.append(part)
     return parts
 
 
