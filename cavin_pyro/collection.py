@@ -80,7 +80,7 @@ def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) ->
     scene_generator, policy_generator = np.random.default_rng([settings.seed, episode]).spawn(2)
     count = int(scene_generator.integers(settings.minimum_objects, settings.maximum_objects + 1))
     with user_input():
-        seen = scene.draw([_crowd(scene_generator)] * count, settings.ranges, scene_generator)
+        seen = scene.draw([crowd(scene_generator)] * count, settings.ranges, scene_generator)
     policy = HeuristicPushingPolicy(policy_generator, hold=settings.hold, perturbed=settings.perturbed)
     arrays = _blank(settings, scene)
     arrays["mask"][:] = seen.mask
@@ -98,7 +98,7 @@ def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) ->
     return arrays
 
 
-def _crowd(generator: np.random.Generator) -> Area:
+def crowd(generator: np.random.Generator) -> Area:
     """A rectangle somewhere on the table: objects near each other are what planning has to deal with."""
     ((low, high),) = WHOLE_TABLE
     size = np.minimum(generator.uniform(*CROWD_SIDES, size=2), np.subtract(high, low))

@@ -14,6 +14,7 @@ checksums find a shard that was damaged later. Letters: E episodes, S pushes, M 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,19 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
         )
     return metadata
+
+
+def content_mark(folder: Path) -> str:
+    """Twelve hexadecimal digits of the first shard's bytes: equal for equal settings, program and simulator.
+
+    Raises:
+        UserError: the shard cannot be read.
+    """
+    path = shard_path(folder, 0)
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    except OSError as error:
+        raise UserError(f"shard {path} cannot be read ({error.strerror}): collect it again") from error
 
 
 def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:

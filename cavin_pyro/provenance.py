@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 import platform
 import shlex
 import subprocess
@@ -14,7 +15,8 @@ from typing import Any
 
 from cavin_pyro import __version__
 from cavin_pyro.checkpoint import load_checkpoint
-from cavin_pyro.dataset import read_metadata
+from cavin_pyro.command import PACKAGES
+from cavin_pyro.dataset import content_mark, read_metadata
 from cavin_pyro.windows import WindowTable
 
 
@@ -37,11 +39,22 @@ def training_provenance(data: Sequence[Path], pointnet: Path, windows: WindowTab
     kept = ("transitions", "episodes", "settings", "made_by")
     return {
         **provenance(),
-        "data": [{name: read_metadata(folder)[name] for name in kept} for folder in data],
+        "data": [
+            {**{name: read_metadata(folder)[name] for name in kept}, "mark": content_mark(folder)} for folder in data
+        ],
         "pointnet": trained_before.get("pointnet", trained_before),
         "training_windows": len(windows.training),
         "validation_windows": len(windows.validation),
     }
+
+
+def program_mark() -> str:
+    """Twelve hexadecimal digits that change when any source file of the five packages does."""
+    home, digest = Path(__file__).resolve().parent.parent, hashlib.sha256()
+    for package in ("cavin_pyro", *PACKAGES):
+        for file in sorted((home / package).rglob("*.py")):
+            digest.update(str(file.relative_to(home)).encode() + file.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def _module() -> str:

@@ -22,6 +22,8 @@ GOOD = {
     "trainer.batch_size=2 windows.minimum_move=0.001 windows.validation_fraction=0.4",
     "plan": "checkpoint=@checkpoint maximum_steps=1 video=false",
     "evaluate": "checkpoint=@checkpoint maximum_steps=1 episodes=1 workers=1",
+    "check": "checkpoint=@trained data=@pushes windows=2 sections=consistency sizes.consistency.scenes=1 "
+    "sizes.consistency.samples=2",
 }
 
 # (command, words added to the good ones, what the line must say)
@@ -44,6 +46,8 @@ BAD = [
     ),
     ("train", "trainer.schedule=linear", "unknown trainer.schedule 'linear': choose from constant, cosine"),
     ("evaluate", "task=juggling", "choose from clearing, insertion, crossing"),
+    ("check", "sections=[consistency,bliss]", "unknown section 'bliss': choose from "),
+    ("check", "sections=[]", "sections must name at least one: choose from "),
     # Words that are not there.
     (
         "plan",
@@ -64,6 +68,8 @@ BAD = [
     ("pretrain", "autoencoder.depth=3", "valid under autoencoder are"),
     ("train", "trainer.step=3", "did you mean steps? valid under trainer are"),
     ("evaluate", "episode=3", "did you mean episodes?"),
+    ("check", "window=3", "did you mean windows?"),
+    ("check", "sizes.consistency.scene=3", "did you mean scenes? valid under sizes.consistency are"),
     # Words that Hydra refuses.
     ("collect", "transitions", "'transitions': write overrides as name=value"),
     ("collect", "transitions=[1,", "write overrides as name=value"),
@@ -118,12 +124,16 @@ BAD = [
             "train": "trainer.steps trainer.batch_size trainer.validate_every trainer.validation_windows "
             "trainer.patience model.segment_length model.width guide.width objective.elbo.num_particles",
             "evaluate": "episodes workers",
+            "check": "windows sizes.consistency.scenes sizes.consistency.objects sizes.consistency.samples",
         }.items()
         for word in words.split()
     ),
     ("collect", "transitions=-2", "transitions must be at least 1, not -2"),
     ("pretrain", "batch_size=-2", "batch_size must be at least 1, not -2"),
     ("train", "trainer.steps=-2", "trainer.steps must be at least 1, not -2"),
+    ("check", "windows=-2", "windows must be at least 1, not -2"),
+    ("check", "sizes.consistency.objects=6", "sizes.consistency.objects=6, but the model knows at most 5"),
+    ("check", "seed=-1", "seed must be a whole number from 0 to"),
     ("evaluate", "episodes=-2", "episodes must be at least 1, not -2"),
     ("collect", "maximum_objects=6", "maximum_objects must be between minimum_objects=1 and 5, not 6"),
     ("collect", "maximum_objects=2 minimum_objects=3", "between minimum_objects=3 and 5, not 2"),
@@ -169,11 +179,23 @@ BAD = [
         "asks to run models.pointnet.torch.save, which is not part of this program",
     ),
     ("evaluate", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),
+    ("check", "checkpoint=@nothing", "no checkpoint at"),
+    ("check", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),
+    ("check", "checkpoint=@no_model", "holds no model: give one that train has written"),
+    ("check", "checkpoint=@no_guide", "holds no guide: give one that train has written"),
+    ("check", "checkpoint=@no_pointnet", "holds no PointNet"),
+    ("check", "checkpoint=@untrusted", "asks to run numpy.save"),
+    ("check", "checkpoint=@checkpoint", "does not tell which windows its training held out"),
+    ("check", "checkpoint=@all_training", "no validation window in which an object moved more than"),
     ("train", "pointnet=@truncated", "truncated is truncated or no safetensors file"),
     ("train", "pointnet=@no_pointnet", "holds no PointNet"),
     # Datasets.
     ("train", "data=@nothing", "python -m cavin_pyro.collect"),
     ("pretrain", "data=@nothing", "python -m cavin_pyro.collect"),
+    ("check", "data=@nothing", "python -m cavin_pyro.collect"),
+    ("check", "data=@empty_data", "empty_data is empty"),
+    ("check", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
+    ("check", "data=[@pushes,@long_data]", "episodes of different length cannot be joined"),
     ("train", "data=@empty_data", "empty_data is empty"),
     ("pretrain", "data=@empty_data", "empty_data is empty"),
     ("train", "data=@old_data", "has format version 0, this program reads 1: collect it again"),
@@ -188,6 +210,7 @@ BAD = [
     ("collect", "output=@pushes seed=4", "holds a dataset with"),
     ("evaluate", "output=@used", "holds a run with"),
     ("train", "output=@used", "holds a run with"),
+    ("check", "output=@used", "holds a run with"),
     # Layouts.
     ("plan", "layout=@nothing.yaml", "nothing.yaml cannot be read"),
     ("plan", "layout=@no_yaml.yaml", "no_yaml.yaml is not YAML"),
@@ -263,6 +286,11 @@ def spoil_checkpoints(folder: Path, good: Path) -> None:
     save("no_sections", config="[1]")
     save("no_prior", config=json.dumps({"model": config["model"]}))
     save("no_model", config="{}")
+    windows = {"maximum_step": 0.2, "minimum_move": 0.001, "maximum_move": 0.5, "quiet_fraction": 0.25}
+    trained = {**config, "seed": 0, "windows": {**windows, "validation_fraction": 0.4}}
+    save("trained", config=json.dumps(trained))
+    save("no_guide", without="guide", config=json.dumps(trained))
+    save("all_training", config=json.dumps({**trained, "windows": {**windows, "validation_fraction": 0}}))
     save("no_pointnet", without="pointnet")
     save_model("width", width=16)
     save_model("segment_length", segment_length=5)

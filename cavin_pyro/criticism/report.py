@@ -1,0 +1,129 @@
+"""The report: sections as one page that needs nothing else, `report.html`, and as data, `report.json`.
+
+Keys of report.json:
+
+    about       what was checked: `checkpoint` (path), `weights` (a mark of the file's content), `model`, `guide`,
+                `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
+                `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check)
+    sections    by name: `title`, `findings` (sentences) and `values`, which the section's function documents
+
+Floats have six significant digits; what is not a finite number is null.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from cavin_pyro.criticism.section import Section, Table
+from cavin_pyro.files import replacing, write_json
+
+SIGNIFICANT_DIGITS = 6
+DOTS_PER_INCH = 150  # of photographs
+LARGEST_DRAWING = 400_000  # bytes of SVG; what is larger becomes pixels
+MISSING = "–"
+
+Part = dict[str, Any]
+"""A rendered section, JSON-ready: name, title, explanation, findings, values, tables, pictures."""
+
+
+def render(section: Section) -> Part:
+    """Turn figures into images and numbers into plain ones, so that a section can be kept on disk."""
+    return {
+        "name": section.name,
+        "title": section.title,
+        "explanation": section.explanation,
+        "findings": list(section.findings),
+        "values": plain(section.values),
+        "tables": [_table(table) for table in section.tables],
+        "pictures": [
+            {"name": picture.name, "caption": picture.caption, "image": image(picture.figure)}
+            for picture in section.pictures
+        ],
+    }
+
+
+def write_report(folder: Path, about: Mapping[str, Any], parts: Sequence[Part]) -> None:
+    """Write both files, each whole or not at all."""
+    told = plain(about)
+    sections = {part["name"]: {key: part[key] for key in ("title", "findings", "values")} for part in parts}
+    write_json(folder / "report.json", {"about": told, "sections": sections})
+    with replacing(folder / "report.html") as temporary:
+        temporary.write_text(page(told, parts), encoding="utf-8")
+
+
+def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
+    """The page as HTML; every string in it is escaped."""
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    source = (resources.files("cavin_pyro.criticism") / "report.html").read_text(encoding="utf-8")
+    details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
+    # Old checkpoints may tell less.
+    trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
+    return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
+
+
+def plain(value: Any) -> Any:
+    """Numbers, arrays and mappings as JSON knows them; what is not finite becomes None.
+
+    Raises:
+        TypeError: there is something else in it.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if hasattr(value, "tolist"):  # arrays, tensors and their scalars
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return float(f"{value:.{SIGNIFICANT_DIGITS}g}") if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    raise TypeError(f"{type(value).__name__} does not belong into report.json")
+
+
+def image(figure: Figure) -> str:
+    """A figure as a `data:` address: a drawing, or pixels where it holds photographs or very many points."""
+    if not any(axes.images for axes in figure.axes):
+        drawing = io.BytesIO()
+        with matplotlib.rc_context({"svg.hashsalt": "cavin_pyro"}):  # equal figures give equal bytes
+            figure.savefig(drawing, format="svg", metadata={"Date": None})
+        if drawing.tell() <= LARGEST_DRAWING:
+            return _address("svg+xml", drawing)
+    pixels = io.BytesIO()
+    figure.savefig(pixels, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
+    return _address("png", pixels)
+
+
+def _address(kind: str, content: io.BytesIO) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+def _table(table: Table) -> dict[str, Any]:
+    """Header, rows of text, and which columns [n] hold numbers."""
+    rows = [[_cell(entry, table.digits) for entry in row] for row in table.rows]
+    numeric = [all(not isinstance(row[column], str) for row in table.rows) for column in range(len(table.header))]
+    return {"header": list(table.header), "rows": rows, "numeric": numeric}
+
+
+def _cell(entry: Any, digits: int) -> str:
+    if isinstance(entry, bool | np.bool_):
+        return "yes" if entry else "no"
+    if isinstance(entry, int | np.integer):
+        return f"{entry:,}".replace(",", "\u202f")
+    if entry is None or isinstance(entry, str):
+        return MISSING if entry is None else entry
+    number = float(entry)
+    return MISSING if math.isnan(number) else f"{number:.{digits}f}".replace("-", "−").replace("inf", "∞")
