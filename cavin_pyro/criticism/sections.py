@@ -9,7 +9,15 @@ from typing import Any
 import pyro
 
 from cavin_pyro.building import check_sizes
+from cavin_pyro.criticism.aggregate import assess_aggregate
+from cavin_pyro.criticism.amortisation import assess_amortisation
+from cavin_pyro.criticism.calibration import assess_calibration
+from cavin_pyro.criticism.codes import assess_codes
 from cavin_pyro.criticism.consistency import assess_consistency
+from cavin_pyro.criticism.elbo_section import assess_elbo
+from cavin_pyro.criticism.growth import assess_growth
+from cavin_pyro.criticism.guide_error import assess_guide_error
+from cavin_pyro.criticism.predictive import assess_predictive
 from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section, Subject
 from cavin_pyro.errors import UserError
@@ -18,6 +26,14 @@ from cavin_pyro.files import read_json, write_json
 # In the order of the report. Each takes the subject, and what `sizes.<name>` of conf/check.yaml holds; long ones show
 # their progress themselves.
 SECTIONS: dict[str, Callable[..., Section]] = {
+    "elbo": assess_elbo,
+    "guide_error": assess_guide_error,
+    "amortisation": assess_amortisation,
+    "codes": assess_codes,
+    "aggregate_posterior": assess_aggregate,
+    "predictive": assess_predictive,
+    "calibration": assess_calibration,
+    "growth": assess_growth,
     "consistency": assess_consistency,
 }
 
