@@ -73,6 +73,12 @@ class Objective:
                 "choose model= from cascaded, single_latent, flat"
             )
 
+        if self.elbo.num_particles > 1 and not any(hasattr(model, name.replace("code", "prior")) for name in CODES):
+            raise ValueError(
+                f"objective with {self.elbo.num_particles} particles needs a model with codes, and "
+                f"{type(model).__name__} has none: choose objective=trace_elbo"
+            )
+
     def weights(self, step: int) -> dict[str, float]:
         """Weight of each code's KL term at a step, counted from 0."""
         ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
