@@ -12,6 +12,7 @@ def main(config: DictConfig) -> None:
     """Check a trained model and its guide on held-out windows, and write a report; resumes what was interrupted."""
     import pyro
 
+    from cavin_pyro.criticism.consistency import check_objects
     from cavin_pyro.criticism.report import write_report
     from cavin_pyro.criticism.sections import choose_sections, run_sections
     from cavin_pyro.criticism.subject import load_subject
@@ -25,6 +26,8 @@ def main(config: DictConfig) -> None:
     at_least("windows", config.windows, 1)
     names = choose_sections(config.sections, config.sizes)
     subject, about = load_subject(config)
+    if "consistency" in names:  # before anything is written
+        check_objects(subject, config.sizes.consistency.objects)
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("output", "sections"))
     write_config(folder, config)

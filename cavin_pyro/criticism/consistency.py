@@ -17,6 +17,18 @@ from cavin_pyro.errors import UserError
 from cavin_pyro.progress import progress_bar
 
 
+def check_objects(subject: Subject, objects: int) -> None:
+    """Make sure that a model knows so many objects.
+
+    Raises:
+        UserError: it does not.
+    """
+    if objects > subject.model.maximum_objects:
+        raise UserError(
+            f"sizes.consistency.objects={objects}, but the model knows at most {subject.model.maximum_objects}"
+        )
+
+
 def assess_consistency(subject: Subject, *, scenes: int = 150, objects: int = 3, samples: int = 1024) -> Section:
     """Pursue subgoals in `scenes` drawn scenes of `objects` objects, N = `samples` candidates where a code is chosen.
 
@@ -26,10 +38,7 @@ def assess_consistency(subject: Subject, *, scenes: int = 150, objects: int = 3,
     Raises:
         UserError: the model does not know so many objects.
     """
-    if objects > subject.model.maximum_objects:
-        raise UserError(
-            f"sizes.consistency.objects={objects}, but the model knows at most {subject.model.maximum_objects}"
-        )
+    check_objects(subject, objects)
     values: dict[str, Any] = {"scenes": scenes, "objects": objects, "samples": samples, "ways": []}
     if not subject.codes:
         nothing = ["The model has no codes and generates no pushes: there is nothing to carry out."]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -54,10 +55,11 @@ def composed(model: str, guide: str, prior: str, objective: str, scales: str = "
 
 
 @pytest.fixture(scope="module")
-def windows(pushes: Path) -> WindowTable:
+def windows(pushes: Path, tmp_path_factory: pytest.TempPathFactory) -> WindowTable:
     torch.manual_seed(0)
+    own = shutil.copytree(pushes, tmp_path_factory.mktemp("combinations") / "pushes")  # features go there
     settings = WindowSettings(validation_fraction=0.4, minimum_move=0.001, quiet_fraction=1.0, seed=1)
-    return load_windows([pushes], PointNet().requires_grad_(False).eval(), settings)
+    return load_windows([own], PointNet().requires_grad_(False).eval(), settings)
 
 
 def validation_loss(model: Any, guide: Any, table: WindowTable) -> float:

@@ -146,7 +146,7 @@ def test_padding_neither_moves_nor_hides(tmp_path: Path) -> None:
     table = load(tmp_path, arrays)
     assert counted_windows(table) == ALL_WINDOWS
     assert counted_transitions(table) == ALL_TRANSITIONS
-    assert not table.batch(torch.arange(3)).states.mask[..., 1].any()
+    assert table.batch(torch.arange(3)).states.objects == 1
 
 
 @pytest.mark.parametrize("length", [1, 3, 4])
