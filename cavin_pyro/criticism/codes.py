@@ -83,7 +83,7 @@ def _findings(values: dict[str, Any], codes: tuple[str, ...]) -> list[str]:
     sentences = []
     for name in codes:
         one = values[name]
-        low, high = one["information"]["lower"], min(one["information"]["upper"], one["kl"]["mean"])
+        low, high = max(one["information"]["lower"], 0.0), min(one["information"]["upper"], one["kl"]["mean"])
         rate, aggregate = one["kl"], max(one["aggregate_kl"]["high"], 0.0)
         sentences.append(
             f"{SYMBOLS[name]} has {one['active']} active dimensions of {one['dimensions']} and costs "

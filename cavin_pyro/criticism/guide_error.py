@@ -23,7 +23,7 @@ from models.state import Window
 
 NAME, TITLE = "guide_error", "How far the guide is from the posterior"
 LABELS = {
-    "joint": "all codes: q(c) q(z|c) for p(c, z | s, s', a)",
+    "joint": "all codes: the guide for the posterior",
     "effect_code": "c alone: q(c) for p(c | s, s', a)",
     "effect_code_given_subgoal": "c without the actions: q(c) for p(c | s, s')",
     "motion_code": "z alone: q(z|c) for p(z | s, a, c), c fixed",

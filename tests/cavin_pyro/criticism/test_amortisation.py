@@ -10,7 +10,7 @@ import torch
 from cavin_pyro.criticism.amortisation import assess_amortisation
 from cavin_pyro.criticism.section import Subject
 
-FEW = {"windows": 30, "steps": 300, "particles": 8, "draws": 1000}
+FEW = {"windows": 30, "steps": 200, "particles": 16, "draws": 1000}
 
 
 @pytest.mark.parametrize("shift, stretch", [(0.0, 1.0), (1.0, 1.0), (0.0, 2.0), (-2.0, 0.5)])
