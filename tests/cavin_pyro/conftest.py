@@ -154,7 +154,7 @@ def clean_pyro() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def pushes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of 12 episodes in 3 shards, to be read only."""
+    """A dataset of 12 episodes in 3 shards, to be read only; training adds its features."""
     folder = tmp_path_factory.mktemp("data") / "pushes"
     folder.mkdir()
     metadata = collect(PUSHES, folder, transitions=60, workers=1)
@@ -164,8 +164,8 @@ def pushes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def own_pushes(pushes: Path, tmp_path: Path) -> Path:
-    """A copy of the dataset, to be spoilt."""
-    return shutil.copytree(pushes, tmp_path / "pushes")
+    """A copy of the dataset as it was collected, to be spoilt."""
+    return shutil.copytree(pushes, tmp_path / "pushes", ignore=shutil.ignore_patterns("features-*"))
 
 
 @pytest.fixture(scope="session")
