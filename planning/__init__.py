@@ -4,6 +4,7 @@ from planning.cavin import MOTION_HORIZONS, CavinPlanner
 from planning.plan import Plan
 from planning.protocol import Outcome, Planner, PlanningModel, RewardFunction
 from planning.random_pushes import RandomPlanner
+from planning.robustness import Robustness
 
 __all__ = [
     "MOTION_HORIZONS",
@@ -14,4 +15,5 @@ __all__ = [
     "PlanningModel",
     "RandomPlanner",
     "RewardFunction",
+    "Robustness",
 ]

@@ -12,6 +12,7 @@ from planning.inputs import check_horizon, check_positive, check_scenes, check_w
 from planning.motions import plan_motions
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
+from planning.robustness import Robustness
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
 
@@ -32,6 +33,8 @@ class CavinPlanner:
         by step, lose against those without one; where every sequence fails somewhere, those that fail in the
         executed segment lose against those that fail later. If false, only the distance counts, as in the
         paper's text.
+    robustness: our addition to line 10, how the best motions are tried again with displaced pushes; None to take
+        the best at its word, as in the paper.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, and a
     `feature_weight` that is negative or not finite.
@@ -47,6 +50,7 @@ class CavinPlanner:
         *,
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
+        robustness: Robustness | None = None,
     ) -> None:
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
@@ -60,6 +64,7 @@ class CavinPlanner:
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
+        self.robustness = robustness
 
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
@@ -84,6 +89,7 @@ class CavinPlanner:
             segments=self.motion_segments,
             feature_weight=self.feature_weight,
             avoid_failures=self.avoid_failures,
+            robustness=self.robustness,
         )
         return Plan(
             actions=motions.actions[:, : self.model.segment_length],

@@ -12,6 +12,7 @@ from models.state import State
 from planning import ranking, returns
 from planning.effects import EffectPlan
 from planning.protocol import PlanningModel, RewardFunction
+from planning.robustness import Robustness, try_again
 from planning.sampling import sample_each
 
 
@@ -34,6 +35,7 @@ def plan_motions(
     segments: int,
     feature_weight: float,
     avoid_failures: bool,
+    robustness: Robustness | None,
 ) -> MotionPlan:
     """Choose among N = `samples` sequences of S = `segments` motion codes for the scenes `state: [B]`.
 
@@ -44,7 +46,7 @@ def plan_motions(
     here = state.expand_plans(1)  # [B, 1, M, .]: all sequences begin here, as in `plan_effects`
     mask = plans.mask
     progress = returns.start(plans.centers)
-    distance = plans.centers.new_zeros(plans.batch_shape)
+    distance = first_distance = plans.centers.new_zeros(plans.batch_shape)
     sound = torch.ones_like(progress.failed)
     failed_in_executed = progress.failed
     codes, actions, paths = [], [], []
@@ -64,6 +66,7 @@ def plan_motions(
         goal = effects.subgoals.step(slice(segment, segment + 1))  # [B, 1, M, .]
         from_goal = ranking.squared_distance(plans, goal, feature_weight=feature_weight)
         distance = distance + torch.where(counts, from_goal, 0.0)
+        first_distance = distance if segment == 0 else first_distance
         sound = sound & (torch.isfinite(pushes).all(-1).all(-1) | ~counts)
         if avoid_failures:
             progress = progress._replace(succeeded=progress.succeeded | ~counts)  # nothing left to fail
@@ -79,6 +82,14 @@ def plan_motions(
     score = ranking.prefer(score, ~failed_in_executed)
     score = ranking.prefer(score, ~progress.failed)
     chosen = ranking.best(score, "distances of motion plans to the subgoals")
+    if robustness is not None:
+        # Our addition: of the best, the one that still works where its pushes start a little elsewhere.
+        first = effects.subgoals.step(slice(0, 1))
+        numbers, cost = try_again(
+            robustness, model, reward, state, first, score, actions[0], generators, feature_weight=feature_weight
+        )
+        cost = cost + (distance - first_distance).gather(1, numbers)  # later segments, as they were
+        chosen = numbers.gather(1, cost.argmin(-1, keepdim=True)).squeeze(1)
     environments = torch.arange(len(chosen), device=chosen.device)
     return MotionPlan(
         codes=torch.stack([code[environments, chosen] for code in codes], 1),

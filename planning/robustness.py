@@ -1,0 +1,82 @@
+"""Motions that still work where the tool meets the object a little elsewhere (our addition to Algorithm 1, line 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import ranking, returns
+from planning.inputs import check_positive, check_weight
+from planning.protocol import PlanningModel, RewardFunction
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """How the best motions are tried again with displaced pushes.
+
+    The best of a thousand motions is often one about which f errs: a push that just meets the object according
+    to f, and just misses it on the table. Displacing its start tells the two apart.
+
+    finalists: motions that are tried again, the best by line 10. draws: times that each is tried.
+    start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
+    failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal.
+
+    Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
+    """
+
+    finalists: int = 64
+    draws: int = 8
+    start_noise: float = 0.03
+    failure_cost: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_positive("finalists", self.finalists)
+        check_positive("draws", self.draws)
+        check_weight("start_noise", self.start_noise)
+        check_weight("failure_cost", self.failure_cost)
+
+
+def try_again(
+    robustness: Robustness,
+    model: PlanningModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State,
+    scores: Tensor,
+    actions: Tensor,
+    generators: Sequence[torch.Generator],
+    *,
+    feature_weight: float,
+) -> tuple[Tensor, Tensor]:
+    """Finalists and how they did: numbers `[B, R]` int64 and mean costs `[B, R]` in square metres.
+
+    state: `[B]`, where all motions begin. goal: `[B, 1]`, the first subgoal. scores: `[B, N]`, the higher the better.
+    actions: `[B, N, T, 4]`, the segment that will be executed. A finalist whose score or whose cost is not finite
+    costs infinity.
+    """
+    count = min(robustness.finalists, scores.shape[-1])
+    best = scores.topk(count, -1)
+    environments = torch.arange(len(scores), device=scores.device).unsqueeze(-1)
+    tried = actions[environments, best.indices].unsqueeze(2)  # [B, R, 1, T, 4]
+    tried = tried.repeat(1, 1, robustness.draws, 1, 1)
+    tried[..., :2] += robustness.start_noise * _noise(tried[..., :2].shape[1:], generators)
+    pushes = tried.flatten(1, 2).clamp(-1.0, 1.0)  # [B, R D, T, 4]
+
+    plans = state.expand_plans(pushes.shape[1])
+    here = state.expand_plans(1)
+    mask, before, steps = plans.mask, plans.centers, []
+    for push in pushes.unbind(-2):
+        here = model.next_state(here, push).expand(mask.shape[:2])
+        steps.append(here.centers)
+    progress = returns.advance(returns.start(before), reward, before, torch.stack(steps, -3), mask)
+    distance = ranking.squared_distance(here, goal, feature_weight=feature_weight)
+    cost = (distance + robustness.failure_cost * progress.failed).unflatten(1, (count, robustness.draws)).mean(-1)
+    return best.indices, torch.where(torch.isfinite(best.values) & torch.isfinite(cost), cost, torch.inf)
+
+
+def _noise(shape: torch.Size, generators: Sequence[torch.Generator]) -> Tensor:
+    return torch.stack([torch.randn(shape, generator=generator, device=generator.device) for generator in generators])

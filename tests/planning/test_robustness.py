@@ -1,0 +1,147 @@
+"""A motion that works only if the tool meets the object exactly loses against one that works nearby as well."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Normal
+
+from models.state import State
+from planning import CavinPlanner, Robustness
+
+SAMPLES = 64
+
+
+class Grazing:
+    """A push moves objects by its motion, but only if its start lies within `width` of zero (normalised).
+
+    h moves everything by 0.1 m in x. g has two motions, which the sign of z tells apart: a wide one that ends 1 cm
+    short of the subgoal, and a narrow one that reaches it exactly.
+    """
+
+    segment_length = 1
+    narrow, wide = 0.001, 10.0
+
+    def effect_prior(self, state: State) -> Distribution:
+        return standard(state)
+
+    def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
+        return standard(state)
+
+    def subgoal(self, state: State, effect_code: Tensor) -> State:
+        return moved(state, state.centers.new_full((*effect_code.shape[:-1], 1), 0.1))
+
+    def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
+        narrow = motion_code[..., :1] > 0
+        distance = torch.where(narrow, 0.1, 0.09)
+        return torch.cat(
+            [torch.zeros_like(distance), narrow.to(distance), distance, narrow.to(distance)], -1
+        ).unsqueeze(-2)
+
+    def next_state(self, state: State, action: Tensor) -> State:
+        width = torch.where(action[..., 3:] > 0, self.narrow, self.wide)
+        meets = action[..., :1].abs() < width
+        return moved(state, torch.where(meets, action[..., 2:3], 0.0))
+
+
+def standard(state: State) -> Distribution:
+    zeros = state.centers.new_zeros((*state.centers.shape[:-2], 16))
+    return torch.distributions.Independent(Normal(zeros, 1.0), 1)
+
+
+def moved(state: State, distance: Tensor) -> State:
+    move = torch.cat([distance, torch.zeros_like(distance), torch.zeros_like(distance)], -1).unsqueeze(-2)
+    centers = state.centers + move
+    return State(centers, state.features.expand(*centers.shape[:-1], -1), state.mask.expand(centers.shape[:-1]))
+
+
+def scenes(count: int) -> State:
+    return State(torch.zeros(count, 2, 3), torch.zeros(count, 2, 4), torch.ones(count, 2, dtype=torch.bool))
+
+
+def chosen_motion(toy: SimpleNamespace, robustness: Robustness | None, **options: object) -> Tensor:
+    planner = CavinPlanner(
+        Grazing(), toy.GoalDisc(goal=(0.1, 0.0)), samples=SAMPLES, horizon=1, robustness=robustness, **options
+    )
+    return planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2]
+
+
+def test_without_it_the_motion_that_f_likes_best_is_taken_at_its_word(toy: SimpleNamespace) -> None:
+    assert chosen_motion(toy, None) == pytest.approx(0.1)
+
+
+def test_a_motion_that_works_nearby_as_well_wins(toy: SimpleNamespace) -> None:
+    # All 64 motions are tried again: the narrow ones then move nothing, 0.1 m from the subgoal instead of 0.01.
+    assert chosen_motion(toy, Robustness(finalists=SAMPLES, draws=4)) == pytest.approx(0.09)
+
+
+def test_pushes_that_are_not_displaced_change_nothing(toy: SimpleNamespace) -> None:
+    assert chosen_motion(toy, Robustness(finalists=SAMPLES, start_noise=0.0)) == pytest.approx(0.1)
+
+
+def test_only_finalists_are_tried_again(toy: SimpleNamespace) -> None:
+    assert chosen_motion(toy, Robustness(finalists=1)) == pytest.approx(0.1)
+    assert chosen_motion(toy, Robustness(finalists=10 * SAMPLES)) == pytest.approx(0.09)  # there are no more than N
+
+
+def test_a_predicted_failure_costs(toy: SimpleNamespace) -> None:
+    class Edge(Grazing):
+        """Every wide push ends beyond the edge in y once it is displaced; a narrow one stays."""
+
+        def next_state(self, state: State, action: Tensor) -> State:
+            after = super().next_state(state, action)
+            beyond = torch.where((action[..., 3:] == 0) & (action[..., :1] != 0), -1e-3, 0.0).unsqueeze(-2)
+            return after._replace(centers=after.centers + beyond * torch.tensor([0.0, 1.0, 0.0]))
+
+    reward = toy.GoalDisc(goal=(0.1, 0.0), forbidden_below=-1e-4)
+
+    def motion(cost: float) -> Tensor:
+        robustness = Robustness(finalists=SAMPLES, failure_cost=cost)
+        planner = CavinPlanner(Edge(), reward, samples=SAMPLES, horizon=1, robustness=robustness)
+        return planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2]
+
+    assert motion(0.0) == pytest.approx(0.09)  # two objects 1 cm off, against 10 cm
+    assert motion(1.0) == pytest.approx(0.1)
+
+
+def test_no_randomness_is_shared_between_environments(toy: SimpleNamespace) -> None:
+    planner = CavinPlanner(
+        toy.PointMass(), toy.GoalDisc(goal=(0.2, 0.1)), samples=SAMPLES, horizon=6, robustness=Robustness(finalists=8)
+    )
+    state = scenes(2)._replace(features=torch.ones(2, 2, 4))
+    both = planner.plan(state, [torch.Generator().manual_seed(seed) for seed in (3, 4)])
+    alone = planner.plan(state.scene(slice(1, 2)), [torch.Generator().manual_seed(4)])
+    torch.testing.assert_close(both.actions[1], alone.actions[0])
+
+
+@pytest.mark.parametrize("horizon", ["first_segment", "full_horizon"])
+def test_motions_that_are_not_finite_never_win(horizon: str, toy: SimpleNamespace) -> None:
+    class Broken(Grazing):
+        """Wide pushes lead nowhere once they are displaced."""
+
+        def next_state(self, state: State, action: Tensor) -> State:
+            after = super().next_state(state, action)
+            lost = (action[..., 3:] == 0) & (action[..., :1] != 0)
+            return after._replace(centers=torch.where(lost.unsqueeze(-2), torch.nan, after.centers))
+
+    planner = CavinPlanner(
+        Broken(), toy.GoalDisc(goal=(0.1, 0.0)), SAMPLES, 2, horizon, robustness=Robustness(finalists=SAMPLES)
+    )
+    assert planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"finalists": 0}, "finalists must be at least 1"),
+        ({"draws": 0}, "draws must be at least 1"),
+        ({"start_noise": -0.1}, "start_noise must be zero or a positive number"),
+        ({"failure_cost": float("nan")}, "failure_cost must be zero or a positive number"),
+    ],
+)
+def test_bad_options_are_one_clear_line(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Robustness(**options)
