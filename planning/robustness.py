@@ -28,10 +28,10 @@ class Robustness:
     Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
     """
 
-    finalists: int = 64
-    draws: int = 8
+    finalists: int = 128
+    draws: int = 16
     start_noise: float = 0.03
-    failure_cost: float = 0.05
+    failure_cost: float = 0.3
 
     def __post_init__(self) -> None:
         check_positive("finalists", self.finalists)
