@@ -33,15 +33,15 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         name: wilson(sum(row["outcome"] == name for row in rows), count)
         for name in ("success", "violation", "fall", "timeout")
     }
+    # An episode that ends before its first segment does has no distance, nor has a planner without subgoals.
+    distances = [row["subgoal_distance"] for row in rows if row["subgoal_distance"] is not None]
     return {
         "episodes": count,
         **rates,
         "steps": spread([row["steps"] for row in rows]),
         "return": spread([row["return"] for row in rows]),
         "planning_ms": spread([value for row in rows for value in row["planning_ms"]]),
-        "subgoal_distance": spread([row["subgoal_distance"] for row in rows])
-        if all(row["subgoal_distance"] is not None for row in rows)
-        else None,
+        "subgoal_distance": spread(distances) if distances else None,
         "per_episode": list(rows),
     }
 

@@ -62,6 +62,12 @@ def test_a_summary_has_a_rate_for_every_outcome_and_all_episodes() -> None:
     assert results["per_episode"] == rows()
 
 
+def test_episodes_that_end_within_a_segment_leave_the_mean_subgoal_distance_to_the_others() -> None:
+    first, *others = rows()
+    results = summarise([{**first, "subgoal_distance": None}, *others])
+    assert results["subgoal_distance"]["mean"] == pytest.approx(0.1)
+
+
 def test_a_planner_without_subgoals_has_no_subgoal_distance() -> None:
     without = [{**row, "subgoal_distance": None} for row in rows()]
     results = summarise(without)
