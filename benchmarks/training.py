@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from cavin_pyro.objectives import Objective
 from cavin_pyro.training import unchecked_programs
 from guides.cascaded import CascadedGuide
-from guides.inference import SCALE_FLOOR
 from models.cascaded import CascadedModel
+from models.layers import SCALE_FLOOR
 from models.state import State, Window
 
 PAIRS = 60  # of steps per batch size

@@ -31,6 +31,7 @@ BAD_INPUT = 2  # exit status
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", list: "a list", dict: "a section"}
 _OF_ANY_KIND = {"layout"}  # a number or a path
+_CAN_BE_LEFT_OUT = {"robustness"}  # sections that null switches off
 
 Body = Callable[[DictConfig], None]
 
@@ -140,7 +141,8 @@ def _check_kinds(defaults: dict[str, Any], config: dict[str, Any], prefix: str =
         value = config[name]
         kind = _KINDS.get(type(default))
         interpolated = isinstance(value, str) and value.startswith("${")
-        if kind is None or name in _OF_ANY_KIND or interpolated:
+        left_out = value is None and name in _CAN_BE_LEFT_OUT
+        if kind is None or name in _OF_ANY_KIND or interpolated or left_out:
             continue
         if type(value) is not type(default) and not (kind == "a number" and type(value) is int):
             raise UserError(f"{prefix}{name} must be {kind}, not {value}")

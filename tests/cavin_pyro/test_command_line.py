@@ -183,3 +183,19 @@ def test_every_command_has_a_configuration_of_its_name() -> None:
     mains = {path.stem for path in root.glob("*.py") if "@command(" in path.read_text() and path.stem != "command"}
     assert mains >= {"collect", "pretrain", "train", "plan", "evaluate"}
     assert mains <= {path.stem for path in (root / "conf").glob("*.yaml")}
+
+
+def test_what_we_added_to_the_papers_planner_can_be_left_out(
+    shell: SimpleNamespace, checkpoint_file: Path, tmp_path: Path
+) -> None:
+    words = [
+        "planner.robustness=null",
+        "planner.avoid_failures=false",
+        "margin=0",
+        "planner.samples=8",
+        "planner.horizon=3",
+    ]
+    words += [f"checkpoint={checkpoint_file}", "episodes=1", "maximum_steps=3", "objects=2", "workers=1"]
+    answer = shell.run_command("evaluate", *words, "output=results", folder=tmp_path)
+    assert answer.status == 0, answer.errors
+    assert "robustness: null" in (tmp_path / "results" / "config.yaml").read_text()
