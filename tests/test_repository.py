@@ -211,11 +211,11 @@ def test_no_file_weighs_more_than_three_megabytes() -> None:
     assert not [place(file) for file in repository_files() if file.stat().st_size > 3_000_000]
 
 
-def test_tests_mirror_the_packages_and_have_names_of_their_own() -> None:
+def test_tests_mirror_the_folders_and_have_names_of_their_own() -> None:
     """pytest's importlib mode wants no `__init__.py` and files that cannot be mistaken for one another."""
     files = sorted((ROOT / "tests").rglob("*.py"))
     folders = {file.relative_to(ROOT / "tests").parts[0] for file in files if file.parent != ROOT / "tests"}
     names = Counter(file.name for file in files if file.name.startswith("test_"))
-    assert folders <= set(PACKAGES)
+    assert folders <= {*PACKAGES, "benchmarks", "notebooks", "how_to"}
     assert not [place(file) for file in files if file.name == "__init__.py"]
     assert not [name for name, count in names.items() if count > 1]
