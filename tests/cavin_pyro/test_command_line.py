@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from cavin_pyro import command as command_module
-from cavin_pyro.command import PACKAGES, check_packages, guarded
+from cavin_pyro.command import PACKAGES, check_packages, compose, guarded
 from cavin_pyro.errors import UserError, at_least, check_seed, user_input
 from cavin_pyro.files import replacing
 
@@ -183,3 +183,22 @@ def test_every_command_has_a_configuration_of_its_name() -> None:
     mains = {path.stem for path in root.glob("*.py") if "@command(" in path.read_text() and path.stem != "command"}
     assert mains >= {"collect", "pretrain", "train", "plan", "evaluate"}
     assert mains <= {path.stem for path in (root / "conf").glob("*.yaml")}
+
+
+def test_a_configuration_from_python_is_that_of_the_command() -> None:
+    config = compose("plan", "task=clearing", "planner.samples=8")
+    assert config.task == "clearing"
+    assert config.planner.samples == 8
+    assert config.output == "runs/plan/clearing-0"  # nothing is left to be resolved
+    assert "hydra" not in config
+
+
+def test_words_from_python_are_refused_as_on_the_command_line() -> None:
+    for words, complaint in {
+        ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from cascaded, flat,",
+        ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",
+        ("plan", "objects=many"): "objects must be a whole number, not many",
+    }.items():
+        with pytest.raises(UserError) as caught:
+            compose(*words)
+        assert str(caught.value).startswith(complaint)
