@@ -39,7 +39,7 @@ def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:
         panel.tick_params(labelsize=8)
     for panel in axes.flat[len(keys) :]:
         panel.set_axis_off()
-    for panel in axes[-1]:
+    for panel in axes.flat[: len(keys)][-COLUMNS:]:  # the lowest of each column
         panel.set_xlabel("training step", fontsize=9)
     handles = axes[0, 0].get_lines()
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=10, frameon=False)
