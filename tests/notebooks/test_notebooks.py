@@ -63,7 +63,7 @@ def test_a_notebook_runs_and_opens_on_a_picture(path: Path, kernel: AsyncKernelM
     folder.mkdir()
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
     client = NotebookClient(notebook, km=kernel, timeout=TIME_LIMIT, resources={"metadata": {"path": str(folder)}})
-    client.execute(env=environment)
+    client.execute(cleanup_kc=True, env=environment)
     shown = [output.get("data", {}) for output in code_cells(notebook)[0].outputs]
     assert any("image/png" in data for data in shown)
     assert not list(folder.iterdir())  # what a notebook makes lies in a temporary folder
