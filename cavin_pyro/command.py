@@ -43,7 +43,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
         def main() -> None:
             # Third parties' deprecations are for developers, whose tests turn them into errors.
             warnings.filterwarnings("ignore", category=DeprecationWarning)
-            guarded(lambda: _check_words(name))
+            guarded(lambda: _check_words(name, [word for word in sys.argv[1:] if not word.startswith("-")]))
             hydra.main(version_base="1.3", config_path=CONFIGURATION, config_name=name)(
                 lambda config: guarded(lambda: _run(body, config))
             )()
@@ -77,15 +77,30 @@ def _stop(line: str, status: int) -> None:
     raise SystemExit(status)
 
 
+def compose(name: str, *words: str) -> DictConfig:
+    """The configuration of `python -m cavin_pyro.<name> <words>`, for those who call the library from Python.
+
+    Raises:
+        UserError: a word that the command line would refuse.
+    """
+    _check_words(name, list(words))
+    with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
+        return _resolved(hydra.compose(name, overrides=list(words)))
+
+
 def _run(body: Body, config: DictConfig) -> None:
     check_packages()
+    body(_resolved(config))
+
+
+def _resolved(config: DictConfig) -> DictConfig:
     try:
-        # Resolved and plain, because Hydra's own interpolations mean nothing in a worker process.
+        # Plain, because Hydra's own interpolations mean nothing in a worker process.
         plain = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
         raise UserError(f"a word has no value: {str(error).splitlines()[0]}") from error
     assert isinstance(plain, DictConfig)
-    body(plain)
+    return plain
 
 
 def check_packages() -> None:
@@ -106,9 +121,8 @@ def check_packages() -> None:
             )
 
 
-def _check_words(name: str) -> None:
+def _check_words(name: str, overrides: list[str]) -> None:
     """Compose the configuration before Hydra's own application does, to explain what is wrong in one line."""
-    overrides = [word for word in sys.argv[1:] if not word.startswith("-")]
     with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
         try:
             config = hydra.compose(name, overrides=overrides, return_hydra_config=True)

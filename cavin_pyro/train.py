@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from cavin_pyro.command import command
 
+if TYPE_CHECKING:
+    from cavin_pyro.training import Trainer
+
 
 @command("train")
 def main(config: DictConfig) -> None:
     """Train a model and its guide by stochastic variational inference; resumes what was interrupted."""
+    run = train(config)
+    print(f"best validation loss {run.best:.2f} at step {run.best_step}: {run.folder / 'checkpoint.safetensors'}")
+
+
+def train(config: DictConfig) -> Trainer:
+    """The whole of a training run, from its configuration to a folder with checkpoint, metrics and a picture.
+
+    Returns:
+        The run when it has ended.
+
+    Raises:
+        UserError: a configuration or data that cannot be used, or a loss that is not finite.
+    """
     import pyro
     import torch
 
@@ -54,7 +71,7 @@ def main(config: DictConfig) -> None:
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
     draw_training(folder / "training.png", run.rows)
-    print(f"best validation loss {run.best:.2f} at step {run.best_step}: {path}")
+    return run
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from cavin_pyro import command as command_module
-from cavin_pyro.command import PACKAGES, check_packages, guarded
+from cavin_pyro.command import PACKAGES, check_packages, compose, guarded
 from cavin_pyro.errors import UserError, at_least, check_seed, user_input
 from cavin_pyro.files import replacing
 
@@ -199,3 +199,22 @@ def test_what_we_added_to_the_papers_planner_can_be_left_out(
     answer = shell.run_command("evaluate", *words, "output=results", folder=tmp_path)
     assert answer.status == 0, answer.errors
     assert "robustness: null" in (tmp_path / "results" / "config.yaml").read_text()
+
+
+def test_a_configuration_from_python_is_that_of_the_command() -> None:
+    config = compose("plan", "task=clearing", "planner.samples=8")
+    assert config.task == "clearing"
+    assert config.planner.samples == 8
+    assert config.output == "runs/plan/clearing-0"  # nothing is left to be resolved
+    assert "hydra" not in config
+
+
+def test_words_from_python_are_refused_as_on_the_command_line() -> None:
+    for words, complaint in {
+        ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from cascaded, flat,",
+        ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",
+        ("plan", "objects=many"): "objects must be a whole number, not many",
+    }.items():
+        with pytest.raises(UserError) as caught:
+            compose(*words)
+        assert str(caught.value).startswith(complaint)
