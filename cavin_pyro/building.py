@@ -101,7 +101,10 @@ def build_guide(config: Config, model: PyroModule) -> PyroModule:
             f"guide {config['guide']['_target_']} does not fit model {type(model).__name__} (it fits "
             f"{', '.join(fits) or 'none'}): choose guide= from {choices}"
         )
-    return construct(config["guide"], model)
+    guide = construct(config["guide"], model)
+    if not isinstance(guide, PyroModule):
+        raise UserError(f"guide {config['guide']['_target_']} is no Pyro program: derive it from guides.guide.Guide")
+    return guide
 
 
 def _class(config: Config) -> Any:

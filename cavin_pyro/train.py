@@ -36,6 +36,7 @@ def train(config: DictConfig) -> Trainer:
     from cavin_pyro.checkpoint import default_checkpoint, save_checkpoint
     from cavin_pyro.figures import draw_training
     from cavin_pyro.files import output_folder, write_json
+    from cavin_pyro.pairs import check_pair
     from cavin_pyro.provenance import training_provenance
     from cavin_pyro.runs import check_same_run, write_config
     from cavin_pyro.settings import trainer_settings, window_settings
@@ -54,6 +55,7 @@ def train(config: DictConfig) -> Trainer:
     check_fit(model, pointnet, MAXIMUM_OBJECTS)
     data = [Path(folder) for folder in ([config.data] if isinstance(config.data, str) else config.data)]
     windows = load_windows(data, pointnet, window, skip_corrupt=config.skip_corrupt)
+    check_pair(model, guide, windows.batch(windows.training[:2]))
     print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
 
     folder = output_folder(config.output)

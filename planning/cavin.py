@@ -8,7 +8,7 @@ import torch
 
 from models.state import State
 from planning.effects import plan_effects
-from planning.inputs import check_horizon, check_positive, check_scenes, check_weight
+from planning.inputs import check_horizon, check_model, check_positive, check_scenes, check_weight
 from planning.motions import plan_motions
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
@@ -36,8 +36,8 @@ class CavinPlanner:
     robustness: our addition to line 10, how the best motions are tried again with displaced pushes; None to take
         the best at its word, as in the paper.
 
-    Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, and a
-    `feature_weight` that is negative or not finite.
+    Raises ValueError for a model that lacks one of these, counts below 1, a horizon that T does not divide, an
+    unknown `motion_horizon`, and a `feature_weight` that is negative or not finite.
     """
 
     def __init__(
@@ -52,6 +52,7 @@ class CavinPlanner:
         avoid_failures: bool = True,
         robustness: Robustness | None = None,
     ) -> None:
+        check_model(model)
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
         if motion_horizon not in MOTION_HORIZONS:

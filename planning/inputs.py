@@ -9,6 +9,8 @@ import torch
 
 from models.state import State
 
+CALLED = ("effect_prior", "motion_prior", "subgoal", "actions", "next_state")  # of a `PlanningModel`
+
 
 def check_positive(name: str, value: int) -> None:
     """Raise ValueError if a count is zero or negative."""
@@ -25,6 +27,16 @@ def check_horizon(horizon: int, segment_length: int) -> None:
         raise ValueError(
             f"horizon={horizon} is not divisible by the model's segment length T={segment_length}: "
             f"take {' or '.join(nearest)}"
+        )
+
+
+def check_model(model: object) -> None:
+    """Raise ValueError, naming what is missing, unless a model has all that Algorithm 1 calls."""
+    missing = [name for name in CALLED if not hasattr(model, name)]
+    if missing:
+        raise ValueError(
+            f"{type(model).__name__} has no {' and no '.join(missing)}, which the planner calls: "
+            "planner=cavin needs a checkpoint of model=cascaded; planner=random takes any"
         )
 
 

@@ -20,6 +20,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
+from cavin_pyro.building import build_guide, build_model
 from cavin_pyro.checkpoint import save_checkpoint
 from cavin_pyro.collection import CollectionSettings, collect
 from guides.cascaded import CascadedGuide
@@ -122,6 +123,26 @@ def small_config() -> dict[str, Any]:
     }
 
 
+BASELINES = {  # model= and the class of its guide, with what its section of the configuration has
+    "flat": ("guides.flat.FlatGuide", {"_target_": "models.flat.FlatModel", "motion_dimension": 4}),
+    "single_latent": (
+        "guides.single_latent.SingleLatentGuide",
+        {"_target_": "models.single_latent.SingleLatentModel", "effect_dimension": 4},
+    ),
+    "dynamics": ("guides.none.NoGuide", {"_target_": "models.dynamics_only.DynamicsModel"}),
+}
+
+
+def save_baseline(path: Path, name: str, **more: Any) -> None:
+    """A checkpoint of another model than the cascade, untrained and small; `more` goes into its configuration."""
+    guide, model = BASELINES[name]
+    config = {**small_config(), **more, "guide": {"_target_": guide, **({} if name == "dynamics" else {"width": 8})}}
+    config["model"] = {**model, "segment_length": 3, "feature_dimension": 64, "width": 8, "maximum_objects": 5}
+    built = build_model(config)
+    parts = {"model": built, "guide": build_guide(config, built), "pointnet": PointNet()}
+    save_checkpoint(path, parts=parts, config=config, provenance={"step": 0})
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file below a folder, by its name."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -138,7 +159,9 @@ def shell() -> SimpleNamespace:
 @pytest.fixture(scope="session")
 def small() -> SimpleNamespace:
     """Small things to try."""
-    return SimpleNamespace(config=small_config, parts=small_parts, pushes=PUSHES)
+    return SimpleNamespace(
+        config=small_config, parts=small_parts, pushes=PUSHES, baselines=[*BASELINES], save_baseline=save_baseline
+    )
 
 
 @pytest.fixture(autouse=True)

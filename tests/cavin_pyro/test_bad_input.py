@@ -173,6 +173,19 @@ BAD = [
     ("plan", "checkpoint=@no_prior", "lacks 'prior'"),
     ("plan", "checkpoint=@no_model", "holds no model: give one that train has written"),
     ("plan", "checkpoint=@no_pointnet", "holds no PointNet: give one that pretrain or train has written"),
+    *(
+        (
+            command,
+            f"checkpoint=@{name} {words}",
+            f"{said}, which the planner calls: planner=cavin needs a checkpoint of",
+        )
+        for command in ("plan", "evaluate")
+        for name, words, said in (
+            ("flat", "", "FlatModel has no effect_prior and no subgoal"),
+            ("single_latent", "", "SingleLatentModel has no motion_prior"),
+            ("dynamics", "", "DynamicsModel has no effect_prior and no motion_prior and no subgoal and no actions"),
+        )
+    ),
     ("plan", "checkpoint=@width", "is of another architecture"),
     ("plan", "checkpoint=@segment_length", "is of another architecture"),
     ("plan", "checkpoint=@untrusted", "asks to run numpy.save, which is not part of this program"),
@@ -245,10 +258,14 @@ def name_of(command: str, words: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def material(tmp_path_factory: pytest.TempPathFactory, pushes: Path, checkpoint_file: Path) -> Path:
+def material(
+    tmp_path_factory: pytest.TempPathFactory, pushes: Path, checkpoint_file: Path, small: SimpleNamespace
+) -> Path:
     """Files and folders for the words in `GOOD` and `BAD`, most of them with something wrong."""
     folder = tmp_path_factory.mktemp("material")
     spoil_checkpoints(folder, shutil.copy(checkpoint_file, folder / "checkpoint"))
+    for name in small.baselines:
+        small.save_baseline(folder / name, name)
     spoil_data(folder, shutil.copytree(pushes, folder / "pushes"))
     tiles = {"target_start": "[[2, 2]]", "region": "[[2, 2], [2, 3], [2, 4]]", "goal": "[[2, 4]]"}
     layouts = {

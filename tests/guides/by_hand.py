@@ -174,6 +174,23 @@ def log_transitions(w: Weights, window: Window) -> Tensor:
     return total
 
 
+def log_weight(
+    w: Weights, q: Weights, x: Example, c_noise: Tensor, z_noise: Tensor, *, of_actions: bool, of_effect: bool
+) -> Tensor:
+    """Of the cascade: log p(s', a, c, z | s) - log q(c, z | s, s', a) for one draw of a window's codes.
+
+    `of_actions`: whether q(c) reads the actions. `of_effect`: whether q(z) reads c.
+    """
+    encoded = encode(w, x.s)
+    c_mean, c_scale = q_h(q, x.s_of_both, x.goal, x.actions if of_actions else None)
+    c = c_mean + c_scale * c_noise
+    effect = effects(w, "meta_dynamics.trunk", encoded, c)
+    j_h = x.log_subgoal(w, effect) - divergence(c, c_mean, c_scale)
+    z_mean, z_scale = q_g(q, encoded, x.actions, c if of_effect else None)
+    z = z_mean + z_scale * z_noise
+    return j_h + log_pushes(x.actions, pushes(w, effect, z)) - divergence(z, z_mean, z_scale)
+
+
 def loss_of(elbo: Callable[..., Tensor], model: nn.Module, guide: nn.Module, window: Window, *noise: Tensor) -> Tensor:
     """-J_f and, for windows that count, minus what `elbo(w, q, example, *noise)` says of their codes.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -16,7 +17,6 @@ from guides.mean_field import MeanFieldGuide
 from models.cascaded import CascadedModel
 from models.state import Window
 from tests.guides import by_hand
-from tests.guides.by_hand import Example, Weights, effects, encode, log_pushes, pushes, q_g, q_h
 
 Programs = tuple[CascadedModel, Guide]
 GUIDES = [CascadedGuide, MeanFieldGuide, JointGuide]
@@ -25,16 +25,8 @@ GUIDES = [CascadedGuide, MeanFieldGuide, JointGuide]
 def hand_written_loss(model: CascadedModel, guide: Guide, window: Window, c_noise: Tensor, z_noise: Tensor) -> Tensor:
     """-(J_f + J_h + J_g) with the paper's J of opposite sign: the negative ELBO, summed over windows."""
 
-    def elbo(w: Weights, q: Weights, x: Example, c_noise: Tensor, z_noise: Tensor) -> Tensor:
-        encoded = encode(w, x.s)
-        c_mean, c_scale = q_h(q, x.s_of_both, x.goal, x.actions if isinstance(guide, JointGuide) else None)
-        c = c_mean + c_scale * c_noise
-        effect = effects(w, "meta_dynamics.trunk", encoded, c)
-        j_h = x.log_subgoal(w, effect) - by_hand.divergence(c, c_mean, c_scale)
-        z_mean, z_scale = q_g(q, encoded, x.actions, None if isinstance(guide, MeanFieldGuide) else c)
-        z = z_mean + z_scale * z_noise
-        return j_h + log_pushes(x.actions, pushes(w, effect, z)) - by_hand.divergence(z, z_mean, z_scale)
-
+    reads = {"of_actions": isinstance(guide, JointGuide), "of_effect": not isinstance(guide, MeanFieldGuide)}
+    elbo = partial(by_hand.log_weight, **reads)
     return by_hand.loss_of(elbo, model, guide, window, c_noise, z_noise)
 
 

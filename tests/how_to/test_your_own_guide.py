@@ -1,0 +1,153 @@
+"""docs/how-to-your-own-guide.md: its code and its commands, taken from the page and run in a folder of a user's."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import shutil
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from cavin_pyro.errors import UserError
+from cavin_pyro.pairs import check_pair
+from models.cascaded import CascadedModel
+from models.state import State, Window
+from tests.cavin_pyro.conftest import ROOT, Answer, run_command
+
+PAGE = (ROOT / "docs" / "how-to-your-own-guide.md").read_text(encoding="utf-8")
+CODE = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
+FOLLOWS = " ..."  # in the page's table: the line goes on
+TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
+
+# The page's commands train for days and look at everything: these words, added to them, make each a matter of seconds.
+SHORT = {
+    "train": "model.width=8 trainer.steps=4 trainer.validate_every=2 trainer.batch_size=4 windows.minimum_move=0.001 "
+    "windows.validation_fraction=0.4",
+    "check": "windows=2 sections=[elbo,consistency] sizes.consistency.scenes=1 sizes.consistency.samples=2",
+    "plan": "maximum_steps=3 planner.samples=8 video=false",
+}
+
+
+def commands(name: str) -> list[tuple[str, list[str]]]:
+    """The page's commands about one run, with words that shorten them."""
+    found = [(command, shlex.split(words)) for command, words in LINES if f"runs/{name}" in words]
+    return [(command, [*words, *SHORT[command].split()]) for command, words in found]
+
+
+def in_one_line(answer: Answer) -> str:
+    assert answer.status == 2, answer.errors
+    (line,) = answer.complaints
+    return line.removeprefix("error: ")
+
+
+def is_told(line: str) -> bool:
+    """Whether the page's table has the line, or its beginning."""
+    return any(
+        line == told or (told.endswith(FOLLOWS) and line.startswith(told.removesuffix(FOLLOWS))) for told in TOLD
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(pushes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder: the class of the page, and data."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    assert ROOT not in folder.parents
+    (folder / "my_lab.py").write_text("\n\n".join(CODE), encoding="utf-8")
+    shutil.copytree(pushes, folder / "data" / "pushes", ignore=shutil.ignore_patterns("features-*"))
+    return folder
+
+
+@pytest.mark.parametrize(("name", "most"), [("MyGuide", 30), ("MyPrior", 15)])
+def test_the_class_is_short(name: str, most: int) -> None:
+    (found,) = (
+        node for node in ast.parse("\n".join(CODE)).body if isinstance(node, ast.ClassDef) and node.name == name
+    )
+    assert found.end_lineno is not None and found.end_lineno - found.lineno + 1 <= most
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "expected"),
+    [("mine/", "MyGuide", ["check", "plan"]), ("mine-prior/", "MyPrior", ["plan"])],
+    ids=["guide", "prior"],
+)
+def test_the_commands_of_the_page_work_and_need_trust(
+    name: str, target: str, expected: list[str], folder: Path
+) -> None:
+    run = name.rstrip("/")
+    training = [words for command, words in commands(run) if command == "train" and f"output=runs/{run}" in words]
+    assert len(training) == 1
+    trained = run_command("train", *training[0], folder=folder)
+    assert trained.status == 0, trained.errors
+    using = commands(name)
+    assert [command for command, _ in using] == expected
+    for command, words in using:
+        refused = run_command(command, *[word for word in words if not word.startswith("trust=")], folder=folder)
+        line = in_one_line(refused)
+        assert f"runs/{run}/checkpoint.safetensors asks to run my_lab.{target}" in line
+        assert line.endswith("pass trust=[my_lab]")
+        assert is_told(line) or target != "MyGuide"
+        (output,) = (word.removeprefix("output=") for word in words if word.startswith("output="))
+        assert not (folder / output).exists()
+        done = run_command(command, *words, folder=folder)
+        assert done.status == 0, done.errors
+        assert done.complaints == []
+        assert any((folder / output).iterdir())
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["model=flat", "guide._target_=my_lab.HerGuide", "+guide.depth=3"],
+)
+def test_what_cannot_be_built_is_told_as_the_page_says(words: str, folder: Path) -> None:
+    ((_, line),) = (one for one in commands("mine") if one[0] == "train" and "output=runs/mine" in one[1])
+    told = in_one_line(run_command("train", *line, "output=runs/never", *words.split(), folder=folder))
+    assert is_told(told), told
+    assert not (folder / "runs" / "never").exists()
+
+
+def module_of(code: str) -> ModuleType:
+    module = ModuleType("my_lab")
+    exec(compile(code, "my_lab.py", "exec"), module.__dict__)
+    return module
+
+
+@pytest.fixture
+def window() -> Window:
+    mask = torch.ones(2, 4, 5, dtype=torch.bool)
+    state = State(torch.rand(2, 4, 5, 3), torch.nn.functional.normalize(torch.randn(2, 4, 5, 64), dim=-1), mask)
+    counted = torch.ones(2, 3, dtype=torch.bool)
+    return Window(state, torch.rand(2, 3, 4), counted, counted[:, 0])
+
+
+def test_the_guide_of_the_page_fits(window: Window) -> None:
+    model = CascadedModel(width=8)
+    check_pair(model, module_of(CODE[0]).MyGuide(model), window)
+
+
+SAMPLE = "with windows_plate(window), counted_sequences(window)"
+MISTAKES = {
+    "misspelt": {'pyro.sample("effect_code"': 'pyro.sample("efect_code"'},
+    "no plate": {SAMPLE: "with counted_sequences(window)"},
+    "not masked": {SAMPLE: "with windows_plate(window)"},
+    "wrong size": {
+        "model.effect_dimension *": "3 *",
+        "window.actions, effect_code)": "window.actions, effect_code.repeat(1, 6)[:, :16])",
+    },
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_sites_that_do_not_fit_are_told_as_the_page_says(mistake: str, window: Window) -> None:
+    code = CODE[0]
+    for right, wrong in MISTAKES[mistake].items():
+        assert right in code
+        code = code.replace(right, wrong)
+    model = CascadedModel(width=8)
+    with pytest.raises(UserError) as caught:
+        check_pair(model, module_of(code).MyGuide(model), window)
+    assert is_told(str(caught.value)), str(caught.value)
