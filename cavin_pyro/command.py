@@ -17,6 +17,7 @@ from typing import Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType
 from hydra.errors import HydraException, MissingConfigException
@@ -85,7 +86,14 @@ def compose(name: str, *words: str) -> DictConfig:
     """
     _check_words(name, list(words))
     with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
-        return _resolved(hydra.compose(name, overrides=list(words)))
+        config = hydra.compose(name, overrides=list(words), return_hydra_config=True)
+    hydra_config = HydraConfig.instance()
+    before = hydra_config.cfg
+    try:
+        hydra_config.set_config(config)  # as within a command: the default output names the planner that was chosen
+        return _resolved(OmegaConf.masked_copy(config, [str(name) for name in config if name != "hydra"]))
+    finally:
+        hydra_config.cfg = before
 
 
 def _run(body: Body, config: DictConfig) -> None:

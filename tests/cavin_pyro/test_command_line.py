@@ -207,6 +207,7 @@ def test_a_configuration_from_python_is_that_of_the_command() -> None:
     assert config.planner.samples == 8
     assert config.output == "runs/plan/clearing-0"  # nothing is left to be resolved
     assert "hydra" not in config
+    assert compose("evaluate", "planner=random").output == "runs/evaluate/crossing-sparse-3-random-0"
 
 
 def test_words_from_python_are_refused_as_on_the_command_line() -> None:

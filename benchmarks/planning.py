@@ -1,0 +1,209 @@
+"""What a plan costs: `python benchmarks/planning.py [--quick]`.
+
+Milliseconds per plan with the shipped checkpoint, the floating-point operations in it, and the share of this machine's
+own rate of matrix products that planning reaches; then the flat problem (30 pushes searched at once, the same dynamics,
+reward and samples) for our MPC and for two public planners, in turn. Crossing, sparse, horizon 30, T = 3. Wall time;
+set OMP_NUM_THREADS for the number of threads. The public planners are in the extra `benchmarks`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # this file would hide `planning`
+
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from cavin_pyro.command import compose
+from cavin_pyro.episodes import observed_state
+from cavin_pyro.setups import Setup, set_up
+from models.state import State
+from planning import Planner
+
+HORIZON, SEGMENT = 30, 3
+FEATURES = 64
+
+
+def setup(objects: int, samples: int, *words: str) -> Setup:
+    shared = ["task=crossing", f"objects={objects}", f"planner.samples={samples}", f"planner.horizon={HORIZON}"]
+    return set_up(compose("evaluate", *words, *shared))
+
+
+def scenes(one: Setup, count: int) -> State:
+    """`count` scenes as the camera sees them: [count, M, ...]."""
+    states = [observed_state(one.env.reset(seed=seed)[0], one.pointnet) for seed in range(count)]
+    return State(*(torch.cat(field) for field in zip(*states, strict=True)))
+
+
+def generators(count: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in range(count)]
+
+
+def milliseconds(actions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, float]:
+    """Median wall time of each action, all of them in turn, so that what else the machine does falls on all."""
+    times: dict[str, list[float]] = {name: [] for name in actions}
+    for repetition in range(repetitions + 1):
+        for name, action in actions.items():
+            began = time.perf_counter()
+            action()
+            if repetition:  # the first warms up
+                times[name].append(1e3 * (time.perf_counter() - began))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def planning(planner: Planner, state: State) -> Callable[[], object]:
+    return lambda: planner.plan(state, generators(len(state.centers)))
+
+
+def matrix_rate() -> float:
+    """Floating-point operations per second of one large product in float32."""
+    size = 2048
+    left, right = torch.rand(size, size), torch.rand(size, size)
+    best = min(milliseconds({"product": lambda: left @ right}, 1)["product"] for _ in range(5))
+    return 2 * size**3 / (best / 1e3)
+
+
+def operations(action: Callable[[], object]) -> int:
+    with FlopCounterMode(display=False) as counter:
+        action()
+    return counter.get_total_flops()
+
+
+def grid(samples: list[int], objects: list[int], batches: list[int], repetitions: int) -> None:
+    rate = matrix_rate()
+    threads = torch.get_num_threads()
+    print(f"{threads} thread(s); matrix products reach {rate / 1e9:.0f} GFLOP/s")
+    print("samples  objects  batch   ms per plan   GFLOP per plan   share of the matrix rate")
+    for count in samples:
+        for number in objects:
+            one = setup(number, count)
+            for batch in batches:
+                action = planning(one.planner, scenes(one, batch))
+                work = operations(action) / batch
+                spent = milliseconds({"plan": action}, repetitions)["plan"] / batch
+                share = work / (spent / 1e3) / rate
+                print(
+                    f"{count:7d}  {number:7d}  {batch:5d}   {spent:11.1f}   {work / 1e9:14.2f}   {share:24.2f}",
+                    flush=True,
+                )
+            one.env.close()
+
+
+class FlatProblem:
+    """f and the reward as functions of a flat state `[..., M * 67]`, as the public planners want them."""
+
+    def __init__(self, one: Setup, state: State) -> None:
+        self.model, self.reward, self.mask = one.planner.model, one.planner.reward, state.mask[0]  # type: ignore[attr-defined]
+        self.objects = state.objects
+        self.start = torch.cat((state.centers[0], state.features[0]), -1).flatten()
+
+    def unpack(self, flat: Tensor) -> State:
+        parts = flat.unflatten(-1, (self.objects, 3 + FEATURES))
+        return State(parts[..., :3], parts[..., 3:], self.mask.expand(parts.shape[:-1]))
+
+    def step(self, flat: Tensor, action: Tensor) -> Tensor:
+        after = self.model.next_state(self.unpack(flat), action)
+        return torch.cat((after.centers, after.features), -1).flatten(-2)
+
+    def rewards(self, before: Tensor, after: Tensor) -> Tensor:
+        state = self.unpack(after)
+        return self.reward(self.unpack(before).centers, state.centers, state.mask).reward
+
+
+def mppi_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
+    from pytorch_mppi import MPPI
+
+    planner = MPPI(
+        problem.step,
+        # Its costs see one state; the reward of a sparse task needs no other.
+        lambda flat, action: -problem.rewards(flat, flat),
+        len(problem.start),
+        torch.eye(4) * 0.25,
+        num_samples=samples,
+        horizon=HORIZON,
+        lambda_=1.0,
+        u_min=-torch.ones(4),
+        u_max=torch.ones(4),
+    )
+    return lambda: planner.command(problem.start)
+
+
+def cem_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
+    from tensordict import TensorDict
+    from tensordict.nn import TensorDictModule, TensorDictSequential
+    from torchrl.data import Bounded, Composite, Unbounded
+    from torchrl.envs.model_based import ModelBasedEnvBase
+    from torchrl.modules import CEMPlanner
+
+    class World(ModelBasedEnvBase):
+        def __init__(self) -> None:
+            model = TensorDictSequential(
+                TensorDictModule(problem.step, in_keys=["state", "action"], out_keys=["after"]),
+                TensorDictModule(
+                    lambda before, after: problem.rewards(before, after).unsqueeze(-1),
+                    in_keys=["state", "after"],
+                    out_keys=["reward"],
+                ),
+                TensorDictModule(lambda after: after, in_keys=["after"], out_keys=["state"]),
+            )
+            super().__init__(model, device="cpu", batch_size=[])
+            self.observation_spec = Composite(state=Unbounded((len(problem.start),)))
+            self.state_spec = Composite(state=Unbounded((len(problem.start),)))
+            self.action_spec = Bounded(-1.0, 1.0, (4,))
+            self.reward_spec = Unbounded((1,))
+
+        def _reset(self, tensordict: TensorDict) -> TensorDict:
+            return TensorDict({"state": problem.start.clone()}, batch_size=[])
+
+        def _set_seed(self, seed: int | None) -> None:
+            torch.manual_seed(seed or 0)
+
+    world = World()
+    planner = CEMPlanner(
+        world, planning_horizon=HORIZON, optim_steps=1, num_candidates=samples, top_k=max(1, samples // 10)
+    )
+    start = world.reset()
+    return lambda: planner(start.clone())
+
+
+def flat(samples: list[int], repetitions: int) -> None:
+    print("the flat problem, 3 objects: ms per plan")
+    for count in samples:
+        one = setup(3, count, "planner=mpc")
+        problem = FlatProblem(one, scenes(one, 1))
+        with torch.inference_mode():
+            spent = milliseconds(
+                {
+                    "ours": planning(one.planner, scenes(one, 1)),
+                    "pytorch_mppi": mppi_planner(problem, count),
+                    "torchrl CEM": cem_planner(problem, count),
+                },
+                repetitions,
+            )
+        figures = ", ".join(f"{name} {value:.1f}" for name, value in spent.items())
+        ratios = ", ".join(f"{spent[name] / spent['ours']:.2f}" for name in ("pytorch_mppi", "torchrl CEM"))
+        print(f"{count:7d} samples: {figures}; theirs over ours {ratios}", flush=True)
+        one.env.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a small part, to see that it runs")
+    parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
+    quick, no_flat = (vars(parser.parse_args())[name] for name in ("quick", "no_flat"))
+    if quick:
+        grid([32], [2], [1, 2], 2)
+    else:
+        grid([256, 1024, 8192], [1, 3, 5], [1, 16], 10)
+    if not no_flat:
+        flat([32] if quick else [1024, 8192], 2 if quick else 5)
+
+
+if __name__ == "__main__":
+    main()
