@@ -35,10 +35,10 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
     if not path.exists():
         return
     try:
-        earlier = _flat(OmegaConf.to_container(OmegaConf.load(path)))
+        earlier = flat_words(OmegaConf.to_container(OmegaConf.load(path)))
     except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
         raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
-    now = _flat(OmegaConf.to_container(config, resolve=True))
+    now = flat_words(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
         if name not in ignore and now.get(name) != earlier.get(name):
             raise UserError(
@@ -47,10 +47,11 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
             )
 
 
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+def flat_words(value: Any, prefix: str = "") -> dict[str, Any]:
+    """A configuration's values by their words: {"a": {"b": 1}} -> {"a.b": 1}."""
     if not isinstance(value, dict):
         return {prefix.rstrip("."): value}
     flat: dict[str, Any] = {}
     for name, entry in value.items():
-        flat |= _flat(entry, f"{prefix}{name}.")
+        flat |= flat_words(entry, f"{prefix}{name}.")
     return flat
