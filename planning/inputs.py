@@ -34,6 +34,12 @@ def check_weight(name: str, value: float) -> None:
         raise ValueError(f"{name} must be zero or a positive number, not {value}")
 
 
+def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
+    """Raise ValueError unless a number lies between 0 and 1; `positive` excludes 0."""
+    if not (0 <= value <= 1) or (positive and value == 0):
+        raise ValueError(f"{name} must be {'above 0 and at most 1' if positive else 'between 0 and 1'}, not {value}")
+
+
 def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
     """Raise ValueError unless `state` is a batch `[B]` with one generator per environment, on its device."""
     centers = state.centers
