@@ -58,8 +58,9 @@ class StrideLimits:
 
     def __init__(self, reward: RewardFunction, limits: Sequence[float], *, of: str) -> None:
         """`limits`: shortest and longest, in metres. Raises ValueError unless they are two, in order, not negative."""
-        if len(limits) != 2 or not 0 <= limits[0] < limits[1]:
-            raise ValueError(f"stride_limits must be two distances in metres, low then high, not {list(limits)}")
+        numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
+        if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
+            raise ValueError(f"stride_limits must be two distances in metres, low then high, not {limits}")
         self.reward, self.of = reward, of
         self.shortest, self.longest = limits
 
