@@ -33,7 +33,7 @@ def share(samples: int, iterations: int, number: int) -> int:
     """
     if samples < iterations:
         raise ValueError(
-            f"{iterations} iterations need at least as many samples, not {samples}: give more or iterate less"
+            f"{iterations} iterations need at least as many samples, not {samples}"
         )
     return samples // iterations + (number < samples % iterations)
 
