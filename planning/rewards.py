@@ -72,7 +72,7 @@ class StrideLimits:
         else:
             whole = self._outside(previous[..., 0, :, :], centers[..., -1, :, :], mask[..., -1, :])
             outside = torch.zeros_like(outcome.failure)
-            outside[..., -1] = whole
+            outside[..., 0] = whole  # from its first step on: nothing counts on the way to where nothing gets
         outside = outside & ~outcome.failure
         return Judgement(
             torch.where(outside, STRIDE_PENALTY, outcome.reward),

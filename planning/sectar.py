@@ -66,8 +66,11 @@ class SectarPlanner:
         generate: Any = self.model.actions  # of a model whose g reads no motion code
         actions = generate(here, effects.codes[:, :1])
         _, path = follow(self.model, here, actions)
-        if not bool(torch.isfinite(actions).all()):
-            raise ValueError("the pushes of the chosen effect are not finite: check the model's weights")
+        broken = (~torch.isfinite(actions).flatten(1).all(-1)).nonzero().flatten().tolist()
+        if broken:
+            raise ValueError(
+                f"environment {broken[0]}: the pushes of the chosen effect are not finite; check the model's weights"
+            )
         return Plan(
             actions=actions[:, 0],
             planned_actions=actions[:, 0],

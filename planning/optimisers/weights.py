@@ -32,9 +32,7 @@ def share(samples: int, iterations: int, number: int) -> int:
     Raises ValueError if there are fewer samples than iterations.
     """
     if samples < iterations:
-        raise ValueError(
-            f"{iterations} iterations need at least as many samples, not {samples}"
-        )
+        raise ValueError(f"{iterations} iterations need at least as many samples, not {samples}")
     return samples // iterations + (number < samples % iterations)
 
 
