@@ -75,7 +75,7 @@ class CavinPlanner:
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        self.optimiser = make_optimiser(optimizer, optimizer_options)
+        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
         limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="segments")
         self.effect_score = CumulativeReward(limited, reward_at)
         self.model = model

@@ -45,7 +45,7 @@ class PushSearch:
         """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
-        self.optimiser = make_optimiser(optimizer, optimizer_options)
+        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
         limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="pushes")
         self.score = CumulativeReward(limited, reward_at)
         self.level, self.model = level, model

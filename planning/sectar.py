@@ -47,7 +47,7 @@ class SectarPlanner:
     ) -> None:
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
-        self.optimiser = make_optimiser(optimizer, optimizer_options)
+        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
         limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="segments")
         self.score = CumulativeReward(limited, reward_at)
         self.model = model

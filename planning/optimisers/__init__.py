@@ -17,10 +17,15 @@ from planning.optimisers.improved_cross_entropy import ImprovedCrossEntropy
 from planning.optimisers.path_integral import PathIntegral
 from planning.optimisers.sequential_monte_carlo import SequentialMonteCarlo
 from planning.optimisers.shooting import Shooting
+from planning.optimisers.weights import share
 
 
 class Optimiser(Protocol):
     """Anything that searches."""
+
+    @property
+    def iterations(self) -> int:
+        """How many times at least one sample is needed."""
 
     def optimise(self, search: Search, samples: int) -> Candidates:
         """At most N = `samples` whole plans `[B, n]`, or the work of so many."""
@@ -35,10 +40,11 @@ OPTIMISERS: dict[str, type] = {
 }
 
 
-def make_optimiser(name: str, options: Mapping[str, Any] | None = None) -> Optimiser:
+def make_optimiser(name: str, options: Mapping[str, Any] | None = None, *, samples: int) -> Optimiser:
     """The optimiser of that name (the word `planner.optimizer`), with options of its own.
 
-    Raises ValueError, naming the valid ones, for an unknown name or option, and for a value out of its range.
+    Raises ValueError, naming the valid ones, for an unknown name or option, and for a value out of its range or
+    too few samples.
     """
     if name not in OPTIMISERS:
         raise ValueError(f"unknown optimizer '{name}': choose from {', '.join(OPTIMISERS)}")
@@ -47,9 +53,11 @@ def make_optimiser(name: str, options: Mapping[str, Any] | None = None) -> Optim
         if option not in known:
             raise ValueError(f"unknown option '{option}' of optimizer {name}: valid are {', '.join(known)}")
     try:
-        return OPTIMISERS[name](**(options or {}))
+        optimiser: Optimiser = OPTIMISERS[name](**(options or {}))
     except TypeError as error:
         raise ValueError(f"optimizer {name}: an option is of the wrong kind ({error})") from error
+    share(samples, optimiser.iterations, 0)
+    return optimiser
 
 
 __all__ = [

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -33,6 +34,7 @@ class SequentialMonteCarlo:
     Raises ValueError for a block below 1, fewer than 0 moves and fractions outside of their range.
     """
 
+    iterations: ClassVar[int] = 1
     effective: float = 0.3
     moves: int = 1
     block: int = 2

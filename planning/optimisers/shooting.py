@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from planning.candidates import Candidates, Search
 from planning.replacement import draw_parents
@@ -15,6 +16,7 @@ class Shooting:
     replacement: false leaves the dead as they are.
     """
 
+    iterations: ClassVar[int] = 1
     replacement: bool = True
 
     def optimise(self, search: Search, samples: int) -> Candidates:

@@ -29,7 +29,7 @@ def search(toy: SimpleNamespace, *seeds: int, segments: int = 3) -> Search:
 
 
 def optimised(toy: SimpleNamespace, name: str, *seeds: int, segments: int = 3, samples: int = SAMPLES) -> Candidates:
-    return make_optimiser(name).optimise(search(toy, *seeds, segments=segments), samples)
+    return make_optimiser(name, samples=SAMPLES).optimise(search(toy, *seeds, segments=segments), samples)
 
 
 def test_every_optimiser_has_a_tolerance() -> None:
@@ -64,7 +64,7 @@ def test_no_optimiser_considers_more_than_its_samples(toy: SimpleNamespace, name
                 return super().extend(segment, here, plans, *rest)
 
         problem = search(toy, 0, segments=segments)
-        make_optimiser(name).optimise(replace(problem, level=Counting()), 100)
+        make_optimiser(name, samples=SAMPLES).optimise(replace(problem, level=Counting()), 100)
         assert 0 < sum(asked) <= 100 * segments
 
 
@@ -93,7 +93,7 @@ def test_returns_that_are_not_finite_do_no_harm(toy: SimpleNamespace, name: str)
 
     problem = search(toy, 0, 1, segments=2)
     problem = replace(problem, score=CumulativeReward(Broken(TOP)))
-    found = make_optimiser(name).optimise(problem, SAMPLES)
+    found = make_optimiser(name, samples=SAMPLES).optimise(problem, SAMPLES)
     assert ((-found.returns.max(-1).values / 2).sqrt() < TOLERANCE[name]).all()
 
 
@@ -106,7 +106,7 @@ def test_where_nothing_is_finite_there_is_no_surprise(toy: SimpleNamespace, name
 
     problem = search(toy, 0, segments=2)
     problem = replace(problem, score=CumulativeReward(Nothing(TOP)))
-    assert (make_optimiser(name).optimise(problem, 64).returns == -torch.inf).all()
+    assert (make_optimiser(name, samples=SAMPLES).optimise(problem, 64).returns == -torch.inf).all()
 
 
 @each_optimiser
@@ -165,11 +165,11 @@ def test_an_optimiser_works_in_one_level(toy: SimpleNamespace, kind: type, name:
 )
 def test_bad_options_are_one_clear_line(name: str, options: dict, message: str) -> None:
     with pytest.raises(ValueError) as error:
-        make_optimiser(name, options)
+        make_optimiser(name, options, samples=SAMPLES)
     assert str(error.value) == message
 
 
 @pytest.mark.parametrize("name", ["cem", "icem", "mppi"])
-def test_fewer_samples_than_iterations_are_refused(toy: SimpleNamespace, name: str) -> None:
+def test_fewer_samples_than_iterations_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="^4 iterations need at least as many samples, not 3$"):
-        optimised(toy, name, 0, samples=3)
+        make_optimiser(name, samples=3)
