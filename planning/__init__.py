@@ -12,6 +12,7 @@ from planning.plan import Plan
 from planning.proposals import PushBox
 from planning.protocol import Outcome, Planner, PlanningModel, RewardFunction
 from planning.random_pushes import RandomPlanner
+from planning.reachability import Reachability
 from planning.robustness import Robustness
 from planning.sectar import SectarPlanner
 
@@ -26,6 +27,7 @@ __all__ = [
     "PlanningModel",
     "PushBox",
     "RandomPlanner",
+    "Reachability",
     "RewardFunction",
     "Robustness",
     "SectarPlanner",

@@ -16,6 +16,7 @@ from planning.motions import Closeness, choose_motions
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
+from planning.reachability import Reachability, most_reachable
 from planning.rewards import CumulativeReward, StrideLimits
 from planning.robustness import Robustness
 
@@ -46,6 +47,8 @@ class CavinPlanner:
         paper's text.
     robustness: our addition to line 10, how the best motions are tried again with displaced pushes; None to take
         the best at its word, as in the paper.
+    reachability: our addition to line 7, how the best effects are scored again by what motions do for them; None to
+        take h at its word, as in the paper.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
     `reward_at`, limits out of order, and a `feature_weight` that is negative or not finite.
@@ -69,6 +72,7 @@ class CavinPlanner:
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
         robustness: Robustness | None = None,
+        reachability: Reachability | None = None,
     ) -> None:
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
@@ -86,6 +90,7 @@ class CavinPlanner:
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
         self.robustness = robustness
+        self.reachability = reachability
 
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
@@ -99,7 +104,11 @@ class CavinPlanner:
         check_scenes(state, generators)  # line 4: the new s_t
         # Lines 5 to 7: choose the effect codes c* and their subgoals.
         what = Search(EffectLevel(self.model), self.effect_score, state, generators, self.segments)
-        effects = choose_effects(self.optimiser.optimise(what, self.samples))
+        plans = self.optimiser.optimise(what, self.samples)
+        chosen = None  # the highest return, as h predicts it
+        if self.reachability is not None:
+            chosen = most_reachable(self.reachability, plans, self.model, self.reward)
+        effects = choose_effects(plans, chosen)
         # Lines 8 to 10: choose the motion codes z* and their actions.
         closeness = Closeness(
             effects, self.reward, feature_weight=self.feature_weight, avoid_failures=self.avoid_failures

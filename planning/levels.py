@@ -33,10 +33,7 @@ class EffectLevel:
         """See `planning.candidates.Level`."""
         # Line 5, a segment at a time: a learned prior p(c | s) has to see the state that it goes on from.
         code = _codes(self.model.effect_prior, [plans], noise, generators)
-        # Line 6: predict the subgoals with h, recursively, and interpolate the states between them.
-        subgoal = self.model.subgoal(here, code).expand(plans.batch_shape)
-        path = returns.interpolate(plans.centers, subgoal.centers, self.model.segment_length)
-        return Stretch(code, None, subgoal, path)
+        return predicted_effect(self.model, here, plans, code)
 
 
 class MotionLevel:
@@ -96,6 +93,15 @@ class PushLevel:
             path.append(step)
         actions = torch.cat(pushes, -2)
         return Stretch(actions.flatten(-2), actions, plans, torch.cat(path, -3))
+
+
+def predicted_effect(model: PlanningModel, here: State, plans: State, code: Tensor) -> Stretch:
+    """Line 6: predict the subgoals with h, recursively, and interpolate the states between them.
+
+    `here`: `plans: [B, n]`, or `[B, 1]` where all are in one state; `code: [B, n, C]`.
+    """
+    subgoal = model.subgoal(here, code).expand(plans.batch_shape)
+    return Stretch(code, None, subgoal, returns.interpolate(plans.centers, subgoal.centers, model.segment_length))
 
 
 def _dimension(prior: Callable[..., Distribution], conditions: Sequence[State | Tensor]) -> int:
