@@ -72,21 +72,21 @@ def test_every_planner_plans_with_every_optimiser(
         ("cavin", "planner.reward_at=subgoals"),
         ("cavin", "planner.stride_limits=[0.1,0.3]"),
         ("cavin", "planner.optimizer_options={replacement:false}"),
+        ("cavin", "planner.reachability={_target_:planning.Reachability}"),
         ("mpc", "planner.stride_limits=[0.01,0.15]"),
         ("mpc", "planner.proposal=heuristic"),
     ],
 )
 def test_options_take_effect(planner: str, word: str) -> None:
-    returns = []
+    plans = []
     for words in ([], [word]):
         overrides = [f"planner={planner}", *SMALL, "planner.samples=64", *words, "output=unused"]
         with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
             parts = set_up(hydra.compose("evaluate", overrides=overrides))  # the shipped checkpoint knows something
-        returns.append(
-            run_episode(parts.env, parts.planner, parts.pointnet, seed=1).decisions[0].plan.candidate_returns
-        )
+        plans.append(run_episode(parts.env, parts.planner, parts.pointnet, seed=1).decisions[0].plan)
         parts.env.close()
-    assert not torch.equal(*returns)
+    returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
+    assert not (torch.equal(*returns) and torch.equal(*actions))
 
 
 @pytest.mark.parametrize("model", MODELS)
