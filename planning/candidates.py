@@ -11,6 +11,7 @@ from torch import Tensor
 
 from models.state import State
 from planning import fields
+from planning.replacement import draw_parents
 from planning.sampling import noise_each
 from planning.segments import Level, Score, Segment, Stretch
 
@@ -39,11 +40,26 @@ class Search:
         """Standard normal noise of `count` whole plans, with every environment's own generator: `[B, n, K, D]`."""
         return noise_each((count, self.segments, self.dimension), self.generators)
 
-    def evaluate(self, noise: Tensor) -> Candidates:
-        """The whole plans that `noise: [B, n, K, D]` stands for; their returns are `candidates.returns: [B, n]`."""
-        candidates = self.begin(noise.shape[1])
-        for segment in noise.unbind(2):
+    def draw(self, count: int, *, replacement: bool) -> Candidates:
+        """n = `count` whole plans, drawn from the prior a segment at a time. For `replacement` see `evaluate`."""
+        return self._whole(count, [None] * self.segments, replacement)
+
+    def evaluate(self, noise: Tensor, *, replacement: bool = False) -> Candidates:
+        """The plans that `noise: [B, n, k, D]` stands for; their returns are `candidates.returns: [B, n]`.
+
+        With `replacement` plans that die before the last segment become copies of living ones, and go on with the
+        noise that was theirs (section 3.2); `candidates.noise` tells what has become of them.
+        """
+        return self._whole(noise.shape[1], noise.unbind(2), replacement)
+
+    def _whole(self, count: int, noise: Sequence[Tensor | None], replacement: bool) -> Candidates:
+        candidates = self.begin(count)
+        for number, segment in enumerate(noise, 1):
             candidates = candidates.extend(segment)
+            standing = candidates.standing
+            # After the last segment nobody goes on in the place of the dead.
+            if replacement and number < len(noise) and bool(standing.failed.any()):
+                candidates = candidates.take(draw_parents(standing.failed, standing.active, self.generators))
         return candidates
 
 

@@ -19,7 +19,8 @@ class CrossEntropy:
     """Draws around the best of the last draws, beginning with the prior.
 
     iterations: the samples are shared among them. elites: fraction of an iteration's candidates that the next
-    one is drawn around. inertia: weight of the last mean and scale in the next.
+    one is drawn around. inertia: weight of the last mean and scale in the next. replacement: whether plans that
+    die become copies of living ones, as in shooting.
 
     Raises ValueError for counts below 1 and fractions outside of their range.
     """
@@ -27,6 +28,7 @@ class CrossEntropy:
     iterations: int = 4
     elites: float = 0.1
     inertia: float = 0.1
+    replacement: bool = False
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
@@ -44,9 +46,9 @@ class CrossEntropy:
                 noise = mean + scale * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
-            candidates = search.evaluate(noise)
+            candidates = search.evaluate(noise, replacement=self.replacement)
             considered.append(candidates)
-            elites = best(Tried(noise, candidates.returns), max(1, round(self.elites * count)))
+            elites = best(Tried(candidates.noise, candidates.returns), max(1, round(self.elites * count)))
             mean, scale = refit(elites, mean, scale, self.inertia)
         return join(considered)
 

@@ -22,8 +22,8 @@ class ImprovedCrossEntropy:
     candidate of the last. Not: elites carried over from the last plan, for a plan here depends on its own state and
     seed only.
 
-    iterations, elites, inertia: as `CrossEntropy`. kept: fraction of the elites that compete again. exponent: the
-    noise's power falls as frequency^-exponent; 0 is white, 2 makes neighbouring segments alike.
+    iterations, elites, inertia, replacement: as `CrossEntropy`. kept: fraction of the elites that compete again.
+    exponent: the noise's power falls as frequency^-exponent; 0 is white, 2 makes neighbouring segments alike.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -33,6 +33,7 @@ class ImprovedCrossEntropy:
     inertia: float = 0.1
     kept: float = 0.3
     exponent: float = 0.5
+    replacement: bool = False
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
@@ -53,10 +54,10 @@ class ImprovedCrossEntropy:
                 noise = mean + scale * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
-            candidates = search.evaluate(noise)
+            candidates = search.evaluate(noise, replacement=self.replacement)
             considered.append(candidates)
             wanted = max(1, round(self.elites * count))
-            tried = Tried(noise, candidates.returns)
+            tried = Tried(candidates.noise, candidates.returns)
             if elites is not None:  # predictions repeat exactly: elites compete again at no cost
                 tried = fields.join([best(elites, round(self.kept * wanted)), tried])
             elites = best(tried, wanted)

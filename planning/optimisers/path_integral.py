@@ -18,7 +18,7 @@ class PathIntegral:
 
     iterations: the samples are shared among them. temperature: in units of the return; None for the one at
     which the weights' effective size is `effective` of the candidates, whatever the returns' range. shrink: factor
-    from one iteration's scale to the next's.
+    from one iteration's scale to the next's. replacement: as `CrossEntropy`.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -27,6 +27,7 @@ class PathIntegral:
     temperature: float | None = None
     effective: float = 0.05
     shrink: float = 0.6
+    replacement: bool = False
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
@@ -44,7 +45,7 @@ class PathIntegral:
                 noise = mean + self.shrink**number * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
-            candidates = search.evaluate(noise)
+            candidates = search.evaluate(noise, replacement=self.replacement)
             considered.append(candidates)
             if self.temperature is None:
                 _, logarithms = adapt_temperature(candidates.returns, self.effective)
@@ -54,5 +55,5 @@ class PathIntegral:
             weights = torch.softmax(logarithms, -1).nan_to_num(0.0)[..., None, None]
             old = torch.zeros_like(noise[:, :1]) if mean is None else mean
             found = (weights > 0).any(1, keepdim=True)
-            mean = torch.where(found, (weights * noise).sum(1, keepdim=True), old)
+            mean = torch.where(found, (weights * candidates.noise).sum(1, keepdim=True), old)
         return join(considered)

@@ -152,7 +152,11 @@ def test_an_optimiser_works_in_one_level(toy: SimpleNamespace, kind: type, name:
     ("name", "options", "message"),
     [
         ("best", {}, "unknown optimizer 'best': choose from shooting, cem, icem, mppi, smc"),
-        ("cem", {"elite": 3}, "unknown option 'elite' of optimizer cem: valid are iterations, elites, inertia"),
+        (
+            "cem",
+            {"elite": 3},
+            "unknown option 'elite' of optimizer cem: valid are iterations, elites, inertia, replacement",
+        ),
         ("cem", {"iterations": 0}, "iterations must be at least 1, not 0"),
         ("cem", {"elites": 0}, "elites must be above 0 and at most 1, not 0"),
         ("icem", {"kept": 2}, "kept must be between 0 and 1, not 2"),
@@ -173,3 +177,16 @@ def test_bad_options_are_one_clear_line(name: str, options: dict, message: str) 
 def test_fewer_samples_than_iterations_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="^4 iterations need at least as many samples, not 3$"):
         make_optimiser(name, samples=3)
+
+
+@pytest.mark.parametrize("name", sorted(OPTIMISERS.keys() - {"smc"}))
+def test_dead_plans_are_replaced_if_so_wanted(toy: SimpleNamespace, name: str) -> None:
+    reward = CumulativeReward(toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=0.0))
+    for replacement in (False, True):
+        problem = replace(search(toy, 0, 1, segments=4), score=reward)
+        optimiser = make_optimiser(name, {"replacement": replacement}, samples=100)
+        found = optimiser.optimise(problem, 100)
+        died_before = (found.history(lambda segment: segment.stretch.states.centers)[:, :, :3, 0, 1] < 0).any(-1)
+        assert died_before.any() != replacement
+        if name != "shooting":  # what has become of plans is what their noise says
+            assert torch.equal(problem.evaluate(found.noise).returns, found.returns)
