@@ -152,11 +152,7 @@ def test_an_optimiser_works_in_one_level(toy: SimpleNamespace, kind: type, name:
     ("name", "options", "message"),
     [
         ("best", {}, "unknown optimizer 'best': choose from shooting, cem, icem, mppi, smc"),
-        (
-            "cem",
-            {"elite": 3},
-            "unknown option 'elite' of optimizer cem: valid are iterations, elites, inertia, replacement",
-        ),
+        ("smc", {"steps": 3}, "unknown option 'steps' of optimizer smc: valid are effective, moves, block, step"),
         ("cem", {"iterations": 0}, "iterations must be at least 1, not 0"),
         ("cem", {"elites": 0}, "elites must be above 0 and at most 1, not 0"),
         ("icem", {"kept": 2}, "kept must be between 0 and 1, not 2"),
