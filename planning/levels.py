@@ -13,7 +13,7 @@ from planning import returns
 from planning.following import follow
 from planning.proposals import Proposal
 from planning.protocol import PlanningModel
-from planning.sampling import codes_each, noise_each, sample_each
+from planning.sampling import codes_each, dimension_of, noise_each, sample_each
 from planning.segments import Stretch
 
 
@@ -25,7 +25,7 @@ class EffectLevel:
 
     def dimension(self, state: State) -> int:
         """C; `state: [B]`."""
-        return _dimension(self.model.effect_prior, [state.expand_plans(1)])
+        return dimension_of(self.model.effect_prior, [state.expand_plans(1)])
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
@@ -47,7 +47,7 @@ class MotionLevel:
 
     def dimension(self, state: State) -> int:
         """Z; `state: [B]`."""
-        return _dimension(self.model.motion_prior, [state.expand_plans(1), *self._effects(0, 1)])
+        return dimension_of(self.model.motion_prior, [state.expand_plans(1), *self._effects(0, 1)])
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
@@ -102,10 +102,6 @@ def predicted_effect(model: PlanningModel, here: State, plans: State, code: Tens
     """
     subgoal = model.subgoal(here, code).expand(plans.batch_shape)
     return Stretch(code, None, subgoal, returns.interpolate(plans.centers, subgoal.centers, model.segment_length))
-
-
-def _dimension(prior: Callable[..., Distribution], conditions: Sequence[State | Tensor]) -> int:
-    return prior(*conditions).event_shape[0]
 
 
 def _codes(

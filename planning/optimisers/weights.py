@@ -10,8 +10,8 @@ from torch import Tensor
 
 from planning import fields
 
-TEMPERATURES = 65  # inverse temperatures tried, evenly spaced in the logarithm
-RANGE = (1e-3, 1e4)  # of them, times the range of the returns
+TEMPERATURES = 97  # inverse temperatures tried, evenly spaced in the logarithm
+RANGE = (1e-3, 1e9)  # of them, times the range of the returns, which one violation can make a million times too wide
 
 
 class Tried(NamedTuple):

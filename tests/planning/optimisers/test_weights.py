@@ -45,6 +45,12 @@ def test_what_candidates_were_drawn_by_is_divided_out() -> None:
     torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
 
 
+def test_one_violation_does_not_hide_the_differences_among_the_others() -> None:
+    returns = torch.cat([torch.tensor([[-1e3]]), 1e-3 * torch.linspace(-1, 0, 99)[None]], -1)
+    _, logarithms = adapt_temperature(returns, 0.3)
+    assert 30 <= effective_size(logarithms) <= 50
+
+
 def test_equal_returns_weigh_the_same() -> None:
     _, logarithms = adapt_temperature(torch.full((1, 5), -30.0), 0.3)
     assert len(logarithms.unique()) == 1
