@@ -52,7 +52,7 @@ class PathIntegral:
             else:
                 logarithms = candidates.returns / self.temperature
             # Where no candidate counts the mean stays: all weights are zero.
-            weights = torch.softmax(logarithms, -1).nan_to_num(0.0)[..., None, None]
+            weights = torch.softmax(logarithms, -1).nan_to_num(0.0).to(noise.dtype)[..., None, None]
             old = torch.zeros_like(noise[:, :1]) if mean is None else mean
             found = (weights > 0).any(1, keepdim=True)
             mean = torch.where(found, (weights * candidates.noise).sum(1, keepdim=True), old)

@@ -56,7 +56,7 @@ class SequentialMonteCarlo:
         """All whole plans `[B, .]` that were considered, at most N = `samples` of them."""
         count = self.particles(samples, search.segments)
         particles = search.begin(count)
-        tempered = torch.zeros_like(particles.returns)  # log weights by which the particles have been drawn so far
+        tempered = torch.zeros_like(particles.returns).double()  # log weights by which they have been drawn
         considered: list[Candidates] = []
         for number in range(1, search.segments + 1):
             particles = particles.extend(noise_each((count, search.dimension), search.generators))
@@ -103,7 +103,7 @@ def living_returns(candidates: Candidates) -> Tensor:
 def _resample(logarithms: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
     """Numbers `[B, n]` of the plans to go on with, by systematic resampling; without weights everybody stays."""
     count = logarithms.shape[-1]
-    weights = torch.softmax(logarithms.double(), -1)
+    weights = torch.softmax(logarithms, -1)
     offsets = torch.stack([torch.rand(1, generator=source, device=source.device) for source in generators])
     places = (torch.arange(count, device=weights.device) + offsets.double()) / count
     numbers = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)

@@ -12,6 +12,7 @@ from planning import fields
 
 TEMPERATURES = 97  # inverse temperatures tried, evenly spaced in the logarithm
 RANGE = (1e-3, 1e9)  # of them, times the range of the returns, which one violation can make a million times too wide
+SAME = 1.05  # effective sizes that differ by less than this factor are the same
 
 
 class Tried(NamedTuple):
@@ -45,10 +46,14 @@ def effective_size(log_weights: Tensor) -> Tensor:
 def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The lowest temperature at which the weights keep `fraction` of the effective size, and the log weights.
 
+    Where many share the highest return, much lower temperatures weigh just the same: then the highest of those.
+
     Weights are exp(return / temperature), divided by `exp(before)` (`[B, n]`, zero by default), by which the
     candidates have been drawn already. returns: `[B, n]`, -inf for those that cannot count; the fraction is of the
-    others. Gives inverse temperatures `[B]` and log weights `[B, n]`, which are -inf where the returns are.
+    others. Gives inverse temperatures `[B]` and log weights `[B, n]`, which are -inf where the returns are, as
+    float64, for large returns at low temperatures leave little of float32.
     """
+    returns = returns.double()
     counts = torch.isfinite(returns)
     finite = torch.where(counts, returns, 0.0)
     highest = returns.masked_fill(~counts, -torch.inf).amax(-1, keepdim=True)
@@ -64,6 +69,8 @@ def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = 
     ranks = torch.arange(TEMPERATURES, device=returns.device)
     # Where no temperature keeps enough, the one that keeps most.
     number = torch.where(enough.any(-1), torch.where(enough, ranks, -1).amax(-1), sizes.argmax(-1))
+    weighs_the_same = enough & (sizes <= SAME * sizes.gather(-1, number.unsqueeze(-1)))
+    number = torch.where(weighs_the_same.any(-1), weighs_the_same.int().argmax(-1), number)
     chosen = inverse.gather(-1, number.unsqueeze(-1)).squeeze(-1)
     environments = torch.arange(len(returns), device=returns.device)
     return chosen, logarithms[environments, number]

@@ -34,15 +34,22 @@ def test_the_temperature_keeps_the_fraction_of_the_living_and_hardly_more(
     assert fraction * living <= size <= (fraction + 0.25) * living  # temperatures are tried on a grid
     assert (logarithms[:, :dead] == -INFINITE).all()
     expected = torch.softmax(inverse[:, None] * (returns - returns.max()), -1)
-    torch.testing.assert_close(torch.softmax(logarithms, -1), expected, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
 
 
 def test_what_candidates_were_drawn_by_is_divided_out() -> None:
     returns = torch.tensor([[0.0, -1.0, -2.0, -3.0]])
     before = 0.7 * returns
     inverse, logarithms = adapt_temperature(returns, 0.5, before=before)
-    expected = torch.softmax(inverse * returns - before, -1)
+    expected = torch.softmax(inverse * returns - before.double(), -1)
     torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
+
+
+def test_where_many_share_the_highest_return_the_temperature_is_no_lower_than_it_takes() -> None:
+    returns = torch.cat([torch.full((1, 50), 95.0), torch.full((1, 50), -6.0)], -1)
+    inverse, logarithms = adapt_temperature(returns, 0.3)
+    assert 50 <= effective_size(logarithms) <= 55
+    assert inverse < 10 / 101
 
 
 def test_one_violation_does_not_hide_the_differences_among_the_others() -> None:
