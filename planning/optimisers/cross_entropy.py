@@ -28,7 +28,7 @@ class CrossEntropy:
     iterations: int = 4
     elites: float = 0.1
     inertia: float = 0.1
-    replacement: bool = False
+    replacement: bool = True
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)

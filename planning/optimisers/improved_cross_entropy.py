@@ -33,7 +33,7 @@ class ImprovedCrossEntropy:
     inertia: float = 0.1
     kept: float = 0.3
     exponent: float = 0.5
-    replacement: bool = False
+    replacement: bool = True
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)

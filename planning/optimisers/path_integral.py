@@ -27,7 +27,7 @@ class PathIntegral:
     temperature: float | None = None
     effective: float = 0.05
     shrink: float = 0.6
-    replacement: bool = False
+    replacement: bool = True
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
