@@ -36,7 +36,7 @@ class CrossEntropy:
         check_fraction("inertia", self.inertia)
 
     def optimise(self, search: Search, samples: int) -> Candidates:
-        """All N = `samples` plans `[B, N]` that were considered; the last of them is the last mean."""
+        """All N = `samples` plans `[B, N]` that were considered; the last one is the last mean, unless that died."""
         mean = scale = None
         considered = []
         for number in range(self.iterations):

@@ -43,7 +43,7 @@ class ImprovedCrossEntropy:
         check_weight("exponent", self.exponent)
 
     def optimise(self, search: Search, samples: int) -> Candidates:
-        """All N = `samples` plans `[B, N]` that were considered; the last of them is the last mean."""
+        """All N = `samples` plans `[B, N]` that were considered; the last one is the last mean, unless that died."""
         mean = scale = None
         elites: Tried | None = None
         considered = []

@@ -37,7 +37,7 @@ class PathIntegral:
             raise ValueError(f"temperature must be a positive number or null, not {self.temperature}")
 
     def optimise(self, search: Search, samples: int) -> Candidates:
-        """All N = `samples` plans `[B, N]` that were considered; the last of them is the last mean."""
+        """All N = `samples` plans `[B, N]` that were considered; the last one is the last mean, unless that died."""
         mean, considered = None, []
         for number in range(self.iterations):
             noise = search.noise(share(samples, self.iterations, number))
