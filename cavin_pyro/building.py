@@ -94,7 +94,7 @@ def build_guide(config: Config, model: PyroModule) -> PyroModule:
         UserError: a guide that cannot be built, or does not fit the model; the guides that do are named.
     """
     check_sizes("guide", config["guide"])
-    fits = getattr(_class(config["guide"]), "fits", None)
+    fits = getattr(class_of(config["guide"]), "fits", None)
     if fits is not None and model.name not in fits:
         choices = ", ".join(_guides_for(model.name)) or "none of ours"
         raise UserError(
@@ -107,7 +107,7 @@ def build_guide(config: Config, model: PyroModule) -> PyroModule:
     return guide
 
 
-def _class(config: Config) -> Any:
+def class_of(config: Config) -> Any:
     """The class that a part names, None if there is no such class."""
     try:
         return hydra.utils.get_class(config["_target_"])
@@ -120,7 +120,7 @@ def _guides_for(model_name: str) -> list[str]:
     words = []
     for file in sorted((resources.files("cavin_pyro") / "conf" / "guide").iterdir(), key=lambda entry: entry.name):
         if file.name.endswith(".yaml"):
-            guide = _class(yaml.safe_load(file.read_text(encoding="utf-8")))
+            guide = class_of(yaml.safe_load(file.read_text(encoding="utf-8")))
             if model_name in getattr(guide, "fits", ()):
                 words.append(file.name.removesuffix(".yaml"))
     return words

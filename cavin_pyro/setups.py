@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyro
 import torch
 from omegaconf import DictConfig, OmegaConf
+from pyro.nn import PyroModule
 
-from cavin_pyro.building import build_model, construct, pointnet_of
+from cavin_pyro.building import build_model, class_of, construct, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
 from cavin_pyro.errors import UserError, at_least, check_seed, user_input
 from cavin_pyro.worlds import check_world, object_ranges
@@ -87,5 +89,23 @@ def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]
     model = build_model(checkpoint.config)
     checkpoint.load_into("model", model, path)
     model.requires_grad_(False).eval()
+    _check_planner(options, model, path)
     torch.manual_seed(config.seed)
     return construct(options, model=model, reward=reward), pointnet
+
+
+def _check_planner(options: dict[str, Any], model: PyroModule, path: Path) -> None:
+    """Make sure that the model has what the planner asks for, and no code that the planner would not choose.
+
+    Raises:
+        UserError: it has not; the model that has is named.
+    """
+    planner = class_of(options)
+    missing = [name for name in getattr(planner, "needs", ()) if not hasattr(model, name)]
+    superfluous = [name for name in getattr(planner, "lacks", ()) if hasattr(model, name)]
+    if missing or superfluous:
+        what = f"has no {' and no '.join(missing)}" if missing else f"has a {superfluous[0]} besides"
+        raise UserError(
+            f"{planner.__name__} needs a checkpoint of model={planner.usual_model}, but {path} holds "
+            f"{type(model).__name__}, which {what}; planner=random takes any"
+        )

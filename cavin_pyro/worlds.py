@@ -9,6 +9,8 @@ from omegaconf import DictConfig, OmegaConf
 from cavin_pyro.errors import UserError
 from envs.objects import ObjectRanges
 from envs.shapes import BUILTIN_NAMES
+from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
+from planning import PushBox
 
 CHOICES = {"robot": ("stick",), "objects": ("builtin",), "camera": ("ideal",), "segmentation": ("mask",)}
 
@@ -44,3 +46,8 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
         raise UserError(f"env.ranges.clearance must be at least 0 metres, not {ranges['clearance']}")
     scale, mass, friction = (tuple(ranges[name]) for name in ("scale", "mass", "friction"))
     return ObjectRanges(tuple(names), scale, mass, friction, ranges["clearance"])
+
+
+def push_box() -> PushBox:
+    """What normalised pushes mean on the table, for planners that propose pushes near objects."""
+    return PushBox(REACH_LOW, REACH_HIGH, MAXIMUM_MOTION)

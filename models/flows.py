@@ -40,6 +40,10 @@ class FlowDistribution(TorchDistribution):
     def sample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
         return self.flow.sample(torch.Size(sample_shape))  # without the density that `rsample` computes
 
+    def from_noise(self, noise: Tensor) -> Tensor:
+        """What standard normal `noise: [..., D]` becomes, where the base is N(0, I): `[..., D]`, for planners."""
+        return self.flow.transform.inv(noise)
+
     def rsample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
         self._drawn = self.flow.rsample_and_log_prob(torch.Size(sample_shape))
         return self._drawn[0]

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
 from models.state import State
-from planning.effects import plan_effects
-from planning.inputs import check_horizon, check_model, check_positive, check_scenes, check_weight
-from planning.motions import plan_motions
+from planning.candidates import Search
+from planning.effects import choose_effects
+from planning.inputs import check_horizon, check_positive, check_scenes, check_weight
+from planning.levels import EffectLevel, MotionLevel
+from planning.motions import Closeness, choose_motions
+from planning.optimisers import make_optimiser
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
+from planning.reachability import Reachability, most_reachable
+from planning.rewards import CumulativeReward, StrideLimits
 from planning.robustness import Robustness
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
@@ -24,6 +30,12 @@ class CavinPlanner:
     reward: the task.
     samples: N, at both levels.
     horizon: H steps, a multiple of the model's T.
+    optimizer: how codes are searched, at both levels: `shooting` (paper), `cem`, `icem`, `mppi` or `smc`, with
+        `optimizer_options` of its own (see `planning.optimisers`).
+    reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
+        implementation).
+    stride_limits: metres, two of them; a subgoal towards which every object moves less than the first, or any more
+        than the second, ends the plan as a violation does (published implementation: 0.1 and 0.3); None in the paper.
     motion_horizon: `full_horizon` plans motions for all K segments and compares them with all K subgoals
         (paper); `first_segment` plans and compares only what is executed before the next plan (published
         implementation).
@@ -35,10 +47,15 @@ class CavinPlanner:
         paper's text.
     robustness: our addition to line 10, how the best motions are tried again with displaced pushes; None to take
         the best at its word, as in the paper.
+    reachability: our addition to line 7, how the best effects are scored again by what motions do for them; None to
+        take h at its word, as in the paper.
 
-    Raises ValueError for a model that lacks one of these, counts below 1, a horizon that T does not divide, an
-    unknown `motion_horizon`, and a `feature_weight` that is negative or not finite.
+    Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
+    `reward_at`, limits out of order, and a `feature_weight` that is negative or not finite.
     """
+
+    needs = ("effect_prior", "motion_prior", "subgoal", "actions", "next_state")
+    usual_model = "cascaded"
 
     def __init__(
         self,
@@ -48,16 +65,23 @@ class CavinPlanner:
         horizon: int = 30,
         motion_horizon: str = "full_horizon",
         *,
+        optimizer: str = "shooting",
+        optimizer_options: Mapping[str, Any] | None = None,
+        reward_at: str = "path",
+        stride_limits: Sequence[float] | None = None,
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
         robustness: Robustness | None = None,
+        reachability: Reachability | None = None,
     ) -> None:
-        check_model(model)
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
+        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
+        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="segments")
+        self.effect_score = CumulativeReward(limited, reward_at)
         self.model = model
         self.reward = reward
         self.samples = samples
@@ -66,6 +90,7 @@ class CavinPlanner:
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
         self.robustness = robustness
+        self.reachability = reachability
 
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
@@ -77,21 +102,20 @@ class CavinPlanner:
         """
         # Lines 2, 3, 11 and 12 (repeat until the episode is done, execute, t = t + T) are the caller's.
         check_scenes(state, generators)  # line 4: the new s_t
-        effects = plan_effects(  # lines 5 to 7: choose the effect codes c* and their subgoals
-            self.model, self.reward, state, generators, samples=self.samples, segments=self.segments
+        # Lines 5 to 7: choose the effect codes c* and their subgoals.
+        what = Search(EffectLevel(self.model), self.effect_score, state, generators, self.segments)
+        plans = self.optimiser.optimise(what, self.samples)
+        chosen = None  # the highest return, as h predicts it
+        if self.reachability is not None:
+            chosen = most_reachable(self.reachability, plans, self.model, self.reward)
+        effects = choose_effects(plans, chosen)
+        # Lines 8 to 10: choose the motion codes z* and their actions.
+        closeness = Closeness(
+            effects, self.reward, feature_weight=self.feature_weight, avoid_failures=self.avoid_failures
         )
-        motions = plan_motions(  # lines 8 to 10: choose the motion codes z* and their actions
-            self.model,
-            self.reward,
-            state,
-            effects,
-            generators,
-            samples=self.samples,
-            segments=self.motion_segments,
-            feature_weight=self.feature_weight,
-            avoid_failures=self.avoid_failures,
-            robustness=self.robustness,
-        )
+        how = Search(MotionLevel(self.model, effects.codes), closeness, state, generators, self.motion_segments)
+        sequences = self.optimiser.optimise(how, self.samples)
+        motions = choose_motions(sequences, self.model, closeness, self.robustness)
         return Plan(
             actions=motions.actions[:, : self.model.segment_length],
             planned_actions=motions.actions,

@@ -9,8 +9,6 @@ import torch
 
 from models.state import State
 
-CALLED = ("effect_prior", "motion_prior", "subgoal", "actions", "next_state")  # of a `PlanningModel`
-
 
 def check_positive(name: str, value: int) -> None:
     """Raise ValueError if a count is zero or negative."""
@@ -30,20 +28,16 @@ def check_horizon(horizon: int, segment_length: int) -> None:
         )
 
 
-def check_model(model: object) -> None:
-    """Raise ValueError, naming what is missing, unless a model has all that Algorithm 1 calls."""
-    missing = [name for name in CALLED if not hasattr(model, name)]
-    if missing:
-        raise ValueError(
-            f"{type(model).__name__} has no {' and no '.join(missing)}, which the planner calls: "
-            "planner=cavin needs a checkpoint of model=cascaded; planner=random takes any"
-        )
-
-
 def check_weight(name: str, value: float) -> None:
     """Raise ValueError unless a weight is finite and not negative."""
     if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"{name} must be zero or a positive number, not {value}")
+
+
+def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
+    """Raise ValueError unless a number lies between 0 and 1; `positive` excludes 0."""
+    if not (0 <= value <= 1) or (positive and value == 0):
+        raise ValueError(f"{name} must be {'above 0 and at most 1' if positive else 'between 0 and 1'}, not {value}")
 
 
 def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:

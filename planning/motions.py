@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,89 +9,118 @@ from torch import Tensor
 
 from models.state import State
 from planning import ranking, returns
+from planning.candidates import Candidates
 from planning.effects import EffectPlan
 from planning.protocol import PlanningModel, RewardFunction
+from planning.returns import Progress
 from planning.robustness import Robustness, try_again
-from planning.sampling import sample_each
+from planning.segments import Stretch, pushes_of
+
+FAILURE = 1e3  # square metres that a predicted failure costs an optimiser: more than any distance on the table
+
+
+class Aim(NamedTuple):
+    """How far sequences have kept from their subgoals; fields `[B, n]`."""
+
+    distance: Tensor  # square metres, summed over the segments
+    first_distance: Tensor  # of them, the executed segment's
+    sound: Tensor  # bool: all actions finite
+    failed_in_executed: Tensor  # bool
+    progress: Progress
+
+    @property
+    def returns(self) -> Tensor:
+        """`[B, n]` minus the distance, less where a failure is predicted, least where it is executed."""
+        costs = self.distance + FAILURE * (self.progress.failed.int() + self.failed_in_executed.int())
+        return torch.where(self.sound & torch.isfinite(costs), -costs, -torch.inf)
+
+    @property
+    def failed(self) -> Tensor:
+        """`[B, n]` bool: none, for Algorithm 1 replaces no motions."""
+        return torch.zeros_like(self.sound)
+
+    @property
+    def active(self) -> Tensor:
+        """`[B, n]` bool: all, for line 9 predicts whole sequences."""
+        return torch.ones_like(self.sound)
+
+
+class Closeness:
+    """Scores sequences of motions by how close they lead to the chosen subgoals (line 10).
+
+    Segments after the end of the chosen effect plan have nothing to aim at, and do not count. For the options see
+    `planning.cavin.CavinPlanner`.
+    """
+
+    def __init__(
+        self, effects: EffectPlan, reward: RewardFunction, *, feature_weight: float, avoid_failures: bool
+    ) -> None:
+        self.effects, self.reward = effects, reward
+        self.feature_weight, self.avoid_failures = feature_weight, avoid_failures
+
+    def start(self, plans: State) -> Aim:
+        """Of sequences that have not begun, `plans: [B, n]`."""
+        progress = returns.start(plans.centers)
+        nothing = torch.zeros_like(progress.returns)
+        return Aim(nothing, nothing, torch.ones_like(progress.failed), progress.failed, progress)
+
+    def advance(self, standing: Aim, segment: int, before: State, stretch: Stretch) -> Aim:
+        """After one more segment from `before: [B, n]`."""
+        counts = (segment < self.effects.segments).unsqueeze(-1)  # [B, 1]
+        # Line 10: distance to the chosen subgoal, at the end of the segment.
+        goal = self.effects.subgoals.step(slice(segment, segment + 1))  # [B, 1, M, .]
+        from_goal = ranking.squared_distance(stretch.states, goal, feature_weight=self.feature_weight)
+        distance = standing.distance + torch.where(counts, from_goal, 0.0)
+        assert stretch.actions is not None
+        sound = standing.sound & (torch.isfinite(stretch.actions).all(-1).all(-1) | ~counts)
+        progress, failed_in_executed = standing.progress, standing.failed_in_executed
+        if self.avoid_failures:
+            progress = progress._replace(succeeded=progress.succeeded | ~counts)  # nothing left to fail
+            progress = returns.advance(progress, self.reward, before.centers, stretch.path, before.mask)
+            if segment == 0:
+                failed_in_executed = progress.failed
+        first = distance if segment == 0 else standing.first_distance
+        return Aim(distance, first, sound, failed_in_executed, progress)
 
 
 class MotionPlan(NamedTuple):
     """The chosen motion codes, their actions, and where f says that they lead; S segments of T steps."""
 
-    codes: Tensor  # [B, S, 16] z*
+    codes: Tensor  # [B, S, Z] z*
     actions: Tensor  # [B, S T, 4] a*
     predicted_centers: Tensor  # [B, S T, M, 3] metres
 
 
-def plan_motions(
-    model: PlanningModel,
-    reward: RewardFunction,
-    state: State,
-    effects: EffectPlan,
-    generators: Sequence[torch.Generator],
-    *,
-    samples: int,
-    segments: int,
-    feature_weight: float,
-    avoid_failures: bool,
-    robustness: Robustness | None,
+def choose_motions(
+    candidates: Candidates, model: PlanningModel, score: Closeness, robustness: Robustness | None
 ) -> MotionPlan:
-    """Choose among N = `samples` sequences of S = `segments` motion codes for the scenes `state: [B]`.
+    """Line 10: the sequence that comes closest to the subgoals (our addition: if it does not fail).
 
-    Segments after the end of the chosen effect plan have nothing to aim at, and do not count.
     Raises ValueError where no sequence of an environment leads to finite states.
     """
-    plans = state.expand_plans(samples)  # [B, N, M, .]
-    here = state.expand_plans(1)  # [B, 1, M, .]: all sequences begin here, as in `plan_effects`
-    mask = plans.mask
-    progress = returns.start(plans.centers)
-    distance = first_distance = plans.centers.new_zeros(plans.batch_shape)
-    sound = torch.ones_like(progress.failed)
-    failed_in_executed = progress.failed
-    codes, actions, paths = [], [], []
-    for segment in range(segments):
-        counts = (segment < effects.segments).unsqueeze(-1)  # [B, 1]
-        effect_code = effects.codes[:, segment].unsqueeze(1).expand(-1, samples, -1)
-        # Line 8, a segment at a time as in line 5; every sequence is paired with the chosen effect codes.
-        code = sample_each(model.motion_prior, [plans, effect_code], generators)
-        # Line 9: the actions by g, from the state that f predicted; the states by f, an action at a time.
-        pushes = model.actions(here, effect_code, code)
-        before, steps = plans.centers, []
-        for push in pushes.unbind(-2):
-            plans = here = model.next_state(here, push).expand(mask.shape[:2])
-            steps.append(plans.centers)
-        path = torch.stack(steps, -3)
-        # Line 10: distance to the chosen subgoal, at the end of the segment.
-        goal = effects.subgoals.step(slice(segment, segment + 1))  # [B, 1, M, .]
-        from_goal = ranking.squared_distance(plans, goal, feature_weight=feature_weight)
-        distance = distance + torch.where(counts, from_goal, 0.0)
-        first_distance = distance if segment == 0 else first_distance
-        sound = sound & (torch.isfinite(pushes).all(-1).all(-1) | ~counts)
-        if avoid_failures:
-            progress = progress._replace(succeeded=progress.succeeded | ~counts)  # nothing left to fail
-            progress = returns.advance(progress, reward, before, path, mask)
-            if segment == 0:
-                failed_in_executed = progress.failed
-        codes.append(code)
-        actions.append(pushes)
-        paths.append(path)
-
-    # Line 10: choose the sequence that comes closest to the subgoals (our addition: if it does not fail).
-    score = torch.where(sound, -distance, -torch.inf)
-    score = ranking.prefer(score, ~failed_in_executed)
-    score = ranking.prefer(score, ~progress.failed)
-    chosen = ranking.best(score, "distances of motion plans to the subgoals")
+    aim = candidates.standing
+    scores = torch.where(aim.sound, -aim.distance, -torch.inf)
+    scores = ranking.prefer(scores, ~aim.failed_in_executed)
+    scores = ranking.prefer(scores, ~aim.progress.failed)
+    chosen = ranking.best(scores, "distances of motion plans to the subgoals")
     if robustness is not None:
         # Our addition: of the best, the one that still works where its pushes start a little elsewhere.
-        first = effects.subgoals.step(slice(0, 1))
         numbers, cost = try_again(
-            robustness, model, reward, state, first, score, actions[0], generators, feature_weight=feature_weight
+            robustness,
+            model,
+            score.reward,
+            candidates.search.state,
+            score.effects.subgoals.step(slice(0, 1)),
+            scores,
+            candidates.at(0, pushes_of),
+            candidates.search.generators,
+            feature_weight=score.feature_weight,
         )
-        cost = cost + (distance - first_distance).gather(1, numbers)  # later segments, as they were
+        cost = cost + (aim.distance - aim.first_distance).gather(1, numbers)  # later segments, as they were
         chosen = numbers.gather(1, cost.argmin(-1, keepdim=True)).squeeze(1)
-    environments = torch.arange(len(chosen), device=chosen.device)
+    winner = candidates.take(chosen.unsqueeze(-1))
     return MotionPlan(
-        codes=torch.stack([code[environments, chosen] for code in codes], 1),
-        actions=torch.cat([pushes[environments, chosen] for pushes in actions], 1),
-        predicted_centers=torch.cat([path[environments, chosen] for path in paths], 1),
+        codes=winner.history(lambda segment: segment.stretch.code)[:, 0],
+        actions=winner.history(pushes_of)[:, 0].flatten(1, 2),
+        predicted_centers=winner.history(lambda segment: segment.stretch.path)[:, 0].flatten(1, 2),
     )

@@ -13,18 +13,19 @@ class Plan(NamedTuple):
     """The chosen plan of every environment, and what was considered on the way (for drawing).
 
     S is the number of segments with motions: K, or 1 where only the first one is planned at the motion level.
-    A planner that predicts nothing (`RandomPlanner`) has S = 1 for its pushes; codes, states and candidates
-    are empty.
+    C and Z are the codes' numbers. What a planner does not have is empty: without effect codes K = 0 for these and
+    the subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for
+    its pushes, and no codes, states or candidates.
     """
 
     actions: Tensor  # [B, T, 4] the first segment, to be executed before planning anew
     planned_actions: Tensor  # [B, S T, 4] a*, of which `actions` is the beginning
-    effect_codes: Tensor  # [B, K, 16] c*
-    motion_codes: Tensor  # [B, S, 16] z*
+    effect_codes: Tensor  # [B, K, C] c*
+    motion_codes: Tensor  # [B, S, Z] z*
     subgoals: State  # [B, K, M, .] chosen subgoals; those after the plan's end repeat the last one
-    segments: Tensor  # [B] int64: segments until the chosen effect plan ends, 1..K; later codes mean nothing
+    segments: Tensor  # [B] int64: segments until the chosen plan ends, 1..K; what comes later means nothing
     predicted_centers: Tensor  # [B, S T, M, 3] metres, predicted by f after each of the planned actions
-    expected_return: Tensor  # [B] cumulative reward of the chosen effect plan; NaN where nothing was predicted
-    expected_success: Tensor  # [B] bool: the chosen effect plan reaches the goal
-    candidate_centers: Tensor  # [B, N, K, M, 3] metres, subgoals of all effect plans, traced back through copies
+    expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
+    expected_success: Tensor  # [B] bool: the chosen plan reaches the goal
+    candidate_centers: Tensor  # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite

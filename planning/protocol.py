@@ -22,7 +22,8 @@ class PlanningModel(Protocol):
 
     Leading dimensions `[...]` of the arguments broadcast: planners hand over states `[B, 1]` with codes or
     actions `[B, N]` where all plans are in one state, else `[B, N]` for all. Priors are asked for `[N]`, an
-    environment at a time.
+    environment at a time. Planners name in `needs` what they ask for; a model without effects takes its motion code by
+    keyword, one without motions is given none.
     """
 
     @property

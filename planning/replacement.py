@@ -27,16 +27,3 @@ def draw_parents(failed: Tensor, active: Tensor, generators: Sequence[torch.Gene
         choice = torch.randint(len(living), (len(dead),), generator=generators[index], device=failed.device)
         parents[index, dead] = living[choice]
     return parents
-
-
-def trace_back(parents: Tensor) -> Tensor:
-    """For every final plan, the number that it had in each segment: `[K, B, N]` int64.
-
-    `parents: [K, B, N]`, of which `parents[k]` says what the plans go on from after segment k (the last of
-    them: what the final plans are). What segment k has recorded under number `trace_back(parents)[k, b, n]`
-    belongs to the final plan n.
-    """
-    numbers = [parents[-1]]
-    for earlier in reversed(parents[:-1].unbind()):
-        numbers.append(earlier.gather(-1, numbers[-1]))
-    return torch.stack(numbers[::-1])

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from models.state import State
 from planning import ranking, returns
+from planning.following import follow
 from planning.inputs import check_positive, check_weight
 from planning.protocol import PlanningModel, RewardFunction
+from planning.sampling import noise_each
 
 
 @dataclass(frozen=True)
@@ -63,20 +65,13 @@ def try_again(
     environments = torch.arange(len(scores), device=scores.device).unsqueeze(-1)
     tried = actions[environments, best.indices].unsqueeze(2)  # [B, R, 1, T, 4]
     tried = tried.repeat(1, 1, robustness.draws, 1, 1)
-    tried[..., :2] += robustness.start_noise * _noise(tried[..., :2].shape[1:], generators)
+    tried[..., :2] += robustness.start_noise * noise_each(tried[..., :2].shape[1:], generators)
     pushes = tried.flatten(1, 2).clamp(-1.0, 1.0)  # [B, R D, T, 4]
 
     plans = state.expand_plans(pushes.shape[1])
-    here = state.expand_plans(1)
-    mask, before, steps = plans.mask, plans.centers, []
-    for push in pushes.unbind(-2):
-        here = model.next_state(here, push).expand(mask.shape[:2])
-        steps.append(here.centers)
-    progress = returns.advance(returns.start(before), reward, before, torch.stack(steps, -3), mask)
+    before, mask = plans.centers, plans.mask
+    here, path = follow(model, state.expand_plans(1), pushes)
+    progress = returns.advance(returns.start(before), reward, before, path, mask)
     distance = ranking.squared_distance(here, goal, feature_weight=feature_weight)
     cost = (distance + robustness.failure_cost * progress.failed).unflatten(1, (count, robustness.draws)).mean(-1)
     return best.indices, torch.where(torch.isfinite(best.values) & torch.isfinite(cost), cost, torch.inf)
-
-
-def _noise(shape: torch.Size, generators: Sequence[torch.Generator]) -> Tensor:
-    return torch.stack([torch.randn(shape, generator=generator, device=generator.device) for generator in generators])

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
 
 from models.state import State
 
@@ -29,6 +29,53 @@ def sample_each(
         with _global_randomness_from(generator):
             draws.append(distribution.sample())
     return torch.stack(draws)
+
+
+def noise_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Standard normal noise, each environment's from its own generator: `[B, *shape]`."""
+    return torch.stack([torch.randn(*shape, generator=source, device=source.device) for source in generators])
+
+
+def codes_each(prior: Callable[..., Distribution], conditions: Sequence[State | Tensor], noise: Tensor) -> Tensor:
+    """The codes that standard normal `noise: [B, N, D]` stands for: `[B, N, D]`, distributed as the prior.
+
+    Asked per environment, as in `sample_each`. Raises ValueError for a prior that cannot be written as a
+    function of such noise.
+    """
+    return torch.stack(
+        [
+            code_of(prior(*(_scene(condition, index) for condition in conditions)), own)
+            for index, own in enumerate(noise)
+        ]
+    )
+
+
+def dimension_of(prior: Callable[..., Distribution], conditions: Sequence[State | Tensor]) -> int:
+    """D, the numbers of a code of `prior(*conditions)`, asked for the first environment of `[B, N]`."""
+    return prior(*(_scene(condition, 0) for condition in conditions)).event_shape[0]
+
+
+def code_of(prior: Distribution, noise: Tensor) -> Tensor:
+    """The code that standard normal noise stands for: mean + scale * noise, or through a flow's transforms.
+
+    `noise: [..., D]` -> `[..., D]`. Distributions that are none of torch's say it themselves, by a method
+    `from_noise`. Raises ValueError for any other.
+    """
+    if hasattr(prior, "from_noise"):
+        return prior.from_noise(noise)
+    if isinstance(prior, Independent):
+        return code_of(prior.base_dist, noise)
+    if isinstance(prior, Normal):
+        return prior.loc + prior.scale * noise
+    if isinstance(prior, TransformedDistribution):
+        code = code_of(prior.base_dist, noise)
+        for transform in prior.transforms:
+            code = transform(code)
+        return code
+    raise ValueError(
+        f"codes of a prior of type {type(prior).__name__} cannot be searched: it is neither normal nor a transformed "
+        "normal, and has no method from_noise; take the optimizer shooting"
+    )
 
 
 def _scene(condition: State | Tensor, index: int) -> State | Tensor:

@@ -31,7 +31,10 @@ BAD = [
     # Names: the valid ones are named.
     ("plan", "task=juggling", "unknown task 'juggling': choose from clearing, insertion, crossing"),
     ("plan", "reward=medium", "unknown reward 'medium': choose from dense, sparse"),
-    ("plan", "planner=best", "unknown planner 'best': choose from cavin, random"),
+    ("plan", "planner=best", "unknown planner 'best': choose from cavin, cvae_mpc, mpc, random, sectar"),
+    ("plan", "planner.optimizer=best", "unknown optimizer 'best': choose from shooting, cem, icem, mppi, smc"),
+    ("plan", "planner=mpc planner.proposal=best", "unknown proposal 'best': take uniform or heuristic"),
+    ("plan", "planner.reward_at=end", "unknown reward_at 'end': take path or subgoals"),
     ("plan", "planner.motion_horizon=long", "take full_horizon or first_segment"),
     ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2 or the path of a YAML file"),
     ("plan", "env.robot=hand", "unknown env.robot 'hand': choose from stick"),
@@ -105,6 +108,19 @@ BAD = [
         "horizon=10 is not divisible by the model's segment length T=3: take 9 or 12",
     ),
     ("plan", "planner=random planner.segment_length=0", "segment_length must be at least 1, not 0"),
+    ("plan", "planner.stride_limits=[0.3,0.1]", "stride_limits must be two distances in metres, low then high"),
+    ("plan", "planner.stride_limits=3", "stride_limits must be two distances in metres, low then high, not 3"),
+    (
+        "plan",
+        "planner.optimizer=cem planner.optimizer_options={elite:3}",
+        "unknown option 'elite' of optimizer cem: valid are iterations, elites, inertia",
+    ),
+    (
+        "plan",
+        "planner.optimizer=cem planner.optimizer_options={elites:many}",
+        "optimizer cem: an option is of the wrong kind",
+    ),
+    ("plan", "planner.optimizer=cem planner.samples=3", "4 iterations need at least as many samples, not 3"),
     ("plan", "planner.feature_weight=-1", "feature_weight must be zero or a positive number, not -1"),
     ("plan", "planner.robustness.draws=0", "draws must be at least 1, not 0"),
     ("plan", "planner.robustness.start_noise=-1", "start_noise must be zero or a positive number, not -1"),
@@ -177,13 +193,17 @@ BAD = [
         (
             command,
             f"checkpoint=@{name} {words}",
-            f"{said}, which the planner calls: planner=cavin needs a checkpoint of",
+            f"{said}; planner=random takes any",
         )
         for command in ("plan", "evaluate")
         for name, words, said in (
-            ("flat", "", "FlatModel has no effect_prior and no subgoal"),
-            ("single_latent", "", "SingleLatentModel has no motion_prior"),
-            ("dynamics", "", "DynamicsModel has no effect_prior and no motion_prior and no subgoal and no actions"),
+            ("flat", "", "FlatModel, which has no effect_prior and no subgoal"),
+            ("single_latent", "", "SingleLatentModel, which has no motion_prior"),
+            (
+                "dynamics",
+                "",
+                "DynamicsModel, which has no effect_prior and no motion_prior and no subgoal and no actions",
+            ),
         )
     ),
     ("plan", "checkpoint=@width", "is of another architecture"),
@@ -194,6 +214,12 @@ BAD = [
         "checkpoint=@smuggled",
         "asks to run models.pointnet.torch.save, which is not part of this program",
     ),
+    (
+        "plan",
+        "planner=sectar",
+        "SectarPlanner needs a checkpoint of model=single_latent, but",
+    ),
+    ("plan", "planner=cvae_mpc", "CvaeMpcPlanner needs a checkpoint of model=flat, but"),
     ("evaluate", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),
     ("check", "checkpoint=@nothing", "no checkpoint at"),
     ("check", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),

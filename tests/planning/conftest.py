@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from models.state import State
+from planning.sampling import noise_each
+from planning.segments import Stretch
 
 REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1
 
@@ -40,6 +42,22 @@ class PointMass:
         share = REACH * effect_code[..., :2].tanh() / self.segment_length
         motions = share.unsqueeze(-2) + self.noise * motion_code[..., :6].unflatten(-1, (3, 2))
         return torch.cat([torch.zeros_like(motions), motions / 0.1], -1)
+
+    def next_state(self, state: State, action: Tensor) -> State:
+        return move(state, 0.1 * action[..., 2:])
+
+
+class Flat:
+    """Without effects: the T = 3 pushes are the motion code's first six numbers, times 0.05 m; f obeys."""
+
+    segment_length = 3
+
+    def motion_prior(self, state: State) -> Distribution:
+        return standard_normal(state)
+
+    def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
+        motions = 0.5 * motion_code[..., :6].unflatten(-1, (3, 2))
+        return torch.cat([torch.zeros_like(motions), motions], -1).clamp(-1.0, 1.0)
 
     def next_state(self, state: State, action: Tensor) -> State:
         return move(state, 0.1 * action[..., 2:])
@@ -85,6 +103,23 @@ class Listed(Distribution):
         return torch.cat([first[:, None], torch.zeros(len(first), 15)], -1)
 
 
+class Placed:
+    """A level whose plans are wherever two numbers of noise per segment say: x and y of the target, in metres."""
+
+    def dimension(self, state: State) -> int:
+        return 2
+
+    def extend(
+        self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
+    ) -> Stretch:
+        if noise is None:
+            noise = noise_each((plans.batch_shape[-1], 2), generators)
+        centers = plans.centers.clone()
+        centers[..., 0, :2] = noise
+        states = plans._replace(centers=centers)
+        return Stretch(noise, None, states, centers.unsqueeze(-3))
+
+
 class Judgement(NamedTuple):
     reward: Tensor
     success: Tensor
@@ -113,6 +148,18 @@ class GoalDisc:
 
     def distance(self, centers: Tensor) -> Tensor:
         return (centers[..., 0, :2] - torch.tensor(self.goal, dtype=centers.dtype)).norm(dim=-1)
+
+
+class Hill:
+    """Every step earns minus the squared distance of the target to a place; nothing ends."""
+
+    def __init__(self, top: tuple[float, float]) -> None:
+        self.top = top
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
+        distance = (centers[..., 0, :2] - torch.tensor(self.top, dtype=centers.dtype)).square().sum(-1)
+        never = torch.zeros_like(distance, dtype=torch.bool)
+        return Judgement(-distance, never, never)
 
 
 class Line:
@@ -149,5 +196,6 @@ def generators(*seeds: int) -> list[torch.Generator]:
 
 @pytest.fixture
 def toy() -> SimpleNamespace:
-    names: list[Callable] = [PointMass, Tabled, GoalDisc, Line, Judgement, move, scenes, generators]
+    worlds: list[Callable] = [PointMass, Flat, Tabled, Placed, GoalDisc, Hill, Line, Judgement]
+    names = [*worlds, move, scenes, generators]
     return SimpleNamespace(**{name.__name__: name for name in names}, REACH=REACH)

@@ -54,6 +54,40 @@ def test_motion_level_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> No
     assert line(plan.predicted_centers) == [0.375, 0.75, 1.25, 1.75]
 
 
+def test_without_replacement_the_dead_stay_dead(toy: SimpleNamespace) -> None:
+    # Plans 0 and 2 end in segment 1, as above, and only plan 1 goes on, to 0.75: c = (0.5, 0.25).
+    plan = replay(toy, EFFECTS, MOTIONS, optimizer_options={"replacement": False})
+    assert plan.candidate_returns.tolist() == [[-102.0, -4.0, -101.0]]
+    assert plan.candidate_centers[0, :, :, 0, 0].tolist() == [[-0.75, -0.75], [0.5, 0.75], [-2.0, -2.0]]
+    assert plan.effect_codes[0, :, 0].tolist() == [0.5, 0.25]
+    assert line(plan.subgoals.centers) == [0.5, 0.75]
+    assert plan.expected_return.tolist() == [-4.0]
+    assert plan.segments.tolist() == [2]
+    # Segment 1 ends at 1.0, 0.75, 0.5 and segment 2 at 0.75, 1.0, 1.75: squared distances 0.25, 0.125, 1.0.
+    assert plan.motion_codes[0, :, 0].tolist() == [0.125, 0.0]
+    assert plan.planned_actions[0].tolist() == [[0, 0, 0.375, 0]] * 2 + [[0, 0, 0.125, 0]] * 2
+    assert line(plan.predicted_centers) == [0.375, 0.75, 0.875, 1.0]
+
+
+def test_reward_at_subgoals_does_not_see_what_happens_on_the_way(toy: SimpleNamespace) -> None:
+    # One step per segment: plan 0 gets to -0.25 and from there to 1.25; plan 2 would have died on the way.
+    plan = replay(toy, [[-0.25, 0.5, -2.0], [1.5, 0.25, 0.25]], MOTIONS, reward_at="subgoals")
+    assert plan.candidate_returns[0, :2].tolist() == [-1.0 + 99.0, -2.0]
+    assert plan.candidate_returns[0, 2] in (-1.0 - 1.0, -1.0 + 99.0)  # a copy of plan 0 or 1, with a code of its own
+    assert line(plan.subgoals.centers) == [-0.25, 1.25]
+
+
+def test_subgoals_outside_the_stride_limits_end_plans_as_violations_do(toy: SimpleNamespace) -> None:
+    # Plan 0 hardly moves, plan 2 jumps onto the goal: both are replaced by copies of plan 1, and die once more.
+    effects = [[0.0625, 0.5, 1.5], [0.0625, 0.25, 1.5]]
+    options: dict = {"stride_limits": [0.1, 1.0]}
+    plan = replay(toy, effects, MOTIONS, **options)
+    assert plan.candidate_returns.tolist() == [[-2.0 - 100.0, -4.0, -2.0 - 100.0]]
+    assert replay(toy, effects, MOTIONS).expected_return.tolist() == [99.0 - 1.0]  # without limits: at once
+    plan = replay(toy, effects, MOTIONS, reward_at="subgoals", **options)
+    assert plan.candidate_returns.tolist() == [[-1.0 - 100.0, -2.0, -1.0 - 100.0]]
+
+
 def test_first_segment_compares_the_first_segment_only(toy: SimpleNamespace) -> None:
     plan = replay(toy, EFFECTS, MOTIONS[:1], motion_horizon="first_segment")
     assert plan.motion_codes[0, :, 0].tolist() == [0.0]

@@ -13,6 +13,7 @@ from models.learned_priors import ConditionalPrior, FlowPrior
 from models.priors import StandardPrior
 from models.state import State
 from planning import CavinPlanner
+from planning.sampling import codes_each, noise_each, sample_each
 
 each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior])
 
@@ -53,6 +54,31 @@ def test_a_plan_comes_out_and_again_from_the_same_seed(kind: type, horizon: str,
     assert plans[0].effect_codes.shape == (2, 3, 5)
     assert plans[0].actions.isfinite().all()
     assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+@each_prior
+def test_noise_stands_for_the_code_that_the_prior_draws_with_it(kind: type, toy: SimpleNamespace) -> None:
+    model, state = model_with(kind), scenes(toy).expand_plans(6)
+    effects = codes_each(model.effect_prior, [state], noise_each((6, 5), toy.generators(3, 4)))
+    torch.testing.assert_close(effects, sample_each(model.effect_prior, [state], toy.generators(3, 4)))
+    motions = codes_each(model.motion_prior, [state, effects], noise_each((6, 4), toy.generators(5, 6)))
+    torch.testing.assert_close(motions, sample_each(model.motion_prior, [state, effects], toy.generators(5, 6)))
+
+
+@pytest.mark.parametrize("optimizer", ["cem", "icem", "mppi", "smc"])
+@each_prior
+def test_every_optimiser_searches_codes_of_every_prior(kind: type, optimizer: str, toy: SimpleNamespace) -> None:
+    reward = toy.GoalDisc((0.8, 0.0), dense=True)
+    one, again = (
+        CavinPlanner(model_with(kind), reward, samples=32, horizon=9, optimizer=optimizer).plan(
+            scenes(toy), toy.generators(3, 4)
+        )
+        for _ in range(2)
+    )
+    assert one.actions.isfinite().all()
+    assert torch.equal(one.actions, again.actions)
+    assert one.effect_codes.shape == (2, 3, 5)
+    assert one.motion_codes.shape == (2, 3, 4)
 
 
 @each_prior

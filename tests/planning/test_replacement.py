@@ -5,10 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from planning.replacement import draw_parents, trace_back
+from planning.replacement import draw_parents
 
 
 def flags(*rows: str) -> torch.Tensor:
@@ -43,17 +41,3 @@ def test_a_generator_is_used_only_where_its_environment_replaces_something(toy: 
     fresh = toy.generators(0)[0].get_state()
     assert torch.equal(untouched.get_state(), fresh)
     assert not torch.equal(used.get_state(), fresh)
-
-
-@settings(deadline=None, max_examples=50)
-@given(data=st.data())
-def test_tracing_back_follows_every_plan_from_parent_to_parent(data: st.DataObject) -> None:
-    segments, plans = data.draw(st.integers(1, 5)), data.draw(st.integers(1, 6))
-    numbers = st.integers(0, plans - 1)
-    table = data.draw(st.lists(st.lists(numbers, min_size=plans, max_size=plans), min_size=segments, max_size=segments))
-    traced = trace_back(torch.tensor(table)[:, None])
-    for plan in range(plans):
-        number = plan
-        for segment in reversed(range(segments)):
-            number = table[segment][number]
-            assert traced[segment, 0, plan] == number

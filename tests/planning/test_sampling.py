@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
 import torch
-from torch.distributions import Distribution, Independent, Normal
+from torch.distributions import (
+    Distribution,
+    ExpTransform,
+    Independent,
+    Normal,
+    TransformedDistribution,
+    Uniform,
+)
 
 from models.state import State
-from planning.sampling import sample_each
+from planning.sampling import code_of, sample_each
 
 
 def learned_prior(state: State, effect_code: torch.Tensor) -> Distribution:
@@ -46,3 +54,15 @@ def test_generators_move_on_and_the_global_one_does_not(toy: SimpleNamespace) ->
     second = sample_each(model.effect_prior, [state], generator)
     assert not torch.equal(first, second)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_transformed_normals_are_searched_through_their_transforms() -> None:
+    base = Independent(Normal(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 3.0])), 1)
+    prior = TransformedDistribution(base, [ExpTransform()])
+    noise = torch.tensor([[0.0, 1.0], [-1.0, 2.0]])
+    torch.testing.assert_close(code_of(prior, noise), torch.tensor([[1.0, 5.0], [0.5, 8.0]]).exp())
+
+
+def test_a_prior_that_cannot_be_searched_is_named() -> None:
+    with pytest.raises(ValueError, match="^codes of a prior of type Uniform cannot be searched: .* shooting$"):
+        code_of(Uniform(0.0, 1.0), torch.zeros(3))

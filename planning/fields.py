@@ -1,0 +1,35 @@
+"""Choosing and joining plans in records: named tuples, nested or not, of tensors `[B, N, ...]` or None."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+Record = TypeVar("Record", bound=tuple)
+
+
+def take(record: Record, numbers: Tensor) -> Record:
+    """Plans by number, per environment: fields `[B, N, ...]`, `numbers: [B, n]` int64 -> `[B, n, ...]`."""
+    environments = torch.arange(len(numbers), device=numbers.device).unsqueeze(-1)
+
+    def chosen(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return type(value)(*map(chosen, value))
+        return None if value is None else value[environments, numbers]
+
+    return chosen(record)
+
+
+def join(records: Sequence[Record]) -> Record:
+    """The plans of several records of one kind, one after the other: `[B, N_1, ...], ... -> [B, N_1 + ..., ...]`."""
+
+    def joined(values: Sequence[Any]) -> Any:
+        first = values[0]
+        if isinstance(first, tuple):
+            return type(first)(*map(joined, zip(*values, strict=True)))
+        return None if any(value is None for value in values) else torch.cat(list(values), dim=1)
+
+    return joined(list(records))

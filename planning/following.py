@@ -1,0 +1,21 @@
+"""Where f says that pushes lead (paper, equation for f in section 3.1; Algorithm 1, line 9)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.protocol import PlanningModel
+
+
+def follow(model: PlanningModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
+    """T `pushes: [B, n, T, 4]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]` and the path `[B, n, T, M, 3]`.
+
+    A push at a time; the path is in metres.
+    """
+    steps = []
+    for push in pushes.unbind(-2):
+        here = model.next_state(here, push).expand(pushes.shape[:2])
+        steps.append(here.centers)
+    return here, torch.stack(steps, -3)

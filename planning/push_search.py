@@ -1,0 +1,85 @@
+"""Planning in one level: sequences of pushes, ranked by the reward of what f predicts (the paper's flat baselines)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from models.state import State
+from planning import ranking
+from planning.candidates import Candidates, Search
+from planning.inputs import check_horizon, check_positive, check_scenes
+from planning.optimisers import make_optimiser
+from planning.plan import Plan
+from planning.protocol import PlanningModel, RewardFunction
+from planning.rewards import CumulativeReward, StrideLimits
+from planning.segments import Level, pushes_of
+
+
+class PushSearch:
+    """What CVAE-MPC and MPC share: everything but where pushes come from.
+
+    level: makes the pushes of a segment, and predicts them with f. stride_limits: metres per push, as published
+    0.01 and 0.15; None in the paper. For the other options see `CavinPlanner`.
+
+    Samples, horizon, returns, ends of plans and replacement of dead plans, segment by segment, are Algorithm 1's.
+    """
+
+    has_codes = False  # whether what is searched are motion codes
+
+    def __init__(
+        self,
+        level: Level,
+        model: PlanningModel,
+        reward: RewardFunction,
+        samples: int,
+        horizon: int,
+        *,
+        optimizer: str,
+        optimizer_options: Mapping[str, Any] | None,
+        reward_at: str,
+        stride_limits: Sequence[float] | None,
+    ) -> None:
+        """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
+        check_positive("samples", samples)
+        check_horizon(horizon, model.segment_length)
+        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
+        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="pushes")
+        self.score = CumulativeReward(limited, reward_at)
+        self.level, self.model = level, model
+        self.samples = samples
+        self.segments = horizon // model.segment_length  # K = H / T
+
+    @torch.inference_mode()
+    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+        """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
+        check_scenes(state, generators)
+        search = Search(self.level, self.score, state, generators, self.segments)
+        return self._best(self.optimiser.optimise(search, self.samples))
+
+    def _best(self, candidates: Candidates) -> Plan:
+        progress = candidates.standing
+        sound = candidates.history(lambda segment: torch.isfinite(pushes_of(segment)).all(-1).all(-1)).all(-1)
+        scores = torch.where(sound, progress.returns, -torch.inf)
+        chosen = ranking.best(scores, "returns of push sequences")
+        environments = torch.arange(len(chosen), device=chosen.device)
+        winner = candidates.take(chosen.unsqueeze(-1))
+        actions = winner.history(pushes_of)[:, 0].flatten(1, 2)
+        state = candidates.search.state
+        codes = winner.history(lambda segment: segment.stretch.code)[:, 0]
+        nothing = codes.new_empty(len(codes), 0, 0)
+        return Plan(
+            actions=actions[:, : self.model.segment_length],
+            planned_actions=actions,
+            effect_codes=nothing,
+            motion_codes=codes if self.has_codes else nothing,
+            subgoals=state.map(lambda field: field[:, None][:, :0]),
+            segments=progress.segments[environments, chosen],
+            predicted_centers=winner.history(lambda segment: segment.stretch.path)[:, 0].flatten(1, 2),
+            expected_return=progress.returns[environments, chosen],
+            expected_success=progress.succeeded[environments, chosen],
+            candidate_centers=candidates.history(lambda segment: segment.stretch.states.centers),
+            candidate_returns=progress.returns,
+        )

@@ -1,0 +1,86 @@
+"""Cumulative reward as what is wanted of plans (paper, section 3.2, and Algorithm 1, line 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import returns
+from planning.protocol import Outcome, RewardFunction
+from planning.returns import Progress
+from planning.segments import Stretch
+
+REWARD_AT = ("path", "subgoals")
+STRIDE_PENALTY = -100.0  # of a step, as for a violation (published code)
+
+
+class Judgement(NamedTuple):
+    """`Outcome` of steps in any batch `[...]`."""
+
+    reward: Tensor
+    success: Tensor
+    failure: Tensor
+
+
+class CumulativeReward:
+    """Scores plans by the reward of all their steps, up to the one that ends a plan.
+
+    reward: the task's. at: `path` judges every step of a segment, interpolated ones too (paper); `subgoals` only its
+    end, as one step (published code).
+    """
+
+    def __init__(self, reward: RewardFunction, at: str = "path") -> None:
+        """Raises ValueError for an unknown `at`."""
+        if at not in REWARD_AT:
+            raise ValueError(f"unknown reward_at '{at}': take {' or '.join(REWARD_AT)}")
+        self.reward, self.at = reward, at
+
+    def start(self, plans: State) -> Progress:
+        """Of plans that have not begun, `plans: [B, n]`."""
+        return returns.start(plans.centers)
+
+    def advance(self, standing: Progress, segment: int, before: State, stretch: Stretch) -> Progress:
+        """After one more segment from `before: [B, n]`."""
+        path = stretch.path if self.at == "path" else stretch.path[..., -1:, :, :]
+        return returns.advance(standing, self.reward, before.centers, path, before.mask)
+
+
+class StrideLimits:
+    """A reward function that ends plans whose strides are implausible (published code; not in the paper).
+
+    A stride fails if every object moves less than `shortest`, or any farther than `longest` metres; its reward is
+    then -100. `of`: `segments` (published: 0.1 m and 0.3 m from subgoal to subgoal) or `pushes` (0.01 m and 0.15 m).
+    """
+
+    def __init__(self, reward: RewardFunction, limits: Sequence[float], *, of: str) -> None:
+        """`limits`: shortest and longest, in metres. Raises ValueError unless they are two, in order, not negative."""
+        numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
+        if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
+            raise ValueError(f"stride_limits must be two distances in metres, low then high, not {limits}")
+        self.reward, self.of = reward, of
+        self.shortest, self.longest = limits
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
+        """Judge the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
+        outcome = self.reward(previous, centers, mask)
+        if self.of == "pushes":
+            outside = self._outside(previous, centers, mask)
+        else:
+            whole = self._outside(previous[..., 0, :, :], centers[..., -1, :, :], mask[..., -1, :])
+            outside = torch.zeros_like(outcome.failure)
+            outside[..., 0] = whole  # from its first step on: nothing counts on the way to where nothing gets
+        outside = outside & ~outcome.failure
+        return Judgement(
+            torch.where(outside, STRIDE_PENALTY, outcome.reward),
+            outcome.success & ~outside,
+            outcome.failure | outside,
+        )
+
+    def _outside(self, before: Tensor, after: Tensor, mask: Tensor) -> Tensor:
+        strides = (after - before).norm(dim=-1)
+        short = ((strides < self.shortest) | ~mask).all(-1)
+        return short | ((strides > self.longest) & mask).any(-1)
