@@ -23,6 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from cavin_pyro.command import compose
 from cavin_pyro.episodes import observed_state
 from cavin_pyro.setups import Setup, set_up
+from envs.tasks import TaskReward
 from models.state import State
 from planning import Planner
 
@@ -99,7 +100,8 @@ class FlatProblem:
     """f and the reward as functions of a flat state `[..., M * 67]`, as the public planners want them."""
 
     def __init__(self, one: Setup, state: State) -> None:
-        self.model, self.reward, self.mask = one.planner.model, one.planner.reward, state.mask[0]  # type: ignore[attr-defined]
+        self.model, self.mask = one.planner.model, state.mask[0]  # type: ignore[attr-defined]
+        self.reward = TaskReward(one.layout)
         self.objects = state.objects
         self.start = torch.cat((state.centers[0], state.features[0]), -1).flatten()
 
