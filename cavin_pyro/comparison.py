@@ -68,7 +68,7 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
             f"compare={folder} is no finished evaluation: {Path(error.filename).name} is missing"
         ) from error
     except (ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
-        raise UserError(f"compare={folder} is damaged: evaluate it again") from error
+        raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
     mine = flat_words(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(mine) | set(theirs)):
         if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):

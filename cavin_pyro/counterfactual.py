@@ -1,4 +1,4 @@
-"""The published code's counterfactual term, for an ablation (reference.md, "Training as published").
+"""The published code's counterfactual term, for an ablation (the published implementation).
 
 The paper's objective has no such term: it asserts that the actions of (s, c, z) lead where h(s, c) says.
 """

@@ -104,7 +104,7 @@ def _check_planner(options: dict[str, Any], model: PyroModule, path: Path) -> No
     missing = [name for name in getattr(planner, "needs", ()) if not hasattr(model, name)]
     superfluous = [name for name in getattr(planner, "lacks", ()) if hasattr(model, name)]
     if missing or superfluous:
-        what = f"has no {' and no '.join(missing)}" if missing else f"has a {superfluous[0]} besides"
+        what = f"has no {' and no '.join(missing)}" if missing else f"has {superfluous[0]} besides"
         raise UserError(
             f"{planner.__name__} needs a checkpoint of model={planner.usual_model}, but {path} holds "
             f"{type(model).__name__}, which {what}; planner=random takes any"

@@ -22,7 +22,7 @@ from models.state import State, Window
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """Which windows and transitions teach what (reference.md, "Training as published").
+    """Which windows and transitions teach what (the published implementation).
 
     Attributes:
         segment_length: T. validation_fraction: of the episodes. seed: of the split.

@@ -1,7 +1,7 @@
 """The overhead depth camera: its geometry, and the way from a depth image back to points on the table.
 
 Pinhole model with square pixels; the optical axis looks straight down unless the pose says otherwise.
-Source: reference.md, "Workspace" (Kinect2, 512 by 424 pixels); here half of each side by default, which shows
+Source: the published implementation (Kinect2, 512 by 424 pixels); here half of each side by default, which shows
 a 57 mm cube with about a hundred pixels.
 """
 

@@ -9,7 +9,7 @@ task.
     target_start: [[2, 3]]
     obstacle_start: [[1, 3]]
 
-Source: paper, appendix "Task Details"; reference.md, "Task layouts".
+Source: paper, appendix "Task Details"; the published implementation.
 """
 
 from __future__ import annotations

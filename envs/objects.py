@@ -1,6 +1,6 @@
 """Which objects lie on the table, and how they get there: random shapes, sizes, masses, friction and poses.
 
-Source: paper section 4.1 and reference.md, "Workspace" (what is randomised per object).
+Source: paper section 4.1 and the published implementation (what is randomised per object).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The heuristic pushing policy that collects data: random pushes that are likely to move something.
 
 Source: paper section 3.3 ("a heuristic policy that randomly samples actions that are likely to have plausible
-effects") and reference.md, "Heuristic pushing policy".
+effects") and the published implementation.
 """
 
 from __future__ import annotations

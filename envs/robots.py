@@ -1,6 +1,6 @@
 """What pushes: a stick that comes down, moves along a straight line and leaves the camera's view.
 
-Source: paper section 4.1 (position control, straight pushes) and reference.md, "Action".
+Source: paper section 4.1 (position control, straight pushes) and the published implementation.
 """
 
 from __future__ import annotations

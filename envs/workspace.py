@@ -1,7 +1,7 @@
 """The table, the tool's reach and the tile grid: the fixed geometry that everything else refers to.
 
-All coordinates are metres in the robot's base frame; the table's top lies at z = 0. Source: reference.md,
-"Workspace" and "Action".
+All coordinates are metres in the robot's base frame; the table's top lies at z = 0. Source: the published
+implementation.
 """
 
 from __future__ import annotations

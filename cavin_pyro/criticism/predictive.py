@@ -5,6 +5,7 @@ After Gelman, Meng and Stern, "Posterior predictive assessment of model fitness 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -118,6 +119,9 @@ def _findings(statistics: Sequence[Statistic], results: Results) -> Iterator[str
         means = {source: result["mean"] for source, result in results[statistic.name].items()}
         texts = {source: _amount(mean["mean"], statistic) for source, mean in means.items()}
         tail = means["prior_means"]["tail"]
+        if math.isnan(tail):
+            yield f"{statistic.label[0].upper()}{statistic.label[1:]}: cannot be told, too little moves."
+            continue
         inferred = f" and {texts['guide_means']} with codes from the guide" if "guide_means" in texts else ""
         odd = ", a misfit" if min(tail, 1 - tail) <= EXTREME else ""
         yield (

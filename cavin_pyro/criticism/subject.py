@@ -59,7 +59,7 @@ def load_subject(config: DictConfig) -> tuple[Subject, dict[str, Any]]:
         "model": type(model).__name__,
         "guide": type(guide).__name__,
         "prior": _last(own_prior or checkpoint.config["prior"].get("_target_")),
-        "objective": _last((checkpoint.config.get("objective") or {}).get("_target_")),
+        "objective": _objective(checkpoint.config),
         "trained": checkpoint.provenance,
         "data": data,
         "windows": {"training": len(training.actions), "validation": len(validation.actions)},
@@ -146,6 +146,12 @@ def _verdict(metadata: Mapping[str, Any], mark: str, entries: Sequence[Any]) -> 
     if "mark" in entry:
         return False, "collected with the settings of the training data, but by another program: other episodes"
     return None, f"settings and seed are those of the training data{grown}; whether the content is, it does not tell"
+
+
+def _objective(config: Mapping[str, Any]) -> str | None:
+    """The bound that was trained on, for people: the name of its class."""
+    objective = config.get("objective") or {}
+    return _last((objective.get("elbo") or objective).get("_target_"))
 
 
 def _last(target: str | None) -> str | None:

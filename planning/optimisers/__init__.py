@@ -49,6 +49,8 @@ def make_optimiser(name: str, options: Mapping[str, Any] | None = None, *, sampl
     if name not in OPTIMISERS:
         raise ValueError(f"unknown optimizer '{name}': choose from {', '.join(OPTIMISERS)}")
     known = [field.name for field in fields(OPTIMISERS[name])]
+    if not isinstance(options or {}, Mapping):
+        raise ValueError(f"optimizer_options must be a section like {{{known[0]}: value}}, not {options}")
     for option in options or {}:
         if option not in known:
             raise ValueError(f"unknown option '{option}' of optimizer {name}: valid are {', '.join(known)}")

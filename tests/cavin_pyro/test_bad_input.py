@@ -122,6 +122,7 @@ BAD = [
     ),
     ("plan", "planner.optimizer=cem planner.samples=3", "4 iterations need at least as many samples, not 3"),
     ("plan", "planner.feature_weight=-1", "feature_weight must be zero or a positive number, not -1"),
+    ("plan", "planner.optimizer_options=3", "optimizer_options must be a section like"),
     ("plan", "planner.robustness.draws=0", "draws must be at least 1, not 0"),
     ("plan", "planner.robustness.start_noise=-1", "start_noise must be zero or a positive number, not -1"),
     ("plan", "planner.robustness=3", "planner.robustness must be a section, not 3"),
