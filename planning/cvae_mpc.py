@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 from planning.levels import MotionLevel
@@ -21,26 +20,6 @@ class CvaeMpcPlanner(PushSearch):
     usual_model = "flat"
     has_codes = True
 
-    def __init__(
-        self,
-        model: PlanningModel,
-        reward: RewardFunction,
-        samples: int = 1024,
-        horizon: int = 30,
-        *,
-        optimizer: str = "shooting",
-        optimizer_options: Mapping[str, Any] | None = None,
-        reward_at: str = "path",
-        stride_limits: Sequence[float] | None = None,
-    ) -> None:
-        super().__init__(
-            MotionLevel(model, None),
-            model,
-            reward,
-            samples,
-            horizon,
-            optimizer=optimizer,
-            optimizer_options=optimizer_options,
-            reward_at=reward_at,
-            stride_limits=stride_limits,
-        )
+    def __init__(self, model: PlanningModel, reward: RewardFunction, **options: Any) -> None:
+        """`options` are those of `PushSearch`."""
+        super().__init__(MotionLevel(model, None), model, reward, **options)

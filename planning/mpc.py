@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 from planning.levels import PushLevel
@@ -28,27 +27,13 @@ class MpcPlanner(PushSearch):
         self,
         model: PlanningModel,
         reward: RewardFunction,
-        samples: int = 1024,
-        horizon: int = 30,
         *,
         proposal: str = "uniform",
         box: PushBox | None = None,
-        optimizer: str = "shooting",
-        optimizer_options: Mapping[str, Any] | None = None,
-        reward_at: str = "path",
-        stride_limits: Sequence[float] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            PushLevel(model, _proposal(proposal, box)),
-            model,
-            reward,
-            samples,
-            horizon,
-            optimizer=optimizer,
-            optimizer_options=optimizer_options,
-            reward_at=reward_at,
-            stride_limits=stride_limits,
-        )
+        """`options` are those of `PushSearch`."""
+        super().__init__(PushLevel(model, _proposal(proposal, box)), model, reward, **options)
 
 
 def _proposal(name: str, box: PushBox | None) -> Proposal:

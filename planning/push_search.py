@@ -34,13 +34,13 @@ class PushSearch:
         level: Level,
         model: PlanningModel,
         reward: RewardFunction,
-        samples: int,
-        horizon: int,
+        samples: int = 1024,
+        horizon: int = 30,
         *,
-        optimizer: str,
-        optimizer_options: Mapping[str, Any] | None,
-        reward_at: str,
-        stride_limits: Sequence[float] | None,
+        optimizer: str = "shooting",
+        optimizer_options: Mapping[str, Any] | None = None,
+        reward_at: str = "path",
+        stride_limits: Sequence[float] | None = None,
     ) -> None:
         """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
         check_positive("samples", samples)

@@ -28,7 +28,7 @@ Make = Callable[..., PushingEnv]
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
+def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     """Environments that are closed when the test ends."""
     made: list[PushingEnv] = []
 
@@ -37,7 +37,7 @@ def make() -> Iterator[Make]:
         env = PushingEnv(**options)
         made.append(env)
         if objects:
-            env.scene.draw = lambda *_, **__: env.scene.reset(objects, np.random.default_rng(0))  # type: ignore
+            monkeypatch.setattr(env.scene, "draw", lambda *_, **__: env.scene.reset(objects, np.random.default_rng(0)))
         return env
 
     yield build
@@ -113,10 +113,12 @@ def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(make: Mak
             assert nearest < 0.075 + 0.06  # within a tile, and some centimetres of rolling until rest
 
 
-def test_a_scene_in_which_the_target_has_rolled_off_the_bridge_is_drawn_anew(make: Make) -> None:
+def test_a_scene_in_which_the_target_has_rolled_off_the_bridge_is_drawn_anew(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     env = make(layout=0, objects=1)
     draws, reset = [], env.scene.reset
-    env.scene.reset = lambda *args: draws.append(reset(*args)) or draws[-1]  # type: ignore
+    monkeypatch.setattr(env.scene, "reset", lambda *args: draws.append(reset(*args)) or draws[-1])
     reward, started = TaskReward(env.layout), 40
     for seed in range(started):
         center = torch.from_numpy(env.reset(seed=seed)[0]["centers"][:1])
@@ -208,12 +210,13 @@ def test_an_object_off_the_table_ends_the_episode_with_a_fall(make: Make, put: C
 
 @pytest.mark.parametrize(("place", "otherwise"), [((2, 2), "success"), ((4, 4), "violation")])
 def test_a_fall_that_the_camera_cannot_see_outweighs_what_it_sees(
-    make: Make, put: Callable, place: tuple[int, int], otherwise: str
+    make: Make, put: Callable, place: tuple[int, int], otherwise: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = make(put("rubiks_cube", *tile_center(place)), layout=BRIDGE, objects=1)
     for fallen in (False, True):
         env.reset(seed=0)
-        env.scene.push = lambda _, fallen=fallen: PushReport(False, True, np.zeros(1), fallen)  # type: ignore
+        report = PushReport(False, True, np.zeros(1), fallen)
+        monkeypatch.setattr(env.scene, "push", lambda _, report=report: report)
         _, reward, terminated, _, info = env.step(NOTHING)
         happened = {name for name in ("success", "violation", "fall") if info[name]}
         assert happened == {"fall" if fallen else otherwise} and terminated
