@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 
@@ -50,3 +50,13 @@ def fraction(name: str, value: float) -> None:
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
         raise UserError(f"{name} must be between 0 and 1, not {value}")
+
+
+def one_of(name: str, value: object, choices: Collection[str]) -> None:
+    """Check a name from the command line.
+
+    Raises:
+        UserError: the name is none of the choices, which are named.
+    """
+    if value not in choices:
+        raise UserError(f"unknown {name} {value!r}: choose from {', '.join(choices)}")

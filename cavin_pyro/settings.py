@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from cavin_pyro.errors import UserError, at_least, check_seed, fraction
-from cavin_pyro.training import BATCHES, PRODUCTS, SCHEDULES, TrainerSettings
+from cavin_pyro.arithmetic import PRODUCTS
+from cavin_pyro.errors import UserError, at_least, check_seed, fraction, one_of
+from cavin_pyro.training import BATCHES, SCHEDULES, TrainerSettings
 from cavin_pyro.windows import WindowSettings
 
 
@@ -23,8 +24,7 @@ def trainer_settings(config: DictConfig) -> TrainerSettings:
         if not isinstance(trainer[name], int | float) or not trainer[name] > 0:
             raise UserError(f"trainer.{name} must be a positive number, not {trainer[name]}")
     for name, choices in (("schedule", SCHEDULES), ("batches", BATCHES), ("products", PRODUCTS)):
-        if trainer[name] not in choices:
-            raise UserError(f"unknown trainer.{name} {trainer[name]!r}: choose from {', '.join(choices)}")
+        one_of(f"trainer.{name}", trainer[name], choices)
     return TrainerSettings(**{str(name): value for name, value in trainer.items()}, seed=config.seed)
 
 

@@ -11,9 +11,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from pyro.nn import PyroModule
 
+from cavin_pyro.arithmetic import PRODUCTS, keep_freed_memory, set_products
 from cavin_pyro.building import build_model, class_of, construct, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
-from cavin_pyro.errors import UserError, at_least, check_seed, user_input
+from cavin_pyro.errors import UserError, at_least, check_seed, one_of, user_input
 from cavin_pyro.worlds import check_world, object_ranges
 from envs.layouts import Layout, load_layout
 from envs.pushing import PushingEnv
@@ -41,6 +42,7 @@ def check_words(config: DictConfig) -> None:
     """
     check_seed(config.seed)
     at_least("maximum_steps", config.maximum_steps, 1)
+    one_of("products", config.products, PRODUCTS)
     if type(config.objects) is not int or not 1 <= config.objects <= MAXIMUM_OBJECTS:
         raise UserError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {config.objects}")
     check_world(config.env)
@@ -53,6 +55,8 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
         UserError: unknown task or layout, a checkpoint that cannot be used, a planner that refuses its options.
     """
     check_words(config)
+    set_products(config.products)
+    keep_freed_memory()
     with user_input():
         tiles = OmegaConf.to_container(config.tiles)
         assert isinstance(tiles, dict)

@@ -24,6 +24,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 
+from cavin_pyro.arithmetic import set_products
 from cavin_pyro.elbo import elbo_terms, first_unsound, mean_terms
 from cavin_pyro.errors import UserError
 from cavin_pyro.files import replacing
@@ -33,7 +34,6 @@ from cavin_pyro.windows import WindowTable
 
 SCHEDULES = ("constant", "cosine")
 BATCHES = ("mixed", "alike")
-PRODUCTS = {"float32": "highest", "bfloat16": "medium"}  # to torch's names
 Row = dict[str, float]
 
 
@@ -94,7 +94,7 @@ class Trainer:
         self._loss = objective.bind(model, guide)
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=settings.learning_rate, fused=True)
         self._batches = torch.Generator().manual_seed(settings.seed)
-        torch.set_float32_matmul_precision(PRODUCTS[settings.products])
+        set_products(settings.products)
         torch.manual_seed(settings.seed)
         self.step, self.best, self.best_step, self.stale = 0, math.inf, 0, 0
         self.rows: list[Row] = []

@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.errors import UserError, one_of
 from envs.objects import ObjectRanges
 from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
@@ -22,8 +22,7 @@ def check_world(env: DictConfig) -> None:
         UserError: unknown part; the valid ones are named.
     """
     for word, valid in CHOICES.items():
-        if env[word] not in valid:
-            raise UserError(f"unknown env.{word} {env[word]!r}: choose from {', '.join(valid)}")
+        one_of(f"env.{word}", env[word], valid)
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:

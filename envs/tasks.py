@@ -7,6 +7,7 @@ progress in metres.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -25,7 +26,7 @@ class Outcome(NamedTuple):
     """What one step of a task came to; every field is [...].
 
     Attributes:
-        reward: the sum of the terms. progress: metres towards the goal, the dense term.
+        reward: the sum of the terms. progress: metres towards the goal, the dense term; zero where rewards are sparse.
         success, violation, fall: bool, at most one is true.
     """
 
@@ -70,25 +71,23 @@ class TaskReward:
             previous, centers: [..., M, 3] metres before and after the step; object 0 is the target.
             mask: [..., M] bool, True for real objects.
         """
-        before, after = previous[..., :2], centers[..., :2]
-        fall = (self._entered(-table_distance(before), -table_distance(after)) & mask).any(dim=-1)
+        before, after = torch.broadcast_tensors(previous[..., :2], centers[..., :2])
+        fall = (self._entered(_off_table, before, after) & mask).any(dim=-1)
         if self.layout.task == "clearing":
             violation = torch.zeros_like(fall)
             success = (~mask | (self._region.signed_distance(after) > self.margin)).all(dim=-1)
         elif self.layout.task == "insertion":
-            inside = (-self._region.signed_distance(points) for points in (before, after))
-            # Entering is leaving the outside: the same rule as for the table's edge and the bridge.
-            violation = (self._entered(*inside) & mask).any(dim=-1)
+            violation = (self._entered(self._inside_region, before, after) & mask).any(dim=-1)
             success = self._arrived(after[..., 0, :])
         else:
-            target = (self._region.signed_distance(points[..., 0, :]) for points in (before, after))
-            violation = self._entered(*target)
+            violation = self._entered(self._region.signed_distance, before[..., 0, :], after[..., 0, :])
             success = self._arrived(after[..., 0, :])
         violation = violation & ~fall
         success = success & ~fall & ~violation
-        progress = self.potential(after, mask) - self.potential(before, mask)
         reward = TIME_REWARD + GOAL_REWARD * success + VIOLATION_REWARD * (violation | fall)
+        progress = torch.zeros_like(reward)
         if self.dense:
+            progress = self.potential(after, mask) - self.potential(before, mask)
             reward = reward + progress
         return Outcome(reward.to(centers.dtype), progress, success, violation, fall)
 
@@ -108,10 +107,26 @@ class TaskReward:
         remaining = self._region.contains(positions) & mask
         return -torch.where(remaining, table_distance(positions), 0.0).sum(dim=-1)
 
-    def _entered(self, before: Tensor, after: Tensor) -> Tensor:
-        """Whether a depth in metres (positive is forbidden) is forbidden now, or grows within the margin."""
-        return (after > 0.0) | ((after > -self.margin) & (after > before))
+    def _entered(self, depth: Callable[[Tensor], Tensor], before: Tensor, after: Tensor) -> Tensor:
+        """Whether points [..., 2] are forbidden now, or draw nearer to what is forbidden within the margin: [...].
+
+        `depth` of points [..., 2] is in metres, positive where it is forbidden.
+        """
+        now = depth(after)
+        entered = now > 0.0
+        near = (now > -self.margin) & ~entered
+        if bool(near.any()):  # the place before counts only there, and few points are there
+            closer = now[near] > depth(before[near])
+            entered = entered.masked_scatter(near, closer)
+        return entered
+
+    def _inside_region(self, points: Tensor) -> Tensor:
+        return -self._region.signed_distance(points)
 
     def _arrived(self, target: Tensor) -> Tensor:
         assert self._goal is not None
-        return self._goal.signed_distance(target) <= 0.0
+        return self._goal.contains(target)
+
+
+def _off_table(points: Tensor) -> Tensor:
+    return -table_distance(points)

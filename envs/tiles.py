@@ -78,5 +78,7 @@ def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:
 
 def table_distance(points: Tensor) -> Tensor:
     """Metres by which points [..., 2] lie inside the table's nearest edge, negative off the table: [...]."""
-    low, high = points.new_tensor(TABLE_LOW), points.new_tensor(TABLE_HIGH)
-    return torch.minimum(points - low, high - points).amin(dim=-1)
+    sides = []
+    for axis, (low, high) in enumerate(zip(TABLE_LOW, TABLE_HIGH, strict=True)):  # see `TileSet.signed_distance`
+        sides.append(torch.minimum(points[..., axis] - low, high - points[..., axis]))
+    return torch.minimum(*sides)

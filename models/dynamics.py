@@ -55,7 +55,9 @@ class StateChange(nn.Module):
         """`effect: [..., M, width]` -> predicted state; leading dimensions broadcast, padding stays put."""
         gate, motion, turn = self.head(effect).split(self.parts, -1)
         gate = gate.sigmoid() * state.mask.unsqueeze(-1)
-        centers = state.centers + gate * (self.reach * motion.tanh())
+        centers = state.centers + gate * (
+            self.reach * motion.contiguous().tanh()
+        )  # tanh too is slow on what is apart in memory
         features = functional.normalize(state.features + gate * turn, dim=-1)
         return State(centers, features, state.mask.expand(centers.shape[:-1]))
 

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 
 from models.state import State
+from planning.bulk import in_bulk
 from planning.candidates import Search
 from planning.effects import choose_effects
-from planning.inputs import check_horizon, check_positive, check_scenes, check_weight
+from planning.inputs import check_horizon, check_positive, check_weight
 from planning.levels import EffectLevel, MotionLevel
 from planning.motions import Closeness, choose_motions
 from planning.optimisers import make_optimiser
@@ -92,16 +93,15 @@ class CavinPlanner:
         self.robustness = robustness
         self.reachability = reachability
 
+    @in_bulk
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
         """Plan for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
 
-        An environment's plan depends on its own state and generator only. Not for several threads at once:
-        torch's global generator is borrowed and given back. Raises ValueError for a state that is not a batch
-        of scenes, for another number of generators than B, and where an environment has no finite candidate.
+        An environment's plan depends on its own state and generator only. For errors see `planning.bulk.in_bulk`.
         """
         # Lines 2, 3, 11 and 12 (repeat until the episode is done, execute, t = t + T) are the caller's.
-        check_scenes(state, generators)  # line 4: the new s_t
+        # Line 4, the new s_t, is what it was given.
         # Lines 5 to 7: choose the effect codes c* and their subgoals.
         what = Search(EffectLevel(self.model), self.effect_score, state, generators, self.segments)
         plans = self.optimiser.optimise(what, self.samples)

@@ -23,13 +23,16 @@ def take(record: Record, numbers: Tensor) -> Record:
     return chosen(record)
 
 
-def join(records: Sequence[Record]) -> Record:
-    """The plans of several records of one kind, one after the other: `[B, N_1, ...], ... -> [B, N_1 + ..., ...]`."""
+def join(records: Sequence[Record], dimension: int = 1) -> Record:
+    """The plans of several records of one kind, one after the other: `[B, N_1, ...], ... -> [B, N_1 + ..., ...]`.
+
+    With `dimension=0` the environments: `[B_1, ...], ... -> [B_1 + ..., ...]`.
+    """
 
     def joined(values: Sequence[Any]) -> Any:
         first = values[0]
         if isinstance(first, tuple):
             return type(first)(*map(joined, zip(*values, strict=True)))
-        return None if any(value is None for value in values) else torch.cat(list(values), dim=1)
+        return None if any(value is None for value in values) else torch.cat(list(values), dim=dimension)
 
     return joined(list(records))

@@ -10,6 +10,14 @@ import torch
 from models.state import State
 
 
+class HopelessEnvironmentError(ValueError):
+    """There is nothing to choose for one environment of a batch; `what` says why."""
+
+    def __init__(self, environment: int, what: str) -> None:
+        super().__init__(f"environment {environment}: {what}")
+        self.environment, self.what = environment, what
+
+
 def check_positive(name: str, value: int) -> None:
     """Raise ValueError if a count is zero or negative."""
     if value < 1:

@@ -9,8 +9,9 @@ import torch
 
 from models.state import State
 from planning import ranking
+from planning.bulk import in_bulk
 from planning.candidates import Candidates, Search
-from planning.inputs import check_horizon, check_positive, check_scenes
+from planning.inputs import check_horizon, check_positive
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
@@ -52,10 +53,10 @@ class PushSearch:
         self.samples = samples
         self.segments = horizon // model.segment_length  # K = H / T
 
+    @in_bulk
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
-        check_scenes(state, generators)
         search = Search(self.level, self.score, state, generators, self.segments)
         return self._best(self.optimiser.optimise(search, self.samples))
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from models.state import State
+from planning.inputs import HopelessEnvironmentError
 
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
@@ -38,8 +39,9 @@ def best(scores: Tensor, what: str) -> Tensor:
     finite = torch.isfinite(scores)
     hopeless = (~finite.any(-1)).nonzero().flatten().tolist()
     if hopeless:
-        raise ValueError(
-            f"environment {hopeless[0]}: none of the {scores.shape[-1]} {what} is finite; "
-            "check the observed state, the reward and the model's weights"
+        raise HopelessEnvironmentError(
+            hopeless[0],
+            f"none of the {scores.shape[-1]} {what} is finite; "
+            "check the observed state, the reward and the model's weights",
         )
     return torch.where(finite, scores, -torch.inf).argmax(-1)

@@ -22,13 +22,12 @@ def sample_each(
     `conditions`: what the prior is given, states and codes with leading dimensions `[B, N]`. The prior is
     asked per environment, so that neither its randomness nor its distribution sees the rest of the batch.
     """
-    draws = []
-    for index, generator in enumerate(generators):
-        scene = [_scene(condition, index) for condition in conditions]
-        distribution = prior(*scene)
-        with _global_randomness_from(generator):
-            draws.append(distribution.sample())
-    return torch.stack(draws)
+    return torch.stack(
+        [
+            _draw(prior(*(_scene(condition, index) for condition in conditions)), generator)
+            for index, generator in enumerate(generators)
+        ]
+    )
 
 
 def noise_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
@@ -78,13 +77,28 @@ def code_of(prior: Distribution, noise: Tensor) -> Tensor:
     )
 
 
+def _is_made_of_noise(prior: Distribution) -> bool:
+    """Whether `code_of` knows this prior."""
+    if isinstance(prior, Independent | TransformedDistribution) and not hasattr(prior, "from_noise"):
+        return _is_made_of_noise(prior.base_dist)
+    return isinstance(prior, Normal) or hasattr(prior, "from_noise")
+
+
+def _draw(prior: Distribution, generator: torch.Generator) -> Tensor:
+    if _is_made_of_noise(prior):
+        shape = prior.batch_shape + prior.event_shape
+        return code_of(prior, torch.randn(shape, generator=generator, device=generator.device))
+    with _global_randomness_from(generator):
+        return prior.sample()
+
+
 def _scene(condition: State | Tensor, index: int) -> State | Tensor:
     return condition.scene(index) if isinstance(condition, State) else condition[index]
 
 
 @contextmanager
 def _global_randomness_from(generator: torch.Generator) -> Iterator[None]:
-    """Let a generator stand in for torch's global one: distributions take no generator of their own."""
+    """Let a generator stand in for torch's global one: `Distribution.sample` takes no generator of its own."""
     device = generator.device
     if device.type == "cuda":
         with torch.random.fork_rng(devices=[device]):

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 
 from models.state import State
+from planning.bulk import in_bulk
 from planning.candidates import Search
 from planning.effects import choose_effects
 from planning.following import follow
-from planning.inputs import check_horizon, check_positive, check_scenes
+from planning.inputs import HopelessEnvironmentError, check_horizon, check_positive
 from planning.levels import EffectLevel
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
@@ -54,10 +55,10 @@ class SectarPlanner:
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1: K = H / T
 
+    @in_bulk
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
-        check_scenes(state, generators)  # line 4: the new s_t
         # Lines 5 to 7: choose the codes c* and their subgoals.
         search = Search(EffectLevel(self.model), self.score, state, generators, self.segments)
         effects = choose_effects(self.optimiser.optimise(search, self.samples))
@@ -68,8 +69,8 @@ class SectarPlanner:
         _, path = follow(self.model, here, actions)
         broken = (~torch.isfinite(actions).flatten(1).all(-1)).nonzero().flatten().tolist()
         if broken:
-            raise ValueError(
-                f"environment {broken[0]}: the pushes of the chosen effect are not finite; check the model's weights"
+            raise HopelessEnvironmentError(
+                broken[0], "the pushes of the chosen effect are not finite; check the model's weights"
             )
         return Plan(
             actions=actions[:, 0],

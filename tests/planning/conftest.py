@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from models.state import State
+from planning import bulk
 from planning.sampling import noise_each
 from planning.segments import Stretch
 
@@ -192,6 +193,12 @@ def scenes(positions: Sequence[Sequence[tuple[float, float]]], gains: Sequence[f
 
 def generators(*seeds: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+@pytest.fixture(autouse=True)
+def environments_in_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plan all environments of a test in one chunk, so that what is computed for several at once is tested."""
+    monkeypatch.setattr(bulk, "ENVIRONMENTS_ON_PROCESSOR", 1000)
 
 
 @pytest.fixture
