@@ -68,6 +68,8 @@ class CavinPlanner:
         *,
         optimizer: str = "shooting",
         optimizer_options: Mapping[str, Any] | None = None,
+        motion_optimizer: str | None = None,
+        motion_optimizer_options: Mapping[str, Any] | None = None,
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
         feature_weight: float = 0.0,
@@ -80,7 +82,10 @@ class CavinPlanner:
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
+        self.effect_optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
+        self.motion_optimiser = self.effect_optimiser
+        if motion_optimizer is not None:
+            self.motion_optimiser = make_optimiser(motion_optimizer, motion_optimizer_options, samples=samples)
         limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="segments")
         self.effect_score = CumulativeReward(limited, reward_at)
         self.model = model
@@ -104,7 +109,7 @@ class CavinPlanner:
         # Line 4, the new s_t, is what it was given.
         # Lines 5 to 7: choose the effect codes c* and their subgoals.
         what = Search(EffectLevel(self.model), self.effect_score, state, generators, self.segments)
-        plans = self.optimiser.optimise(what, self.samples)
+        plans = self.effect_optimiser.optimise(what, self.samples)
         chosen = None  # the highest return, as h predicts it
         if self.reachability is not None:
             chosen = most_reachable(self.reachability, plans, self.model, self.reward)
@@ -114,7 +119,7 @@ class CavinPlanner:
             effects, self.reward, feature_weight=self.feature_weight, avoid_failures=self.avoid_failures
         )
         how = Search(MotionLevel(self.model, effects.codes), closeness, state, generators, self.motion_segments)
-        sequences = self.optimiser.optimise(how, self.samples)
+        sequences = self.motion_optimiser.optimise(how, self.samples)
         motions = choose_motions(sequences, self.model, closeness, self.robustness)
         return Plan(
             actions=motions.actions[:, : self.model.segment_length],

@@ -35,6 +35,11 @@ def noise_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> T
     return torch.stack([torch.randn(*shape, generator=source, device=source.device) for source in generators])
 
 
+def uniform_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Uniform numbers in [0, 1), each environment's from its own generator: `[B, *shape]`."""
+    return torch.stack([torch.rand(*shape, generator=source, device=source.device) for source in generators])
+
+
 def codes_each(prior: Callable[..., Distribution], conditions: Sequence[State | Tensor], noise: Tensor) -> Tensor:
     """The codes that standard normal `noise: [B, N, D]` stands for: `[B, N, D]`, distributed as the prior.
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from planning.candidates import Candidates, Search
 from planning.optimisers.cross_entropy import CrossEntropy
+from planning.optimisers.evolution import Evolution
 from planning.optimisers.improved_cross_entropy import ImprovedCrossEntropy
 from planning.optimisers.path_integral import PathIntegral
 from planning.optimisers.sequential_monte_carlo import SequentialMonteCarlo
@@ -36,6 +37,7 @@ OPTIMISERS: dict[str, type] = {
     "cem": CrossEntropy,
     "icem": ImprovedCrossEntropy,
     "mppi": PathIntegral,
+    "evolution": Evolution,
     "smc": SequentialMonteCarlo,
 }
 
@@ -65,6 +67,7 @@ def make_optimiser(name: str, options: Mapping[str, Any] | None = None, *, sampl
 __all__ = [
     "OPTIMISERS",
     "CrossEntropy",
+    "Evolution",
     "ImprovedCrossEntropy",
     "Optimiser",
     "PathIntegral",

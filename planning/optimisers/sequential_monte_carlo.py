@@ -18,7 +18,7 @@ from torch import Tensor
 from planning.candidates import Candidates, Search, join
 from planning.inputs import check_fraction, check_positive
 from planning.optimisers.weights import adapt_temperature
-from planning.sampling import noise_each
+from planning.sampling import noise_each, uniform_each
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,7 @@ class SequentialMonteCarlo:
         for segment in noise.unbind(2):
             proposed = proposed.extend(segment)
         gain = inverse.unsqueeze(-1) * (living_returns(proposed) - living_returns(particles))  # NaN: both dead
-        chance = torch.stack(
-            [torch.rand(particles.count, generator=source, device=source.device) for source in search.generators]
-        )
+        chance = uniform_each((particles.count,), search.generators)
         accepted = chance.log() < gain
         own = torch.arange(particles.count, device=inverse.device)
         numbers = torch.where(accepted, own + particles.count, own.expand_as(accepted))
@@ -104,7 +102,7 @@ def _resample(logarithms: Tensor, generators: Sequence[torch.Generator]) -> Tens
     """Numbers `[B, n]` of the plans to go on with, by systematic resampling; without weights everybody stays."""
     count = logarithms.shape[-1]
     weights = torch.softmax(logarithms, -1)
-    offsets = torch.stack([torch.rand(1, generator=source, device=source.device) for source in generators])
+    offsets = uniform_each((1,), generators)
     places = (torch.arange(count, device=weights.device) + offsets.double()) / count
     numbers = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)
     hopeless = ~torch.isfinite(weights).all(-1, keepdim=True)
