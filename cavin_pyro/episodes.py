@@ -107,7 +107,7 @@ def run_episode(
     while not ended:
         began = time.perf_counter()
         state = observed_state(observation, pointnet)
-        plan = planner.plan(state, [generator])
+        plan = planner.plan(state, [generator], episode.decisions[-1].plan if episode.decisions else None)
         decision = Decision(
             step=len(episode.pushes),
             centers=observation["centers"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import torch
 
@@ -25,8 +25,7 @@ class Sampling(Protocol):
     samples: int
 
 
-Self = TypeVar("Self", bound=Sampling)
-PlanMethod = Callable[[Self, State, Sequence[torch.Generator]], Plan]
+PlanMethod = Callable[..., Plan]  # (self, state, generators, previous)
 
 
 def in_bulk(plan: PlanMethod) -> PlanMethod:
@@ -37,7 +36,9 @@ def in_bulk(plan: PlanMethod) -> PlanMethod:
     """
 
     @wraps(plan)
-    def planned(self: Self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+    def planned(
+        self: Sampling, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None
+    ) -> Plan:
         check_scenes(state, generators)
         size = ENVIRONMENTS_ON_PROCESSOR
         if state.centers.device.type != "cpu":
@@ -45,8 +46,9 @@ def in_bulk(plan: PlanMethod) -> PlanMethod:
         plans = []
         for start in range(0, max(len(generators), 1), size):
             chunk = slice(start, start + size)
+            last = previous and fields.apply(previous, lambda field: field[chunk])  # noqa: B023
             try:
-                plans.append(plan(self, state.scene(chunk), generators[chunk]))
+                plans.append(plan(self, state.scene(chunk), generators[chunk], last))
             except HopelessEnvironmentError as error:
                 raise HopelessEnvironmentError(start + error.environment, error.what) from error
         return plans[0] if len(plans) == 1 else fields.join(plans, dimension=0)

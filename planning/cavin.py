@@ -13,6 +13,7 @@ from planning.candidates import Search
 from planning.effects import choose_effects
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.levels import EffectLevel, MotionLevel
+from planning.memory import hints
 from planning.motions import Closeness, choose_motions
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
@@ -100,7 +101,7 @@ class CavinPlanner:
 
     @in_bulk
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
 
         An environment's plan depends on its own state and generator only. For errors see `planning.bulk.in_bulk`.
@@ -108,7 +109,9 @@ class CavinPlanner:
         # Lines 2, 3, 11 and 12 (repeat until the episode is done, execute, t = t + T) are the caller's.
         # Line 4, the new s_t, is what it was given.
         # Lines 5 to 7: choose the effect codes c* and their subgoals.
-        what = Search(EffectLevel(self.model), self.effect_score, state, generators, self.segments)
+        what = Search(
+            EffectLevel(self.model), self.effect_score, state, generators, self.segments, hints(previous, generators)
+        )
         plans = self.effect_optimiser.optimise(what, self.samples)
         chosen = None  # the highest return, as h predicts it
         if self.reachability is not None:
@@ -132,5 +135,6 @@ class CavinPlanner:
             expected_return=effects.expected_return,
             expected_success=effects.expected_success,
             candidate_centers=effects.candidate_centers,
+            noise=effects.noise,
             candidate_returns=effects.candidate_returns,
         )

@@ -10,6 +10,7 @@ from torch import Tensor
 from models.state import State
 from planning import ranking
 from planning.candidates import Candidates
+from planning.memory import remembered
 
 
 class EffectPlan(NamedTuple):
@@ -20,6 +21,7 @@ class EffectPlan(NamedTuple):
     segments: Tensor  # [B] int64, 1..K: segments until the plan ends
     expected_return: Tensor  # [B]
     expected_success: Tensor  # [B] bool
+    noise: Tensor  # [B, K, C] of which the codes were made, or [B, 0, 0]
     candidate_centers: Tensor  # [B, N, K, M, 3] metres
     candidate_returns: Tensor  # [B, N]
 
@@ -45,6 +47,7 @@ def choose_effects(candidates: Candidates, chosen: Tensor | None = None) -> Effe
         segments=progress.segments[environments, chosen],
         expected_return=progress.returns[environments, chosen],
         expected_success=progress.succeeded[environments, chosen],
+        noise=remembered(candidates, chosen),
         candidate_centers=candidates.history(lambda segment: segment.stretch.states.centers),
         candidate_returns=progress.returns,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -11,16 +11,21 @@ from torch import Tensor
 Record = TypeVar("Record", bound=tuple)
 
 
+def apply(record: Record, function: Callable[[Tensor], Tensor]) -> Record:
+    """The same function of every field; None stays None."""
+
+    def applied(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return type(value)(*map(applied, value))
+        return None if value is None else function(value)
+
+    return applied(record)
+
+
 def take(record: Record, numbers: Tensor) -> Record:
     """Plans by number, per environment: fields `[B, N, ...]`, `numbers: [B, n]` int64 -> `[B, n, ...]`."""
     environments = torch.arange(len(numbers), device=numbers.device).unsqueeze(-1)
-
-    def chosen(value: Any) -> Any:
-        if isinstance(value, tuple):
-            return type(value)(*map(chosen, value))
-        return None if value is None else value[environments, numbers]
-
-    return chosen(record)
+    return apply(record, lambda field: field[environments, numbers])
 
 
 def join(records: Sequence[Record], dimension: int = 1) -> Record:

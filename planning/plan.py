@@ -28,4 +28,5 @@ class Plan(NamedTuple):
     expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
     expected_success: Tensor  # [B] bool: the chosen plan reaches the goal
     candidate_centers: Tensor  # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies
+    noise: Tensor  # [B, K, D] what the searched codes or pushes were made of, or [B, 0, 0]; see `planning.memory`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite

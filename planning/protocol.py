@@ -75,5 +75,8 @@ class RewardFunction(Protocol):
 class Planner(Protocol):
     """Anything that turns observed states into pushes."""
 
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
-        """Plan for the scenes `state: [B]`, each with its own source of randomness."""
+    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
+        """Plan for the scenes `state: [B]`, each with its own source of randomness.
+
+        `previous`: the plans whose `actions` have just been executed, for optimisers that go on from them.
+        """

@@ -12,6 +12,7 @@ from planning import ranking
 from planning.bulk import in_bulk
 from planning.candidates import Candidates, Search
 from planning.inputs import check_horizon, check_positive
+from planning.memory import hints, remembered
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
@@ -55,9 +56,9 @@ class PushSearch:
 
     @in_bulk
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
-        search = Search(self.level, self.score, state, generators, self.segments)
+        search = Search(self.level, self.score, state, generators, self.segments, hints(previous, generators))
         return self._best(self.optimiser.optimise(search, self.samples))
 
     def _best(self, candidates: Candidates) -> Plan:
@@ -82,5 +83,6 @@ class PushSearch:
             expected_return=progress.returns[environments, chosen],
             expected_success=progress.succeeded[environments, chosen],
             candidate_centers=candidates.history(lambda segment: segment.stretch.states.centers),
+            noise=remembered(candidates, chosen),
             candidate_returns=progress.returns,
         )

@@ -22,7 +22,7 @@ class RandomPlanner:
         self.segment_length = segment_length
 
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Draw `[B, T, 4]` pushes for the scenes `state: [B]`; nothing is predicted or chosen.
 
         Raises ValueError unless there is one generator per environment.
@@ -52,5 +52,6 @@ class RandomPlanner:
             expected_return=state.centers.new_full((environments,), torch.nan),
             expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
             candidate_centers=empty(environments, 0, 0, objects, 3),
+            noise=empty(environments, 0, 0),
             candidate_returns=empty(environments, 0),
         )

@@ -14,6 +14,7 @@ from planning.effects import choose_effects
 from planning.following import follow
 from planning.inputs import HopelessEnvironmentError, check_horizon, check_positive
 from planning.levels import EffectLevel
+from planning.memory import hints
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
@@ -57,10 +58,12 @@ class SectarPlanner:
 
     @in_bulk
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
-        search = Search(EffectLevel(self.model), self.score, state, generators, self.segments)
+        search = Search(
+            EffectLevel(self.model), self.score, state, generators, self.segments, hints(previous, generators)
+        )
         effects = choose_effects(self.optimiser.optimise(search, self.samples))
         # Lines 8 to 10 without motion codes: the pushes of the first segment, all that is executed.
         here = state.expand_plans(1)
@@ -83,5 +86,6 @@ class SectarPlanner:
             expected_return=effects.expected_return,
             expected_success=effects.expected_success,
             candidate_centers=effects.candidate_centers,
+            noise=effects.noise,
             candidate_returns=effects.candidate_returns,
         )

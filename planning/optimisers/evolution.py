@@ -25,7 +25,7 @@ class Evolution:
     generations: after the first, which is drawn from the prior. first: fraction of the samples that the first one
     takes. parents: how many, at most. omitted, altered: segments, on average, of a child. step: of an alteration, in
     (0, 1], which leaves the prior invariant; 1 draws the segment anew. replacement: as in shooting, in the first
-    generation.
+    generation. memory: whether what is left of the last plan competes in the first generation.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -37,6 +37,7 @@ class Evolution:
     altered: float = 1.0
     step: float = 0.5
     replacement: bool = True
+    memory: bool = True
 
     def __post_init__(self) -> None:
         check_positive("generations", self.generations)
@@ -54,7 +55,11 @@ class Evolution:
     def optimise(self, search: Search, samples: int) -> Candidates:
         """All N = `samples` plans `[B, N]` that were considered."""
         begin = min(max(1, round(self.first * samples)), samples - self.generations)
-        considered = [search.evaluate(search.noise(begin), replacement=self.replacement)]
+        noise = search.noise(begin)
+        if self.memory and search.hints is not None:
+            count = min(begin, search.hints.shape[1])
+            noise[:, :count] = search.hints[:, :count]
+        considered = [search.evaluate(noise, replacement=self.replacement)]
         tried = Tried(considered[0].noise, considered[0].returns)
         for number in range(self.generations):
             tried = best(tried, self.parents)
