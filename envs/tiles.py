@@ -23,8 +23,9 @@ class TileSet:
         self.tiles = tuple(tiles)
         self.centers = _tensor([tile_center(tile) for tile in self.tiles]).reshape(-1, 2)
         # Neighbours compute their common border from the same half index, so that rounding leaves no gap.
-        self._low = _tensor([tile_center((i - 0.5, j - 0.5)) for i, j in self.tiles]).reshape(-1, 2)
-        self._high = _tensor([tile_center((i + 0.5, j + 0.5)) for i, j in self.tiles]).reshape(-1, 2)
+        rows = _rows(self.tiles)
+        self._low = _tensor([tile_center((i - 0.5, first - 0.5)) for i, first, _ in rows]).reshape(-1, 2)
+        self._high = _tensor([tile_center((i + 0.5, last + 0.5)) for i, _, last in rows]).reshape(-1, 2)
         edges = _tensor(_outline(set(self.tiles))).reshape(-1, 2, 2)
         self._edge_low, self._edge_high = edges[:, 0], edges[:, 1]
 
@@ -48,6 +49,17 @@ class TileSet:
 
 def _tensor(numbers: Sequence[Any]) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
+
+
+def _rows(tiles: Iterable[Tile]) -> list[tuple[int, int, int]]:
+    """Neighbours along y joined: (i, first j, last j), fewer rectangles to compare points with."""
+    rows: list[tuple[int, int, int]] = []
+    for i, j in sorted(tiles):
+        if rows and rows[-1][0] == i and rows[-1][2] == j - 1:
+            rows[-1] = (i, rows[-1][1], j)
+        else:
+            rows.append((i, j, j))
+    return rows
 
 
 def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:

@@ -25,7 +25,7 @@ class Evolution:
     generations: after the first, which is drawn from the prior. first: fraction of the samples that the first one
     takes. parents: how many, at most. omitted, altered: segments, on average, of a child. step: of an alteration, in
     (0, 1], which leaves the prior invariant; 1 draws the segment anew. replacement: as in shooting, in the first
-    generation. memory: whether what is left of the last plan competes in the first generation.
+    generation. memory: fraction of the first generation that is what is left of the last plan, and its children.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -37,7 +37,7 @@ class Evolution:
     altered: float = 1.0
     step: float = 0.5
     replacement: bool = True
-    memory: bool = True
+    memory: float = 0.2
 
     def __post_init__(self) -> None:
         check_positive("generations", self.generations)
@@ -46,6 +46,7 @@ class Evolution:
         for name in ("omitted", "altered"):
             check_weight(name, getattr(self, name))
         check_fraction("step", self.step, positive=True)
+        check_fraction("memory", self.memory)
 
     @property
     def iterations(self) -> int:
@@ -56,9 +57,9 @@ class Evolution:
         """All N = `samples` plans `[B, N]` that were considered."""
         begin = min(max(1, round(self.first * samples)), samples - self.generations)
         noise = search.noise(begin)
-        if self.memory and search.hints is not None:
-            count = min(begin, search.hints.shape[1])
-            noise[:, :count] = search.hints[:, :count]
+        heirs = min(begin, math.ceil(self.memory * begin))
+        if heirs and search.hints is not None:
+            noise[:, :heirs] = torch.cat([search.hints, self._children(search, search.hints, heirs)], 1)[:, :heirs]
         considered = [search.evaluate(noise, replacement=self.replacement)]
         tried = Tried(considered[0].noise, considered[0].returns)
         for number in range(self.generations):
