@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from envs.camera import Camera, sample_cloud
+from envs.markings import LEVEL, TileGroup, paint_tiles
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
+from envs.randomness import next_draw_streams
 from envs.robots import FrameHook, StickRobot
 from envs.segmentation import segment_by_mask
 from envs.shapes import builtin_shape, write_mesh
@@ -87,6 +89,7 @@ class Scene:
         self.camera = camera or Camera()
         self.on_frame = on_frame
         self.world = PhysicsWorld()
+        self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
         self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # where the time went, summed
@@ -107,13 +110,13 @@ class Scene:
 
         Args:
             areas: where each object may start; the first is the target.
-            generator: the scene's randomness; the points' randomness is spawned from it.
+            generator: the scene's randomness, from which that of objects and points is derived (`envs.randomness`).
 
         Raises:
             ValueError: the areas hold no such scene.
         """
         for _ in range(DRAWS):
-            scene_generator, point_generator = generator.spawn(2)
+            scene_generator, point_generator = next_draw_streams(generator)
             observation = self.reset(draw_objects(areas, ranges, scene_generator), point_generator)
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
@@ -196,8 +199,12 @@ class Scene:
         return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
 
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
-        """A colour image [height, width, 3] of the scene, for people."""
-        return self.world.render(camera).color
+        """A colour image [height, width, 3] of the scene with the `markings` on the table, for people."""
+        rendering = self.world.render(camera)
+        rows, columns = np.nonzero(~np.isin(rendering.bodies, self.bodies))
+        points = camera.points(rendering.depth, rows, columns)
+        top = np.abs(points[:, 2]) < LEVEL
+        return paint_tiles(rendering.color, rows[top], columns[top], points[top, :2], self.markings)
 
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""

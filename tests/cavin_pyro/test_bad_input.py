@@ -36,7 +36,7 @@ BAD = [
     ("plan", "planner=mpc planner.proposal=best", "unknown proposal 'best': take uniform or heuristic"),
     ("plan", "planner.reward_at=end", "unknown reward_at 'end': take path or subgoals"),
     ("plan", "planner.motion_horizon=long", "take full_horizon or first_segment"),
-    ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2 or the path of a YAML file"),
+    ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, random or the path of a YAML file"),
     ("plan", "env.robot=hand", "unknown env.robot 'hand': choose from stick"),
     ("plan", "env.ranges.names=[fork]", "unknown object 'fork' in env.ranges.names: choose from sugar_box"),
     ("train", "model=nonsense", "unknown model 'nonsense': choose from cascaded"),
