@@ -92,7 +92,7 @@ class Scene:
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
-        self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # where the time went, summed
+        self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # of CPU time, summed
 
     def close(self) -> None:
         """Free the simulator. Closing twice is harmless."""
@@ -132,7 +132,7 @@ class Scene:
         """
         if not 1 <= len(objects) <= MAXIMUM_OBJECTS:
             raise ValueError(f"a scene holds 1 to {MAXIMUM_OBJECTS} objects, not {len(objects)}")
-        began = time.perf_counter()
+        began = time.process_time()
         self.world.reset()
         self.objects = list(objects)
         self.bodies = [
@@ -152,7 +152,7 @@ class Scene:
         self._points = point_generator
         self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
         self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
-        self.seconds["physics"] += time.perf_counter() - began
+        self.seconds["physics"] += time.process_time() - began
         return self.observe()
 
     def push(self, action: NDArray[np.floating]) -> PushReport:
@@ -164,7 +164,7 @@ class Scene:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is four finite numbers (x, y, dx, dy), not {action.tolist()}")
-        began = time.perf_counter()
+        began = time.process_time()
         before = self.ground_truth()
         start, end = push_endpoints(action)
         safe = self.robot.push(start, end, self.bodies, on_frame=self.on_frame)
@@ -173,7 +173,7 @@ class Scene:
         after = self.ground_truth()
         moved = np.linalg.norm(after.positions - before.positions, axis=-1)
         turn = Rotation.from_quat(after.orientations) * Rotation.from_quat(before.orientations).inv()
-        self.seconds["physics"] += time.perf_counter() - began
+        self.seconds["physics"] += time.process_time() - began
         return PushReport(
             unsafe=not safe,
             ineffective=bool((moved < MOVED).all() and (turn.magnitude() < TURNED).all()),
@@ -183,9 +183,9 @@ class Scene:
 
     def observe(self) -> Observation:
         """Take a depth image and turn it into one cloud per object."""
-        began = time.perf_counter()
+        began = time.process_time()
         rendering = self.world.render(self.camera)
-        rendered = time.perf_counter()
+        rendered = time.process_time()
         visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
         for slot, (rows, columns) in enumerate(segment_by_mask(rendering, self.bodies)):
             if len(rows) >= MINIMUM_PIXELS:
@@ -195,7 +195,7 @@ class Scene:
         self._mask |= visible
         centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
         self.seconds["rendering"] += rendered - began
-        self.seconds["points"] += time.perf_counter() - rendered
+        self.seconds["points"] += time.process_time() - rendered
         return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
 
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:

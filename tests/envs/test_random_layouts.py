@@ -106,3 +106,13 @@ def test_the_reward_is_that_of_the_layout_drawn(envs: dict[str, PushingEnv]) -> 
         for slot, reached in ((number, True), (other, False)):
             there = torch.tensor([[*tile_center(env.layouts[slot].goal[0]), 0.03]])
             assert bool(env.reward(middle, there, torch.tensor([True])).success) == reached
+
+
+def test_a_scene_is_the_same_whether_its_layout_was_drawn_or_asked_for(envs: dict[str, PushingEnv]) -> None:
+    env = envs["clearing"]
+    for seed in range(3):
+        drawn, info = env.reset(seed=seed)
+        number = env.layouts.index(info["layout"])
+        asked = PushingEnv(task="clearing", layout=number, objects=5)
+        np.testing.assert_array_equal(asked.reset(seed=seed)[0]["clouds"], drawn["clouds"])
+        asked.close()
