@@ -29,15 +29,15 @@ from envs.objects import ObjectRanges
 from envs.physics import TIME_STEP
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import ObservationDict, PushingEnv
-from envs.scene import Observation, Scene
+from envs.scene import FALLEN, Observation, Scene
 from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, normalised_push
 
 CHUNK = 500
 EPISODE = 20  # pushes after which a scene is drawn anew, if it has not ended before
 EVERY = 5  # physics steps between two looks at the objects
 SPEED = 2.0  # metres per second, sideways or upwards; the tool goes at most 0.7
-FALLING = 4.0  # metres per second, downwards; where objects lie close, one of five may be dropped from 0.5 m (3.1 m/s)
-EDGE = 0.03  # metres; what is lower than the table and farther than this inside its edges went through it
+FALLING = 4.0  # metres per second, downwards; where objects lie close, one of five may be dropped from 0.7 m (3.7 m/s)
+EDGE = 0.03  # metres; what is lower than `FALLEN` and farther than this inside the table's edges went into it
 PATIENCE = 30.0  # seconds of CPU time for one reset or push; wall time would count a busy machine as a hang
 
 Push = NDArray[np.float32]
@@ -47,7 +47,7 @@ class Watch:
     """Looks at the objects every few physics steps, for what no push may do."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.jumps, self.through = scene, 0, 0
+        self.scene, self.jumps, self.through, self.deepest = scene, 0, 0, 1.0
         self.fastest = np.zeros(2)  # sideways or upwards, downwards
         self._before: NDArray[np.float64] | None = None
         self._steps = 0
@@ -68,7 +68,9 @@ class Watch:
     def _look(self) -> None:
         now = self.scene.ground_truth().positions
         inside = (now[:, :2] > np.array(TABLE_LOW) + EDGE) & (now[:, :2] < np.array(TABLE_HIGH) - EDGE)
-        self.through += int((inside.all(axis=-1) & (now[:, 2] < 0.0)).sum())
+        heights = now[inside.all(axis=-1), 2]
+        self.through += int((heights < FALLEN).sum())
+        self.deepest = min(self.deepest, heights.min(initial=1.0))
         if self._before is not None:
             above = (now[:, 2] > 0.0) | ~np.isfinite(now).all(axis=-1)  # what fell off the table may fall freely
             velocity = (now - self._before)[above] / (EVERY * TIME_STEP)
@@ -127,11 +129,12 @@ class World:
         worst: dict[str, float] = {
             "fastest_m_s": float(max(watch.fastest[0] for watch in self.watches)),
             "falling_m_s": float(max(watch.fastest[1] for watch in self.watches)),
+            "deepest_m": float(min(watch.deepest for watch in self.watches)),
             "jumps": sum(watch.jumps for watch in self.watches),
             "through": sum(watch.through for watch in self.watches),
         }
         for watch in self.watches:
-            watch.fastest, watch.jumps, watch.through = np.zeros(2), 0, 0
+            watch.fastest, watch.jumps, watch.through, watch.deepest = np.zeros(2), 0, 0, 1.0
         return worst
 
 
@@ -233,7 +236,8 @@ def summary(phase: str, lines: list[dict[str, Any]]) -> bool:
     fastest, falling = (max(line[name] for line in lines) for name in ("fastest_m_s", "falling_m_s"))
     print(f"  objects above the table: {fastest:.2f} m/s sideways or upwards (limit {SPEED:g})", end=", ")
     print(f"{falling:.2f} m/s downwards (limit {FALLING:g})")
-    print(f"  {jumps} jumps, {through} looks at an object inside the table")
+    deepest = min(line["deepest_m"] for line in lines)
+    print(f"  {jumps} jumps, {through} looks at an object inside the table; lowest centre {1e3 * deepest:+.1f} mm")
     ends: Counter[str] = Counter()
     for line in lines:
         ends.update(line["ends"])

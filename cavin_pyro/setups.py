@@ -76,8 +76,10 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
         planner, pointnet = _planner(config, reward)
         with user_input():  # tells at once whether every layout has room for the objects
-            for number in reversed(range(len(env.layouts))):
+            for number in range(len(env.layouts)):
                 env.reset(seed=config.seed, options={"layout": number})
+        if len(env.layouts) > 1:
+            env.reset(seed=config.seed)  # in the layout that the seed draws
     except BaseException:
         env.close()
         raise

@@ -201,6 +201,8 @@ class Scene:
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
         """A colour image [height, width, 3] of the scene with the `markings` on the table, for people."""
         rendering = self.world.render(camera)
+        if not self.markings:
+            return rendering.color
         rows, columns = np.nonzero(~np.isin(rendering.bodies, self.bodies))
         points = camera.points(rendering.depth, rows, columns)
         top = np.abs(points[:, 2]) < LEVEL
