@@ -17,6 +17,7 @@ from cavin_pyro.errors import UserError, user_input
 from cavin_pyro.progress import progress_bar
 from envs.objects import WHOLE_TABLE, Area, ObjectRanges
 from envs.policy import HeuristicPushingPolicy
+from envs.randomness import collection_streams
 from envs.scene import Observation, PushReport, Scene
 from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
@@ -77,7 +78,7 @@ def collect(settings: CollectionSettings, folder: Path, *, transitions: int, wor
 
 def collect_episode(scene: Scene, settings: CollectionSettings, episode: int) -> Arrays:
     """Collect one episode; arrays as in `cavin_pyro.dataset`, without the leading E."""
-    scene_generator, policy_generator = np.random.default_rng([settings.seed, episode]).spawn(2)
+    scene_generator, policy_generator = collection_streams(settings.seed, episode)
     count = int(scene_generator.integers(settings.minimum_objects, settings.maximum_objects + 1))
     with user_input():
         seen = scene.draw([crowd(scene_generator)] * count, settings.ranges, scene_generator)

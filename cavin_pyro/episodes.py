@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from envs.pushing import ObservationDict, PushingEnv
+from envs.randomness import planner_seed
 from models.pointnet import PointNet
 from models.state import State
 from planning import Plan, Planner
@@ -101,7 +102,7 @@ def run_episode(
         on_decision: called after every plan, before its pushes.
     """
     episode = Episode(seed)
-    generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]))
+    generator = torch.Generator().manual_seed(planner_seed(seed))
     observation, _ = env.reset(seed=seed)
     ended = False
     while not ended:

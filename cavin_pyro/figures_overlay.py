@@ -6,8 +6,6 @@ are (column, row), as of `Camera.project`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,35 +21,9 @@ SUBGOAL_COLOR = "#E69F00"  # orange, as in the paper
 PREDICTION_COLOR = "#007A5A"  # green
 PUSH_COLOR = "#1A1A1A"
 TABLE_COLOR = "#C2B9AD"  # where there is no photograph
-GOAL_COLOR = "#F2C200"  # gold
 
 TARGET_RADIUS = 0.07  # metres; of the circle that marks the target
 MOVING = 0.01  # metres; objects that are to move less are left out
-
-
-class TileGroup(NamedTuple):
-    """Tiles that mean the same: a name for the legend, colour, how opaque the fill is, and where they lie."""
-
-    name: str
-    color: str
-    opacity: float
-    tiles: tuple[Tile, ...]
-
-
-_REGIONS = {  # what `Layout.region` means to each task
-    "clearing": ("to clear", "#0072B2", 0.25),
-    "insertion": ("keep out", "#C2272D", 0.30),
-    "crossing": ("bridge", "#5A5A5A", 0.0),
-}
-
-
-def tile_groups(layout: Layout) -> list[TileGroup]:
-    """The task's region, and the goal where there is one."""
-    groups = [
-        TileGroup(*_REGIONS[layout.task], layout.region),
-        TileGroup("goal", GOAL_COLOR, 0.45, layout.goal),
-    ]
-    return [group for group in groups if group.tiles]
 
 
 def tile_corners(tile: Tile, camera: Camera) -> Pixels:

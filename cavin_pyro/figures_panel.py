@@ -27,10 +27,10 @@ from cavin_pyro.figures_overlay import (
     table_box,
     target_circle,
     tile_corners,
-    tile_groups,
 )
 from envs.camera import Camera
 from envs.layouts import Layout
+from envs.markings import tile_groups
 
 CANDIDATES = 150  # dots per panel
 # Nothing else in the picture is purple. The palest part is cut off: it would be lost on the table.
@@ -66,9 +66,9 @@ def draw_decision(panel: Axes, decision: Decision, layout: Layout, camera: Camer
         camera = camera.resized(width, height)
         panel.imshow(decision.photograph)
     left, top, right, bottom = table_box(camera)
-    if decision.photograph is None:
+    if decision.photograph is None:  # photographs show the tiles
         panel.fill([left, right, right, left], [top, top, bottom, bottom], color=TABLE_COLOR, zorder=0)
-    _draw_tiles(panel, layout, camera)
+        _draw_tiles(panel, layout, camera)
     if scale is not None:
         dots, returns = candidate_subgoals(decision, layout, camera, count=CANDIDATES)
         panel.scatter(dots[:, 0], dots[:, 1], s=9, c=returns, norm=scale, cmap=RETURNS, alpha=0.8, zorder=2)

@@ -14,14 +14,15 @@ from pyro.nn import PyroModule
 from cavin_pyro.arithmetic import PRODUCTS, keep_freed_memory, set_products
 from cavin_pyro.building import build_model, class_of, construct, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
+from cavin_pyro.episode_reward import EpisodeReward
 from cavin_pyro.errors import UserError, at_least, check_seed, one_of, user_input
 from cavin_pyro.worlds import check_world, object_ranges
-from envs.layouts import Layout, load_layout
+from envs.layouts import Layout
 from envs.pushing import PushingEnv
-from envs.tasks import TaskReward
 from envs.workspace import MAXIMUM_OBJECTS
 from models.pointnet import PointNet
 from planning import Planner
+from planning.protocol import RewardFunction
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,11 @@ class Setup:
     env: PushingEnv
     planner: Planner
     pointnet: PointNet
-    layout: Layout
+
+    @property
+    def layout(self) -> Layout:
+        """Of the episode that the environment is in."""
+        return self.env.layout
 
 
 def check_words(config: DictConfig) -> None:
@@ -60,24 +65,32 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
     with user_input():
         tiles = OmegaConf.to_container(config.tiles)
         assert isinstance(tiles, dict)
-        layout = load_layout(config.task, config.layout, {str(name): value for name, value in tiles.items()})
-        reward = TaskReward(layout, reward=config.reward, margin=config.margin)
-    planner, pointnet = _planner(config, reward)
-    with user_input():
         env = PushingEnv(
             task=config.task,
-            layout=layout,
+            layout=config.layout,
+            tiles={str(name): value for name, value in tiles.items()},
             reward=config.reward,
             objects=config.objects,
             ranges=object_ranges(config.env),
             maximum_steps=config.maximum_steps,
             render_mode="rgb_array" if render else None,
         )
-        env.reset(seed=config.seed)  # tells at once whether the layout has room for the objects
-    return Setup(env, planner, pointnet, layout)
+    try:
+        with user_input():
+            reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
+        planner, pointnet = _planner(config, reward)
+        with user_input():  # tells at once whether every layout has room for the objects
+            for number in range(len(env.layouts)):
+                env.reset(seed=config.seed, options={"layout": number})
+        if len(env.layouts) > 1:
+            env.reset(seed=config.seed)  # in the layout that the seed draws
+    except BaseException:
+        env.close()
+        raise
+    return Setup(env, planner, pointnet)
 
 
-def _planner(config: DictConfig, reward: TaskReward) -> tuple[Planner, PointNet]:
+def _planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, PointNet]:
     path = Path(config.checkpoint or default_checkpoint())
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     pointnet = pointnet_of(checkpoint, path)

@@ -18,7 +18,7 @@ from envs.pushing import VIDEO_SIZE
 
 def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool) -> dict[str, Any]:
     """Run one episode and write `steps.csv`, `plan.png` and, if wanted, `episode.mp4`; returns its results' row."""
-    with EpisodeVideo(folder / "episode.mp4", setup.layout) if video else nullcontext() as reel:
+    with EpisodeVideo(folder / "episode.mp4", setup.layout.task) if video else nullcontext() as reel:
         if reel is not None:
             film(setup.env, reel)
         episode = run_episode(

@@ -13,7 +13,7 @@ import imageio.v2 as imageio
 import numpy as np
 from imageio_ffmpeg import count_frames_and_secs
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont
 
 from cavin_pyro.episodes import Decision
 from cavin_pyro.figures_overlay import (
@@ -22,12 +22,9 @@ from cavin_pyro.figures_overlay import (
     Pixels,
     pushes,
     subgoal_chains,
-    tile_corners,
-    tile_groups,
 )
 from cavin_pyro.files import replacing
 from envs.camera import Camera
-from envs.layouts import Layout
 from envs.pushing import VIDEO_SIZE, PushingEnv
 
 FRAMES_PER_SECOND = 10
@@ -42,14 +39,12 @@ class EpisodeVideo:
     Use it as a context manager. Frames of odd sizes lose their last row or column, as the format wants.
 
     Args:
-        path: `.mp4`. layout: the tiles to draw. fps: frames per second.
+        path: `.mp4`. task: for the caption; the frames show its tiles themselves. fps: frames per second.
         camera: that takes the frames, in any resolution.
     """
 
-    def __init__(
-        self, path: Path, layout: Layout, fps: int = FRAMES_PER_SECOND, *, camera: Camera | None = None
-    ) -> None:
-        self.path, self.layout, self.fps = path, layout, fps
+    def __init__(self, path: Path, task: str, fps: int = FRAMES_PER_SECOND, *, camera: Camera | None = None) -> None:
+        self.path, self.task, self.fps = path, task, fps
         self.camera = camera or Camera()
         self._decision: Decision | None = None
         self._overlay: Image.Image | None = None
@@ -130,22 +125,17 @@ class EpisodeVideo:
 
     def _caption(self, phase: str) -> str:
         if self._decision is None:
-            return f"{self.layout.task} · {phase}"
+            return f"{self.task} · {phase}"
         first = self._decision.step + 1
         last = self._decision.step + self._decision.plan.actions.shape[1]
         numbers = f"push {first}" if first == last else f"pushes {first} to {last}"
-        return f"{self.layout.task} · {numbers} · {phase}"
+        return f"{self.task} · {numbers} · {phase}"
 
     def _draw_overlay(self, width: int, height: int) -> Image.Image:
         """Everything that stays the same until the next plan, as a transparent image."""
         camera = self.camera.resized(_FINE * width, _FINE * height)
         image = Image.new("RGBA", (camera.width, camera.height))
         draw = ImageDraw.Draw(image)
-        for group in tile_groups(self.layout):
-            red, green, blue = ImageColor.getrgb(group.color)[:3]
-            fill = (red, green, blue, round(255 * group.opacity))
-            for tile in group.tiles:
-                draw.polygon(_points(tile_corners(tile, camera)), fill=fill, outline=group.color, width=2 * _FINE)
         if self._decision is not None:
             _draw_decision(draw, self._decision, camera)
         return image.resize((width, height), Image.Resampling.LANCZOS)

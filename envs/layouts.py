@@ -59,7 +59,7 @@ def load_layout(task: str, layout: int | str | Path, overrides: Mapping[str, Any
     name = str(layout)
     if name.isdecimal():
         if int(name) not in BUILTIN_LAYOUTS:
-            raise ValueError(f"unknown layout {name}: choose 0, 1, 2 or the path of a YAML file")
+            raise ValueError(f"unknown layout {name}: choose 0, 1, 2, random or the path of a YAML file")
         path = _FOLDER / f"{task}_{int(name)}.yaml"
     else:
         path = Path(name)
@@ -67,7 +67,7 @@ def load_layout(task: str, layout: int | str | Path, overrides: Mapping[str, Any
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         reason = error.strerror
-        raise ValueError(f"layout {path} cannot be read ({reason}): give 0, 1, 2 or a YAML file") from error
+        raise ValueError(f"layout {path} cannot be read ({reason}): give 0, 1, 2, random or a YAML file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"layout {path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):

@@ -12,8 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from envs.camera import Camera
-from envs.layouts import Layout, Tile, load_layout
+from envs.layouts import Layout, Tile
+from envs.markings import tile_groups
 from envs.objects import Area, ObjectRanges
+from envs.random_layouts import possible_layouts
+from envs.randomness import layout_stream, next_scene_stream
 from envs.scene import Observation, Scene
 from envs.tasks import GOAL_REWARD, TIME_REWARD, VIOLATION_REWARD, Outcome, TaskReward
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
@@ -32,15 +35,16 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is
     the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
 
-    `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and
+    `info` of a reset: `steps`, which is 0, and the episode's `layout`, from which `envs.tasks.TaskReward` makes its
+    reward. `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and
     `terms`, the named parts of the reward. An episode terminates at success, violation or fall, and is
     truncated after `maximum_steps`.
 
     Args:
-        task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout. A `Layout`
-            is taken as it is, and its task counts.
+        task, layout, tiles: see `envs.random_layouts.possible_layouts`; `tiles` replaces fields of the layout. A
+            `Layout` is taken as it is, and its task counts. `layout="random"` is drawn anew at every reset.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
-        maximum_steps: pushes per episode.
+        maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
 
     Raises:
         ValueError: an argument is out of its range, or the layout has no room for the objects.
@@ -60,6 +64,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         maximum_steps: int = EPISODE_STEPS,
         camera: Camera | None = None,
         render_mode: str | None = None,
+        show_tiles: bool = True,
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
             raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
@@ -69,10 +74,12 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         if isinstance(layout, Layout) and tiles:
             raise ValueError("tiles replace fields of a layout that is read: give its number or path, or no tiles")
-        self.layout = layout if isinstance(layout, Layout) else load_layout(task, layout, tiles)
-        self.reward = TaskReward(self.layout, reward=reward)
+        self.layouts = (layout,) if isinstance(layout, Layout) else possible_layouts(task, layout, tiles)
+        self._rewards = [TaskReward(one, reward=reward) for one in self.layouts]
+        self.layout, self.reward = self.layouts[0], self._rewards[0]  # of the episode
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.ranges = ranges or ObjectRanges()
+        self.show_tiles = show_tiles
         self.scene = Scene(camera=camera)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
@@ -91,19 +98,28 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ObservationDict, dict[str, Any]]:
-        """Draw a scene in which the episode has not ended before it began.
+        """Draw a layout, and a scene in which the episode has not ended before it began.
+
+        Args:
+            options: `layout`, which of the environment's `layouts` to take instead of a random one.
 
         Raises:
-            ValueError: the layout has no room for the objects.
+            ValueError: the layout has no room for the objects, or there is no layout of that number.
         """
         super().reset(seed=seed)
-        (scene_generator,) = self.np_random.spawn(1)
+        scene_generator = next_scene_stream(self.np_random)
+        drawn = int(layout_stream(scene_generator).integers(len(self.layouts)))
+        number = (options or {}).get("layout", drawn)
+        if number not in range(len(self.layouts)):
+            raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.layouts) - 1}")
+        self.layout, self.reward = self.layouts[number], self._rewards[number]
+        self.scene.markings = tile_groups(self.layout) if self.show_tiles else ()
         target = _areas(self.layout.target_start, TARGET_JITTER)
         obstacle = _areas(self.layout.obstacle_start, OBSTACLE_JITTER)
         areas = [target, *[obstacle] * (self.objects - 1)]
         self._seen = self.scene.draw(areas, self.ranges, scene_generator, acceptable=self._can_start)
         self._steps = 0
-        return _as_dict(self._seen), {"steps": 0}
+        return _as_dict(self._seen), {"steps": 0, "layout": self.layout}
 
     def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Push, wait until the objects rest, look, and judge.

@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from envs.camera import Camera, sample_cloud
+from envs.markings import LEVEL, TileGroup, paint_tiles
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
+from envs.randomness import next_draw_streams
 from envs.robots import FrameHook, StickRobot
 from envs.segmentation import segment_by_mask
 from envs.shapes import builtin_shape, write_mesh
@@ -87,9 +89,10 @@ class Scene:
         self.camera = camera or Camera()
         self.on_frame = on_frame
         self.world = PhysicsWorld()
+        self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
-        self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # where the time went, summed
+        self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # of CPU time, summed
 
     def close(self) -> None:
         """Free the simulator. Closing twice is harmless."""
@@ -107,13 +110,13 @@ class Scene:
 
         Args:
             areas: where each object may start; the first is the target.
-            generator: the scene's randomness; the points' randomness is spawned from it.
+            generator: the scene's randomness, from which that of objects and points is derived (`envs.randomness`).
 
         Raises:
             ValueError: the areas hold no such scene.
         """
         for _ in range(DRAWS):
-            scene_generator, point_generator = generator.spawn(2)
+            scene_generator, point_generator = next_draw_streams(generator)
             observation = self.reset(draw_objects(areas, ranges, scene_generator), point_generator)
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
@@ -129,7 +132,7 @@ class Scene:
         """
         if not 1 <= len(objects) <= MAXIMUM_OBJECTS:
             raise ValueError(f"a scene holds 1 to {MAXIMUM_OBJECTS} objects, not {len(objects)}")
-        began = time.perf_counter()
+        began = time.process_time()
         self.world.reset()
         self.objects = list(objects)
         self.bodies = [
@@ -149,7 +152,7 @@ class Scene:
         self._points = point_generator
         self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
         self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
-        self.seconds["physics"] += time.perf_counter() - began
+        self.seconds["physics"] += time.process_time() - began
         return self.observe()
 
     def push(self, action: NDArray[np.floating]) -> PushReport:
@@ -161,7 +164,7 @@ class Scene:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is four finite numbers (x, y, dx, dy), not {action.tolist()}")
-        began = time.perf_counter()
+        began = time.process_time()
         before = self.ground_truth()
         start, end = push_endpoints(action)
         safe = self.robot.push(start, end, self.bodies, on_frame=self.on_frame)
@@ -170,7 +173,7 @@ class Scene:
         after = self.ground_truth()
         moved = np.linalg.norm(after.positions - before.positions, axis=-1)
         turn = Rotation.from_quat(after.orientations) * Rotation.from_quat(before.orientations).inv()
-        self.seconds["physics"] += time.perf_counter() - began
+        self.seconds["physics"] += time.process_time() - began
         return PushReport(
             unsafe=not safe,
             ineffective=bool((moved < MOVED).all() and (turn.magnitude() < TURNED).all()),
@@ -180,9 +183,9 @@ class Scene:
 
     def observe(self) -> Observation:
         """Take a depth image and turn it into one cloud per object."""
-        began = time.perf_counter()
+        began = time.process_time()
         rendering = self.world.render(self.camera)
-        rendered = time.perf_counter()
+        rendered = time.process_time()
         visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
         for slot, (rows, columns) in enumerate(segment_by_mask(rendering, self.bodies)):
             if len(rows) >= MINIMUM_PIXELS:
@@ -192,12 +195,18 @@ class Scene:
         self._mask |= visible
         centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
         self.seconds["rendering"] += rendered - began
-        self.seconds["points"] += time.perf_counter() - rendered
+        self.seconds["points"] += time.process_time() - rendered
         return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
 
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
-        """A colour image [height, width, 3] of the scene, for people."""
-        return self.world.render(camera).color
+        """A colour image [height, width, 3] of the scene with the `markings` on the table, for people."""
+        rendering = self.world.render(camera)
+        if not self.markings:
+            return rendering.color
+        rows, columns = np.nonzero(~np.isin(rendering.bodies, self.bodies))
+        points = camera.points(rendering.depth, rows, columns)
+        top = np.abs(points[:, 2]) < LEVEL
+        return paint_tiles(rendering.color, rows[top], columns[top], points[top, :2], self.markings)
 
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 
@@ -29,3 +32,20 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
     # samples, objects, batch, ms per plan, GFLOP per plan, share
     assert alone.split()[:3] == ["32", "2", "1"] and together.split()[:3] == ["32", "2", "2"]
     assert float(alone.split()[4]) == float(together.split()[4]) > 0.0
+
+
+def test_collection_tells_where_its_time_goes() -> None:
+    printed = run("collection", "12")
+    shares = [float(share) for share in re.findall(r"([\d.]+) %", printed)]
+    assert len(shares) == 5 and sum(shares) == pytest.approx(100, abs=0.5)  # physics, rendering, points, writing, rest
+
+
+def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    words = ["--adversarial", "0.8", "--log", str(tmp_path / "world.jsonl")]
+    run("world", "--resets", "2", "--pushes", "10", *words)
+    printed = run("world", "--resets", "5", "--pushes", "40", *words)
+    assert "5 resets: " in printed and "40 pushes: " in printed
+    assert printed.count("0 jumps, 0 looks at an object inside the table") == 2
+    assert "NaN: refused" in printed and "WRONG" not in printed
+    counts = [json.loads(line)["count"] for line in (tmp_path / "world.jsonl").read_text().splitlines()]
+    assert counts == [2, 10, 3, 30]

@@ -131,7 +131,7 @@ def test_a_kill_while_an_evaluation_begins_again_loses_no_episode(
 
 def parts(setup: Setup) -> SimpleNamespace:
     setup.env.close()
-    return SimpleNamespace(**vars(setup))
+    return SimpleNamespace(**vars(setup), layout=setup.layout)
 
 
 def test_words_reach_the_parts(configure: Any) -> None:

@@ -20,10 +20,10 @@ from cavin_pyro.figures_overlay import (
     pushes,
     subgoal_chains,
     tile_corners,
-    tile_groups,
 )
 from envs.camera import Camera
 from envs.layouts import TASK_NAMES, load_layout
+from envs.markings import tile_groups
 from envs.workspace import normalised_push, tile_center
 from models.pointnet import PointNetAutoencoder
 from models.state import State

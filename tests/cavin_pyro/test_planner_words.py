@@ -20,8 +20,14 @@ from cavin_pyro.setups import Setup, set_up
 from models.pointnet import PointNet
 from planning.optimisers import OPTIMISERS
 
-FITTING = {"cavin": "cascaded", "sectar": "single_latent", "cvae_mpc": "flat", "mpc": "dynamics"}
-MODELS = sorted(FITTING.values())
+FITTING = {
+    "cavin": "cascaded",
+    "cavin_evolution": "cascaded",
+    "sectar": "single_latent",
+    "cvae_mpc": "flat",
+    "mpc": "dynamics",
+}
+MODELS = sorted({*FITTING.values()})
 SMALL = ["maximum_steps=3", "objects=2", "planner.samples=16", "planner.horizon=6"]
 
 
@@ -72,6 +78,9 @@ def test_every_planner_plans_with_every_optimiser(
         ("cavin", "planner.reward_at=subgoals"),
         ("cavin", "planner.stride_limits=[0.1,0.3]"),
         ("cavin", "planner.optimizer_options={replacement:false}"),
+        ("cavin", "planner.motion_optimizer=cem"),
+        ("cavin", "products=float32"),
+        ("cavin_evolution", "planner.optimizer_options={generations:1}"),
         ("cavin", "planner.reachability={_target_:planning.Reachability}"),
         ("mpc", "planner.stride_limits=[0.01,0.15]"),
         ("mpc", "planner.proposal=heuristic"),

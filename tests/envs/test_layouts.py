@@ -188,7 +188,7 @@ def test_a_file_without_keys_is_told_which_keys_it_needs(tmp_path: Path, text: s
 
 @pytest.mark.parametrize("layout", ["nowhere.yaml", -1, 1.0, None, "", "²"])
 def test_a_layout_that_is_no_file_is_told_what_to_give(tmp_path: Path, layout: Any) -> None:
-    with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2 or a YAML file$"):
+    with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, random or a YAML file$"):
         load_layout("crossing", layout)
     with pytest.raises(ValueError, match=r"cannot be read \(Is a directory\)"):
         load_layout("crossing", tmp_path)
@@ -196,7 +196,9 @@ def test_a_layout_that_is_no_file_is_told_what_to_give(tmp_path: Path, layout: A
 
 @pytest.mark.parametrize("layout", [3, "3", "17"])
 def test_an_unknown_number_is_told_the_known_ones(layout: Any) -> None:
-    with pytest.raises(ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2 or the path of a YAML file$"):
+    with pytest.raises(
+        ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2, random or the path of a YAML file$"
+    ):
         load_layout("crossing", layout)
 
 

@@ -80,7 +80,7 @@ def test_environments_can_be_stepped_side_by_side() -> None:
 def test_a_step_reports_all_that_happened(make: Make) -> None:
     env = make(objects=2)
     seen, info = env.reset(seed=1)
-    assert env.observation_space.contains(seen) and info == {"steps": 0}
+    assert env.observation_space.contains(seen) and info == {"steps": 0, "layout": env.layout}
     seen, reward, terminated, truncated, info = env.step(NOTHING)
     assert env.observation_space.contains(seen)
     assert set(info) == {"steps", "unsafe", "ineffective", "success", "violation", "fall", "terms"}
@@ -303,7 +303,7 @@ def test_a_layout_may_be_a_number_a_file_or_an_object(make: Make, tmp_path: Path
         ({"render_mode": "human"}, r"^unknown render_mode 'human': choose rgb_array or None$"),
         ({"task": "juggling"}, r"^unknown task 'juggling': choose from clearing, insertion, crossing$"),
         ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
-        ({"layout": 3}, r"^unknown layout 3: choose 0, 1, 2 or the path of a YAML file$"),
+        ({"layout": 3}, r"^unknown layout 3: choose 0, 1, 2, random or the path of a YAML file$"),
         ({"layout": "nowhere.yaml"}, r"^layout nowhere.yaml cannot be read"),
         ({"tiles": {"goal": [[9, 9]]}}, r"goal: tile \[9, 9\] is off the table"),
         ({"tiles": {"bridge": [[1, 1]]}}, r"unknown key 'bridge'"),

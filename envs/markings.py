@@ -1,0 +1,76 @@
+"""The layout, painted on the table in colour pictures for people: never in the depth image nor in the mask.
+
+The tiles are painted into the finished picture, on those pixels that show the table's top, instead of being bodies of
+the simulator: so nothing can touch them, the depth image cannot see them, and objects hide them as they should.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.layouts import Layout, Tile
+from envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE
+
+GOAL_COLOR = "#F2C200"  # gold
+LEVEL = 0.002  # metres; the table's top is what lies at most this far from z = 0
+BORDER = 0.003  # metres on either side of a tile's edge that are painted opaque
+
+
+class TileGroup(NamedTuple):
+    """Tiles that mean the same: a name for legends, colour, how opaque the fill is, and where they lie."""
+
+    name: str
+    color: str
+    opacity: float
+    tiles: tuple[Tile, ...]
+
+
+_REGIONS = {  # what `Layout.region` means to each task, in the paper's colours, as the colour-blind tell them apart
+    "clearing": ("to clear", "#0072B2", 0.35),
+    "insertion": ("keep out", "#C2272D", 0.40),
+    "crossing": ("bridge", "#5A5A5A", 0.35),
+}
+
+
+def tile_groups(layout: Layout) -> list[TileGroup]:
+    """The task's region, and the goal where there is one; later ones lie on top of earlier ones."""
+    groups = [
+        TileGroup(*_REGIONS[layout.task], layout.region),
+        TileGroup("goal", GOAL_COLOR, 0.70, layout.goal),
+    ]
+    return [group for group in groups if group.tiles]
+
+
+def paint_tiles(
+    picture: NDArray[np.uint8],
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    places: NDArray[np.floating],
+    groups: Sequence[TileGroup],
+) -> NDArray[np.uint8]:
+    """A copy of a picture with tiles on some of its pixels.
+
+    Args:
+        picture: [height, width, 3]. rows, columns: [P] pixels that show the table's top.
+        places: [P, 2] where on the table they lie, metres.
+    """
+    exact = (places - np.array(TILE_ORIGIN)) / TILE_SIDE
+    tile = np.floor(exact + 0.5).astype(np.intp)
+    on_grid = ((tile >= 0) & (tile < TILE_COUNT)).all(axis=-1)
+    tile = np.where(on_grid[:, None], tile, 0)
+    to_edge = TILE_SIDE * (0.5 - np.abs(exact - tile).max(axis=-1))  # metres
+    painted = picture.copy()
+    for group in groups:
+        chosen = np.zeros(TILE_COUNT, dtype=np.bool_)
+        chosen[tuple(np.array(group.tiles).T)] = True
+        inside = np.flatnonzero(on_grid & chosen[tile[:, 0], tile[:, 1]])
+        border = np.clip(1.5 - to_edge[inside] / BORDER, 0.0, 1.0)  # fades over one width: smooth edges
+        opacity = (group.opacity + (1.0 - group.opacity) * border)[:, None]
+        where = rows[inside], columns[inside]
+        color = np.array([int(group.color[start : start + 2], 16) for start in (1, 3, 5)])
+        painted[where] = np.rint((1.0 - opacity) * painted[where] + opacity * color).astype(np.uint8)
+    return painted

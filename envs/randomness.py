@@ -1,0 +1,72 @@
+"""Where every random number of an episode comes from: streams with a purpose, all derived from one seed.
+
+A stream is a `numpy.random.Generator` known by its entropy and its spawn key (numpy's `SeedSequence`). Streams of
+different keys are independent, so that drawing more or fewer numbers for one purpose changes no other purpose:
+planners and policies are compared on the very same scenes.
+
+| purpose | of what | entropy | spawn key |
+| --- | --- | --- | --- |
+| scene | one reset of an environment, the k-th since it was seeded | `seed` | `(k,)` |
+| layout | of that reset, where the layout is random | `seed` | `(k, LAYOUT)` |
+| scene | one collected episode: how many objects, and where | `[seed, episode]` | `(0,)` |
+| policy | of that episode: the heuristic's pushes | `[seed, episode]` | `(1,)` |
+| objects | the a-th scene drawn until one is acceptable: shapes, masses, poses | as its scene | `(*scene, 2 a)` |
+| points | of that scene: which pixels make a cloud, over the whole episode | as its scene | `(*scene, 2 a + 1)` |
+| sensor | of that scene: the camera's pose and noise | as its scene | `(*points, SENSOR)` |
+| planner | one episode: one word of it seeds torch's generator | `[seed, 1]` | none |
+
+`LAYOUT` and `SENSOR` are larger than any number that `Generator.spawn` counts to, so that asking for them changes
+neither the streams that are spawned nor their order. The table is a promise: published success rates and the
+collected data hang on it, so that purposes may be added, but none may be derived in another way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+LAYOUT, SENSOR = 2**31, 2**31 + 1  # last entries of spawn keys
+_PLANNER = 1  # last word of the planner's entropy
+
+
+def named_stream(parent: np.random.Generator, name: int) -> np.random.Generator:
+    """The stream below `parent` with the last key `name`; the parent's own numbers stay what they were."""
+    sequence = parent.bit_generator.seed_seq
+    assert isinstance(sequence, np.random.SeedSequence)
+    return np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, name)))
+
+
+def next_scene_stream(environment: np.random.Generator) -> np.random.Generator:
+    """The scene's stream of an environment's next reset.
+
+    Args:
+        environment: Gymnasium's `np_random`, which `reset(seed=...)` has made of the seed.
+    """
+    (scene,) = environment.spawn(1)
+    return scene
+
+
+def layout_stream(scene: np.random.Generator) -> np.random.Generator:
+    """Which layout a scene's episode has."""
+    return named_stream(scene, LAYOUT)
+
+
+def next_draw_streams(scene: np.random.Generator) -> tuple[np.random.Generator, np.random.Generator]:
+    """Streams of the objects and of the points for the next draw of a scene."""
+    objects, points = scene.spawn(2)
+    return objects, points
+
+
+def sensor_stream(points: np.random.Generator) -> np.random.Generator:
+    """The camera's perturbed pose and its noise, in the scene whose points come from `points`."""
+    return named_stream(points, SENSOR)
+
+
+def collection_streams(seed: int, episode: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Streams of the scene and of the policy for one collected episode."""
+    scene, policy = np.random.default_rng([seed, episode]).spawn(2)
+    return scene, policy
+
+
+def planner_seed(seed: int) -> int:
+    """What seeds torch's generator for the planner of an episode; independent of the episode's scene."""
+    return int(np.random.SeedSequence([seed, _PLANNER]).generate_state(1)[0])
