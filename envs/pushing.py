@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from envs.camera import Camera
 from envs.layouts import Layout, Tile, load_layout
+from envs.object_asset import plain_name
+from envs.object_sets import load_object_set
 from envs.objects import Area, ObjectRanges
 from envs.scene import Observation, Scene
 from envs.tasks import GOAL_REWARD, TIME_REWARD, VIOLATION_REWARD, Outcome, TaskReward
@@ -40,6 +42,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout. A `Layout`
             is taken as it is, and its task counts.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
+        object_set: where the objects come from, a key of `envs.object_sets.OBJECT_SETS`.
+        assets: folder of meshes, for a set that needs one.
         maximum_steps: pushes per episode.
 
     Raises:
@@ -57,6 +61,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward: str = "sparse",
         objects: int = 3,
         ranges: ObjectRanges | None = None,
+        object_set: str = "builtin",
+        assets: str | Path | None = None,
         maximum_steps: int = EPISODE_STEPS,
         camera: Camera | None = None,
         render_mode: str | None = None,
@@ -72,8 +78,9 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.layout = layout if isinstance(layout, Layout) else load_layout(task, layout, tiles)
         self.reward = TaskReward(self.layout, reward=reward)
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
-        self.ranges = ranges or ObjectRanges()
-        self.scene = Scene(camera=camera)
+        available = load_object_set(object_set, assets)
+        self.ranges = ranges or ObjectRanges(names=tuple(dict.fromkeys(map(plain_name, available.names))))
+        self.scene = Scene(camera=camera, object_set=available)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
