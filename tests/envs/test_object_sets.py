@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -164,6 +165,7 @@ def test_equal_seeds_give_equal_states_with_parts_whatever_came_before(scanned: 
 def test_an_environment_takes_all_that_is_in_the_folder(tiny_assets: Path) -> None:
     env = PushingEnv(object_set="ycb", assets=tiny_assets, objects=5)
     assert env.ranges.names == ("brick", "mug", "angle")
+    check_env(env, skip_render_check=True)  # what it warns of is an error here
     first, _ = env.reset(seed=1)
     after, *_ = env.step(np.array([0.0, 0.0, 0.5, 0.5], np.float32))
     assert env.observation_space.contains(first) and env.observation_space.contains(after)
