@@ -35,6 +35,8 @@ def main(config: DictConfig) -> None:
         maximum_objects=config.maximum_objects,
         episodes_per_shard=config.episodes_per_shard,
         ranges=object_ranges(config.env),
+        object_set=config.env.objects,
+        assets=config.env.assets,
     )
     folder = output_folder(config.output)
     if config.repair:

@@ -6,6 +6,7 @@ import multiprocessing
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from cavin_pyro import __version__
 from cavin_pyro.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
 from cavin_pyro.errors import UserError, user_input
 from cavin_pyro.progress import progress_bar
+from envs.object_sets import load_object_set
 from envs.objects import WHOLE_TABLE, Area, ObjectRanges
 from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
 from envs.scene import Observation, PushReport, Scene
-from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
 CROWD_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are drawn from this range
@@ -34,6 +35,8 @@ class CollectionSettings:
         perturbed: share of pushes that start elsewhere than the heuristic wants (see `envs.policy`).
         minimum_objects, maximum_objects: how many lie on the table, drawn uniformly.
         episodes_per_shard: episodes per file, the unit of work and of resuming. ranges: object parameters.
+        object_set: where the objects come from. assets: folder of meshes, for a set that needs one; where it lies
+            decides nothing.
     """
 
     seed: int = 0
@@ -44,6 +47,8 @@ class CollectionSettings:
     maximum_objects: int = MAXIMUM_OBJECTS
     episodes_per_shard: int = 50
     ranges: ObjectRanges = field(default_factory=lambda: ObjectRanges(clearance=0.12))
+    object_set: str = "builtin"
+    assets: str | None = None
 
 
 def collect(settings: CollectionSettings, folder: Path, *, transitions: int, workers: int) -> dict[str, Any]:
@@ -123,7 +128,7 @@ def _blank(settings: CollectionSettings, scene: Scene) -> Arrays:
         **{name: np.zeros(objects, np.float32) for name in ("scale", "mass", "friction")},
     }
     for slot, one in enumerate(scene.objects):
-        arrays["shape"][slot] = BUILTIN_NAMES.index(one.name)
+        arrays["shape"][slot] = scene.object_set.names.index(one.name)
         for name in ("scale", "mass", "friction"):
             arrays[name][slot] = getattr(one, name)
     return arrays
@@ -145,21 +150,24 @@ def _record_push(
     arrays["target"][step], arrays["angle"][step] = policy.intent.target, policy.intent.angle
 
 
-_scene: Scene | None = None  # one per worker process
+@cache
+def _scene(object_set: str, assets: str | None) -> Scene:
+    """One per worker process."""
+    with user_input():
+        return Scene(object_set=load_object_set(object_set, assets))
 
 
 def _collect_shard(job: tuple[CollectionSettings, int]) -> tuple[Arrays, dict[str, float]]:
-    global _scene
     settings, shard = job
-    _scene = _scene or Scene()
+    scene = _scene(settings.object_set, settings.assets)
     began = time.process_time()
-    _scene.seconds = dict.fromkeys(_scene.seconds, 0.0)
+    scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     first = shard * settings.episodes_per_shard
     episodes = [
-        collect_episode(_scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
+        collect_episode(scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
     ]
     arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
-    return arrays, {"cpu": time.process_time() - began, **_scene.seconds}
+    return arrays, {"cpu": time.process_time() - began, **scene.seconds}
 
 
 def _shards(settings: CollectionSettings, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
@@ -177,11 +185,12 @@ def _shards(settings: CollectionSettings, *, first: int, workers: int) -> Iterat
 
 def _begin(settings: CollectionSettings, folder: Path) -> dict[str, Any]:
     """Metadata of the dataset so far, checked against what is asked for."""
-    wanted = _plain(asdict(settings))
+    wanted, usual = (_plain(asdict(one)) for one in (settings, CollectionSettings()))
+    del wanted["assets"], usual["assets"]
     if not (folder / "metadata.json").exists():
         metadata = {
             "settings": wanted,
-            "shape_names": list(BUILTIN_NAMES),
+            "shape_names": list(load_object_set(settings.object_set, settings.assets).names),
             "made_by": f"cavin_pyro {__version__}",
             "shards": 0,
             "episodes": 0,
@@ -195,10 +204,12 @@ def _begin(settings: CollectionSettings, folder: Path) -> dict[str, Any]:
             raise
         (folder / "metadata.json").unlink()
         return _begin(settings, folder)
+    held = usual | metadata["settings"]  # an older version did not write the words that it did not know
+    held["ranges"] = usual["ranges"] | held["ranges"]
     for name, value in wanted.items():
-        if metadata["settings"].get(name) != value:
+        if held[name] != value:
             raise UserError(
-                f"{folder} holds a dataset with {name}={metadata['settings'].get(name)}, not {value}: "
+                f"{folder} holds a dataset with {name}={held[name]}, not {value}: "
                 "resume with the same settings, or choose another output=DIR"
             )
     return metadata

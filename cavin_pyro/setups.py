@@ -72,6 +72,8 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             reward=config.reward,
             objects=config.objects,
             ranges=object_ranges(config.env),
+            object_set=config.env.objects,
+            assets=config.env.assets,
             maximum_steps=config.maximum_steps,
             render_mode="rgb_array" if render else None,
         )

@@ -6,13 +6,14 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.errors import UserError, one_of
+from cavin_pyro.errors import UserError, one_of, user_input
+from envs.object_asset import plain_name
+from envs.object_sets import OBJECT_SETS, chosen, load_object_set
 from envs.objects import ObjectRanges
-from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
 
-CHOICES = {"robot": ("stick",), "objects": ("builtin",), "camera": ("ideal",), "segmentation": ("mask",)}
+CHOICES = {"robot": ("stick",), "objects": tuple(OBJECT_SETS), "camera": ("ideal",), "segmentation": ("mask",)}
 
 
 def check_world(env: DictConfig) -> None:
@@ -29,22 +30,33 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     """Object parameters' ranges.
 
     Raises:
-        UserError: unknown shape, or a range that is not two increasing positive numbers.
+        UserError: assets that are not there, an unknown object, or a range that is not two increasing positive numbers.
     """
     ranges: Any = OmegaConf.to_container(env.ranges)
-    names = ranges.pop("names") or BUILTIN_NAMES
-    unknown = [name for name in names if name not in BUILTIN_NAMES]
-    if unknown:
-        raise UserError(f"unknown object {unknown[0]!r} in env.ranges.names: choose from {', '.join(BUILTIN_NAMES)}")
-    for name in ("scale", "mass", "friction"):
-        value = ranges[name]
-        numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
-        if not numbers or not 0 < value[0] <= value[1]:
-            raise UserError(f"env.ranges.{name} must be two positive numbers, low then high, not {value}")
-    if not isinstance(ranges["clearance"], int | float) or not ranges["clearance"] >= 0:
-        raise UserError(f"env.ranges.clearance must be at least 0 metres, not {ranges['clearance']}")
-    scale, mass, friction = (tuple(ranges[name]) for name in ("scale", "mass", "friction"))
-    return ObjectRanges(tuple(names), scale, mass, friction, ranges["clearance"])
+    with user_input():
+        objects = load_object_set(env.objects, env.assets)
+    every = tuple(dict.fromkeys(map(plain_name, objects.names)))
+    for word in ("names", "target"):
+        if not isinstance(ranges[word], list | None):
+            raise UserError(f"env.ranges.{word} must be a list of objects, not {ranges[word]}")
+        ranges[word] = tuple(ranges[word] or (every if word == "names" else ()))
+        try:
+            chosen(ranges[word], objects)
+        except ValueError as error:
+            raise UserError(str(error).replace(":", f" in env.ranges.{word}:", 1)) from error
+    for word in ("scale", "mass", "friction", "kilograms"):
+        ranges[word] = _pair(f"env.ranges.{word}", ranges[word]) if ranges[word] or word != "kilograms" else None
+    for word in ("clearance", "drop_height"):
+        if not isinstance(ranges[word], int | float) or not ranges[word] >= 0:
+            raise UserError(f"env.ranges.{word} must be at least 0 metres, not {ranges[word]}")
+    return ObjectRanges(**ranges)
+
+
+def _pair(word: str, value: Any) -> tuple[float, float]:
+    numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
+    if not numbers or not 0 < value[0] <= value[1]:
+        raise UserError(f"{word} must be two positive numbers, low then high, not {value}")
+    return value[0], value[1]
 
 
 def push_box() -> PushBox:

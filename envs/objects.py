@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.shapes import BUILTIN_NAMES, builtin_shape
+from envs.object_sets import BuiltinObjects, ObjectSet, chosen
+from envs.shapes import BUILTIN_NAMES
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 ATTEMPTS = 400  # whole arrangements tried before an area counts as too small
@@ -23,9 +24,12 @@ class ObjectRanges:
     """From where object parameters are drawn, uniformly.
 
     Attributes:
-        names: shapes to choose from. scale: factor on size. mass: factor on the published mass.
+        names: objects to choose from. scale: factor on size. mass: factor on the published mass.
         friction: Coulomb coefficient against the table.
         clearance: metres between neighbouring centres at the start.
+        kilograms: mass whatever the object, in place of the factor.
+        target: what the first object, the target, is chosen from, in place of `names`.
+        drop_height: metres above the table from which centres fall, at least; 0 means just above the table.
     """
 
     names: tuple[str, ...] = BUILTIN_NAMES
@@ -33,6 +37,9 @@ class ObjectRanges:
     mass: tuple[float, float] = (0.5, 2.0)
     friction: tuple[float, float] = (0.5, 0.9)
     clearance: float = 0.15
+    kilograms: tuple[float, float] | None = None
+    target: tuple[str, ...] = ()
+    drop_height: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,7 @@ class ObjectParameters:
     """One object as drawn: what it is, how it behaves, and the pose from which it is dropped.
 
     Attributes:
-        name: shape. scale: factor. mass: kilograms. friction: coefficient.
+        name: what its set calls it. scale: factor. mass: kilograms. friction: coefficient.
         position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
     """
 
@@ -88,32 +95,43 @@ def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Genera
     )
 
 
-def draw_objects(areas: Sequence[Area], ranges: ObjectRanges, generator: np.random.Generator) -> list[ObjectParameters]:
-    """Draw one object per area, in random orientation, low above the table and clear of its neighbours.
+def draw_objects(
+    areas: Sequence[Area],
+    ranges: ObjectRanges,
+    generator: np.random.Generator,
+    objects: ObjectSet | None = None,
+) -> list[ObjectParameters]:
+    """Draw one object per area, in random orientation, above the table and clear of its neighbours.
 
     Args:
-        areas: where each object may start; the first is the target.
+        areas: where each object may start; the first is the target. objects: the set that the names mean, the
+            builtin one by default.
 
     Raises:
-        ValueError: the areas are too small for so many objects.
+        ValueError: the areas are too small for so many objects, or a name means no object.
     """
+    objects = objects or BuiltinObjects()
+    names = chosen(ranges.names, objects)
+    targets = chosen(ranges.target, objects) or names
     positions = arrange(areas, ranges.clearance, generator)
     orientations = Rotation.random(len(areas), random_state=generator).as_quat()
     drawn: list[ObjectParameters] = []
     circles: list[tuple[NDArray[np.float64], float, float]] = []  # planar centre, radius, top
     for position, orientation in zip(positions, orientations, strict=True):
-        shape = builtin_shape(ranges.names[generator.integers(len(ranges.names))])
+        choices = names if drawn else targets
+        asset = objects.asset(choices[generator.integers(len(choices))])
         scale = generator.uniform(*ranges.scale)
-        radius = scale * shape.radius
+        radius = scale * asset.radius
         # Long neighbours may overlap in the plan view: the later one then falls from above the earlier one.
         below = [top for center, other, top in circles if np.linalg.norm(position - center) < radius + other]
-        height = max([0.005, *(top + 0.005 for top in below)]) + radius
+        height = max(max([0.005, *(top + 0.005 for top in below)]) + radius, ranges.drop_height)
         circles.append((position, radius, height + radius))
+        mass = generator.uniform(*(ranges.kilograms or ranges.mass))
         drawn.append(
             ObjectParameters(
-                name=shape.name,
+                name=asset.name,
                 scale=float(scale),
-                mass=float(shape.mass * generator.uniform(*ranges.mass)),
+                mass=float(mass if ranges.kilograms else asset.mass * mass),
                 friction=float(generator.uniform(*ranges.friction)),
                 position=(float(position[0]), float(position[1]), float(height)),
                 orientation=tuple(float(value) for value in orientation),  # type: ignore[arg-type]

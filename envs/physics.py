@@ -120,8 +120,10 @@ class PhysicsWorld:
         self,
         mesh: Path,
         *,
+        visual: Path | None = None,
         scale: float,
         mass: float,
+        inertia: Sequence[float] | None = None,
         friction: float,
         position: Sequence[float],
         orientation: Sequence[float],
@@ -131,7 +133,9 @@ class PhysicsWorld:
 
         Args:
             mesh: a Wavefront file, metres, origin at the centre of mass. scale: factor on its size.
-            mass: kilograms. friction: Coulomb coefficient against the table.
+            visual: another one for the camera to see. mass: kilograms.
+            inertia: (x, y, z) kilograms times square metres about the mesh's axes; by default, its bounding box's.
+            friction: Coulomb coefficient against the table.
             position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
             color: red, green, blue in [0, 1].
         """
@@ -140,7 +144,7 @@ class PhysicsWorld:
             baseMass=mass,
             baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size),
             baseVisualShapeIndex=bullet.createVisualShape(
-                pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size, rgbaColor=(*color, 1.0)
+                pybullet.GEOM_MESH, fileName=str(visual or mesh), meshScale=size, rgbaColor=(*color, 1.0)
             ),
             basePosition=position,
             baseOrientation=orientation,
@@ -154,6 +158,8 @@ class PhysicsWorld:
             angularDamping=ANGULAR_DAMPING,
             restitution=0.0,
         )
+        if inertia is not None:
+            bullet.changeDynamics(body, -1, localInertiaDiagonal=tuple(inertia))
         return int(body)
 
     def add_tool(self, *, radius: float, length: float, position: Sequence[float]) -> int:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from envs.camera import Camera
 from envs.layouts import Layout, Tile
 from envs.markings import tile_groups
+from envs.object_asset import plain_name
+from envs.object_sets import load_object_set
 from envs.objects import Area, ObjectRanges
 from envs.random_layouts import possible_layouts
 from envs.randomness import layout_stream, next_scene_stream
@@ -44,6 +46,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         task, layout, tiles: see `envs.random_layouts.possible_layouts`; `tiles` replaces fields of the layout. A
             `Layout` is taken as it is, and its task counts. `layout="random"` is drawn anew at every reset.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
+        object_set: where the objects come from, a key of `envs.object_sets.OBJECT_SETS`.
+        assets: folder of meshes, for a set that needs one.
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
 
     Raises:
@@ -61,6 +65,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward: str = "sparse",
         objects: int = 3,
         ranges: ObjectRanges | None = None,
+        object_set: str = "builtin",
+        assets: str | Path | None = None,
         maximum_steps: int = EPISODE_STEPS,
         camera: Camera | None = None,
         render_mode: str | None = None,
@@ -78,9 +84,10 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self._rewards = [TaskReward(one, reward=reward) for one in self.layouts]
         self.layout, self.reward = self.layouts[0], self._rewards[0]  # of the episode
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
-        self.ranges = ranges or ObjectRanges()
         self.show_tiles = show_tiles
-        self.scene = Scene(camera=camera)
+        available = load_object_set(object_set, assets)
+        self.ranges = ranges or ObjectRanges(names=tuple(dict.fromkeys(map(plain_name, available.names))))
+        self.scene = Scene(camera=camera, object_set=available)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]

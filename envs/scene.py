@@ -5,15 +5,10 @@ Data flows one way: poses in the simulator, a depth image, segmented points, an 
 
 from __future__ import annotations
 
-import atexit
 import colorsys
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from envs.camera import Camera, sample_cloud
 from envs.markings import LEVEL, TileGroup, paint_tiles
+from envs.object_sets import BuiltinObjects, ObjectSet
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_draw_streams
 from envs.robots import FrameHook, StickRobot
 from envs.segmentation import segment_by_mask
-from envs.shapes import builtin_shape, write_mesh
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
 MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
@@ -70,23 +65,23 @@ class PushReport:
     fallen: bool
 
 
-@cache
-def _mesh_folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="cavin_pyro_meshes_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
 class Scene:
     """One world in which scenes are drawn, pushed and looked at.
 
     Args:
-        camera: the depth camera.
+        camera: the depth camera. object_set: what the objects' names mean, the builtin shapes by default.
         on_frame: called a few times during every push, for whoever films it.
     """
 
-    def __init__(self, *, camera: Camera | None = None, on_frame: FrameHook | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        camera: Camera | None = None,
+        object_set: ObjectSet | None = None,
+        on_frame: FrameHook | None = None,
+    ) -> None:
         self.camera = camera or Camera()
+        self.object_set = object_set or BuiltinObjects()
         self.on_frame = on_frame
         self.world = PhysicsWorld()
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
@@ -117,7 +112,7 @@ class Scene:
         """
         for _ in range(DRAWS):
             scene_generator, point_generator = next_draw_streams(generator)
-            observation = self.reset(draw_objects(areas, ranges, scene_generator), point_generator)
+            observation = self.reset(draw_objects(areas, ranges, scene_generator, self.object_set), point_generator)
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
         raise ValueError(
@@ -135,18 +130,7 @@ class Scene:
         began = time.process_time()
         self.world.reset()
         self.objects = list(objects)
-        self.bodies = [
-            self.world.add_object(
-                write_mesh(builtin_shape(one.name), _mesh_folder()),
-                scale=one.scale,
-                mass=one.mass,
-                friction=one.friction,
-                position=one.position,
-                orientation=one.orientation,
-                color=color,
-            )
-            for one, color in zip(objects, COLORS, strict=False)
-        ]
+        self.bodies = [self._add(one, color) for one, color in zip(objects, COLORS, strict=False)]
         self.robot = StickRobot(self.world)
         self.robot.settle(self.bodies, limit=720)
         self._points = point_generator
@@ -211,6 +195,20 @@ class Scene:
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""
         return self.world.poses(self.bodies)
+
+    def _add(self, one: ObjectParameters, color: Sequence[float]) -> int:
+        asset = self.object_set.asset(one.name)
+        return self.world.add_object(
+            asset.collision,
+            visual=asset.visual,
+            scale=one.scale,
+            mass=one.mass,
+            inertia=asset.inertia_of(one.mass, one.scale),
+            friction=one.friction,
+            position=one.position,
+            orientation=one.orientation,
+            color=color,
+        )
 
     def _any_fallen(self) -> bool:
         return bool((self.ground_truth().positions[:, 2] < FALLEN).any())

@@ -108,13 +108,14 @@ def test_licence_and_citation_say_whose_work_it_is() -> None:
 
 
 def test_every_dependency_is_locked_at_the_version_that_the_project_names() -> None:
-    named = pins(PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["test"])
+    extras = PROJECT["project"]["optional-dependencies"]
+    named = pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"])
     locked = lock()
     assert named == {name: locked.get(name) for name in named}
 
 
 def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
-    declared = pins(PROJECT["project"]["dependencies"])
+    declared = pins(PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["assets"])
     known = {*sys.stdlib_module_names, *PACKAGES}
     strangers = [
         f"{place(file, line)} imports {name}"
@@ -128,8 +129,8 @@ def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
 def test_every_dependency_says_why_it_was_chosen() -> None:
     text = (ROOT / "docs" / "dependencies.md").read_text()
     reasons = {name for row in re.findall(r"^\| ([^|]+) \|", text, re.MULTILINE) for name in row.split(", ")}
-    extras = PROJECT["project"]["optional-dependencies"]["test"]
-    assert set(pins(PROJECT["project"]["dependencies"] + extras)) <= reasons
+    extras = PROJECT["project"]["optional-dependencies"]
+    assert set(pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"])) <= reasons
 
 
 def test_every_folder_of_a_package_is_a_package() -> None:

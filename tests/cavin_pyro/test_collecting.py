@@ -17,6 +17,7 @@ from cavin_pyro import collection
 from cavin_pyro.collection import CollectionSettings, collect, collect_episode, repair
 from cavin_pyro.dataset import read_metadata, read_shard, shard_path
 from cavin_pyro.errors import UserError
+from envs.objects import ObjectRanges
 from envs.scene import Scene
 from envs.shapes import BUILTIN_NAMES
 
@@ -102,6 +103,33 @@ def test_other_settings_are_refused_and_change_nothing(small: SimpleNamespace, o
         with pytest.raises(UserError, match=f"{said}.*: resume with the same settings, or choose another output=DIR"):
             collect(replace(small.pushes, **changes), own_pushes, transitions=100, workers=1)
     assert data_of(own_pushes) == before
+
+
+def test_a_dataset_of_an_older_version_goes_on(small: SimpleNamespace, own_pushes: Path) -> None:
+    before = data_of(own_pushes)
+    metadata = json.loads((own_pushes / "metadata.json").read_text())
+    del metadata["settings"]["object_set"]
+    for name in ("kilograms", "target", "drop_height"):
+        del metadata["settings"]["ranges"][name]
+    (own_pushes / "metadata.json").write_text(json.dumps(metadata))
+    held = metadata["transitions"]
+    assert collect(small.pushes, own_pushes, transitions=held, workers=1)["transitions"] == held
+    with pytest.raises(UserError, match="holds a dataset with object_set=builtin, not ycb"):
+        collect(replace(small.pushes, object_set="ycb", assets="elsewhere"), own_pushes, transitions=held, workers=1)
+    assert {name for name, content in data_of(own_pushes).items() if content != before[name]} == {"metadata.json"}
+
+
+def test_scans_and_builtin_shapes_are_collected_together(
+    small: SimpleNamespace, tiny_assets: Path, tmp_path: Path
+) -> None:
+    kinds = {"object_set": "mixed", "ranges": ObjectRanges(("mug", "brick"), clearance=0.12)}
+    settings = replace(small.pushes, **kinds, assets=str(tiny_assets), episodes_per_shard=10, steps=1)
+    metadata = collect(settings, tmp_path, transitions=10, workers=1)
+    assert metadata["shape_names"] == [*BUILTIN_NAMES, "ycb/brick", "ycb/mug", "ycb/angle"]
+    assert "assets" not in metadata["settings"]
+    shapes = read_shard(shard_path(tmp_path, 0))["shape"]
+    drawn = {metadata["shape_names"][shape] for shape in shapes[shapes >= 0]}
+    assert drawn == {"mug", "ycb/mug", "ycb/brick"}
 
 
 def test_missing_and_damaged_files_are_collected_again(

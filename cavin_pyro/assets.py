@@ -1,0 +1,45 @@
+"""Fetch real meshes: `python -m cavin_pyro.assets ycb --to DIR`, then `env.objects=ycb env.assets=DIR`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NoReturn
+
+from cavin_pyro.command import guarded
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        from cavin_pyro.errors import UserError
+
+        raise UserError(f"{message}; {' '.join(self.format_usage().split())}")
+
+
+def main() -> None:
+    """Download, decimate, decompose and verify one kind of assets; goes on where an earlier run stopped."""
+    guarded(_run)
+
+
+def _run() -> None:
+    from cavin_pyro.fetching.download import site
+    from cavin_pyro.fetching.folder import install
+    from cavin_pyro.fetching.sawyer import SawyerRobot
+    from cavin_pyro.fetching.ycb import YcbObjects
+
+    kinds = {kind.name: kind for kind in (YcbObjects(), SawyerRobot())}
+    parser = _Parser(prog="python -m cavin_pyro.assets", description=main.__doc__)
+    parser.add_argument("kind", choices=kinds, help="the ten YCB objects of the paper, or the Sawyer arm")
+    parser.add_argument(
+        "--to", type=Path, required=True, metavar="DIR", help="folder; the kind gets one of its own in it"
+    )
+    parser.add_argument(
+        "--source", metavar="URL", help="a mirror in place of the publisher's site, same paths below it"
+    )
+    words = parser.parse_args()
+    kind = kinds[words.kind]
+    print(install(kind, words.to, site(words.source or kind.site)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Files over HTTP: whole and with the right checksum, or not at all; what broke off is resumed."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import urllib.error
+import urllib.parse
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro.errors import UserError
+from cavin_pyro.files import PARTIAL, read_json, write_json
+from cavin_pyro.progress import progress_bar
+
+TIMEOUT = 30.0  # seconds without an answer
+CHUNK = 1 << 16  # bytes
+
+
+class Checksums:
+    """SHA-256 of files by name: those in a lock file, which the first download of each writes.
+
+    No publisher here names a checksum of its files. So the first download is believed if it is a whole archive whose
+    contents stand every check, and all later ones, from whatever mirror, must be the same bytes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._known: dict[str, str] = read_json(path) if path.exists() else {}
+        if not isinstance(self._known, dict):
+            raise UserError(f"{path} is damaged: it is no table of checksums; delete it")
+
+    def check(self, file: Path) -> None:
+        """Compare a file with what is known of its name.
+
+        Raises:
+            UserError: it differs; the file is deleted.
+        """
+        known, found = self._known.get(file.name), _sha256(file)
+        if known not in (None, found):
+            file.unlink()
+            raise UserError(
+                f"{file.name} has the wrong checksum: {found[:16]}..., not {str(known)[:16]}... as in {self.path}; "
+                "run again, or delete that file if the publisher has changed it"
+            )
+
+    def record(self, file: Path) -> None:
+        """Remember a file that has proved good."""
+        if file.name not in self._known:
+            self._known[file.name] = _sha256(file)
+            write_json(self.path, self._known)
+
+
+def site(url: str) -> str:
+    """An address below which files lie, without a slash at its end.
+
+    Raises:
+        UserError: it is no http or https address.
+    """
+    parts = urllib.parse.urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.netloc:
+        raise UserError(f"--source must be an http or https address, not {url}")
+    return url.rstrip("/")
+
+
+def fetch(url: str, path: Path, checksums: Checksums) -> None:
+    """Download to `path`, unless it is there already.
+
+    Raises:
+        UserError: no network, no such file, a connection that broke off, or a wrong checksum.
+    """
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + PARTIAL)
+        _receive(url, partial)
+        partial.replace(path)
+    checksums.check(path)
+
+
+def _receive(url: str, partial: Path) -> None:
+    begun = partial.stat().st_size if partial.exists() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={begun}-"} if begun else {})
+    try:
+        with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
+            begun = begun if answer.status == http.HTTPStatus.PARTIAL_CONTENT else 0
+            _store(url, answer, partial, begun)
+    except urllib.error.HTTPError as error:
+        if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+            partial.unlink()  # it has all that there is, or of something else: begin anew
+            _receive(url, partial)
+            return
+        raise UserError(f"{url} answers {error.code} {error.reason}: name a mirror with --source URL") from error
+    except urllib.error.URLError as error:
+        raise UserError(
+            f"{_unreachable(url)} ({error.reason}): no network? or name a mirror with --source URL"
+        ) from error
+    except TimeoutError as error:
+        raise UserError(f"{_unreachable(url)} (no answer in {TIMEOUT:g} s): run again to go on") from error
+    except (http.client.HTTPException, ConnectionError) as error:
+        raise UserError(f"{url} broke off ({type(error).__name__}): run again to go on") from error
+
+
+def _store(url: str, answer: Any, partial: Path, begun: int) -> None:
+    length = answer.headers.get("Content-Length")
+    total = begun + int(length) if length and length.isdecimal() else None
+    with (
+        open(partial, "ab" if begun else "wb") as file,
+        progress_bar(partial.name.removesuffix(PARTIAL), total=total or 0, initial=begun, unit="byte") as bar,
+    ):
+        while chunk := answer.read(CHUNK):
+            file.write(chunk)
+            bar.update(len(chunk))
+        held = file.tell()
+    if total is not None and held != total:
+        raise UserError(f"{url} broke off after {held} of {total} bytes: run again to go on")
+
+
+def _unreachable(url: str) -> str:
+    return f"{urllib.parse.urlsplit(url).netloc} cannot be reached"
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        digest = hashlib.sha256()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
