@@ -25,7 +25,7 @@ def main(config: DictConfig) -> None:
     setup.env.close()
     write_json(folder / "results.json", {**row, "provenance": provenance()})
     print(f"{config.task}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
-    for name in ("steps.csv", "plan.png", *(["episode.mp4"] if config.video else [])):
+    for name in ("steps.csv", "plan.png", "plan-above.png", *(["episode.mp4"] if config.video else [])):
         print(f"  {folder / name}")
 
 

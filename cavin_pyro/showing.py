@@ -9,7 +9,7 @@ from typing import Any
 
 from cavin_pyro.episodes import Episode, run_episode
 from cavin_pyro.evaluation import episode_row
-from cavin_pyro.figures import draw_plan
+from cavin_pyro.figures_plan import draw_plan
 from cavin_pyro.files import replacing
 from cavin_pyro.setups import Setup
 from cavin_pyro.video import EpisodeVideo, film
@@ -28,6 +28,7 @@ def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool) -> dict[
             seed=seed,
             photograph=True,
             on_decision=reel.set_decision if reel is not None else None,
+            on_observation=reel.set_observation if reel is not None else None,
         )
         if reel is not None:
             reel.add(
@@ -36,7 +37,8 @@ def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool) -> dict[
                 repeat=10,
             )
     write_steps(folder / "steps.csv", episode)
-    draw_plan(folder / "plan.png", episode, setup.layout, setup.env.scene.camera.resized(*VIDEO_SIZE))
+    draw_plan(folder / "plan.png", episode, setup.layout, setup.env.scene.camera)
+    draw_plan(folder / "plan-above.png", episode, setup.layout, None)
     return episode_row(episode)
 
 
