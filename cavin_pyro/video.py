@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from cavin_pyro.episodes import Decision
+from cavin_pyro.episodes import Decision, Episode
 from cavin_pyro.figures import DOTS_PER_INCH
 from cavin_pyro.figures_panel import draw_overlay, draw_tiles
 from cavin_pyro.figures_plan import return_scale
@@ -38,14 +38,15 @@ class EpisodeVideo:
 
     Args:
         path: `.mp4`. layout: the tiles to draw. fps: frames per second.
-        camera: that takes the frames, in any resolution.
+        env: of which `add_frame` and `end` take photographs, with its own camera.
     """
 
     def __init__(
-        self, path: Path, layout: Layout, fps: int = FRAMES_PER_SECOND, *, camera: Camera | None = None
+        self, path: Path, layout: Layout, fps: int = FRAMES_PER_SECOND, *, env: PushingEnv | None = None
     ) -> None:
         self.path, self.layout, self.fps = path, layout, fps
-        self.camera = camera or Camera()
+        self.camera = Camera()
+        self._env = env
         self._decision: Decision | None = None
         self._reached: list[NDArray[np.float32]] = []
         self._overlay: Image.Image | None = None
@@ -75,6 +76,14 @@ class EpisodeVideo:
             self._reached.append(observation["centers"])
             self._overlay = None
 
+    def add_frame(self) -> None:
+        """Append a photograph of the environment as it is; for `Scene.on_frame`."""
+        self.add(self._photograph())
+
+    def end(self, episode: Episode) -> None:
+        """Show for a second how the episode ended."""
+        self.add(self._photograph(), phase=episode.outcome, repeat=self.fps)
+
     def add(self, frame: NDArray[np.uint8], *, phase: str = "pushing", repeat: int = 1) -> None:
         """Append a frame [H, W, 3], drawn over.
 
@@ -98,6 +107,13 @@ class EpisodeVideo:
         except OSError as error:  # from imageio, and without a number
             raise OSError(errno.EIO, "ffmpeg stopped, is the disk full?", str(self.path)) from error
         self._frames += repeat
+
+    def _photograph(self) -> NDArray[np.uint8]:
+        if self._env is None:
+            raise RuntimeError("this video was made without an environment: use add")
+        scene = self._env.scene
+        self.camera = scene.camera.resized(*VIDEO_SIZE)
+        return scene.photograph(self.camera)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -153,13 +169,6 @@ class EpisodeVideo:
             draw_overlay(panel, self._decision, self.layout, camera, scale, reached)
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba()))
-
-
-def film(env: PushingEnv, video: EpisodeVideo) -> None:
-    """Have every push of the environment photographed for the video, from the environment's own camera."""
-    camera = env.scene.camera.resized(*VIDEO_SIZE)
-    video.camera = camera
-    env.scene.on_frame = lambda: video.add(env.scene.photograph(camera))
 
 
 def _open_writer(path: Path, fps: int) -> Any:

@@ -30,6 +30,7 @@ GOOD = {
 BAD = [
     # Names: the valid ones are named.
     ("plan", "task=juggling", "unknown task 'juggling': choose from clearing, insertion, crossing"),
+    ("plan", "viewer=screen", "unknown viewer 'screen': choose from rerun, or null for none"),
     ("plan", "reward=medium", "unknown reward 'medium': choose from dense, sparse"),
     ("plan", "planner=best", "unknown planner 'best': choose from cavin, cvae_mpc, mpc, random, sectar"),
     ("plan", "planner.optimizer=best", "unknown optimizer 'best': choose from shooting, cem, icem, mppi, smc"),

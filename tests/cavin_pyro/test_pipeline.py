@@ -145,6 +145,17 @@ def test_planning_leaves_a_table_a_picture_and_a_video(chain: SimpleNamespace) -
         assert f"episode/{name}\n" in said
 
 
+def test_planning_does_not_write_over_another_run(chain: SimpleNamespace, shell: SimpleNamespace) -> None:
+    words = LINES["plan"].replace("seed=7", "seed=8").split()
+    for name, said in (("episode", "seed=7, not 8: "), ("run", "")):  # the first is plan's own, the second train's
+        before = shell.contents(chain.folder / name)
+        answer = shell.run_command("plan", *words, f"output={name}", folder=chain.folder)
+        assert answer.status == 2
+        (line,) = answer.complaints
+        assert line.startswith(f"error: {name} holds a run with {said}")
+        assert shell.contents(chain.folder / name) == before
+
+
 def test_evaluation_leaves_rates_with_intervals_and_every_episode(chain: SimpleNamespace) -> None:
     folder = chain.folder / "evaluation"
     names = {"config.yaml", "results.json", "results.txt", "episodes.jsonl"}

@@ -12,7 +12,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from numpy.typing import NDArray
 
 from cavin_pyro.episodes import Decision, run_episode
-from cavin_pyro.video import EpisodeVideo, film
+from cavin_pyro.video import EpisodeVideo
 from envs.layouts import load_layout
 from envs.pushing import PushingEnv
 from models.pointnet import PointNet
@@ -166,8 +166,8 @@ def test_drawing_over_a_frame_costs_little(tmp_path: Path) -> None:
 def test_an_episode_is_filmed_from_the_first_push_to_the_last(tmp_path: Path) -> None:
     env = PushingEnv(task="insertion", objects=2, maximum_steps=4, render_mode="rgb_array")
     path = tmp_path / "episode.mp4"
-    with EpisodeVideo(path, env.layout) as video:
-        film(env, video)
+    with EpisodeVideo(path, env.layout, env=env) as video:
+        env.scene.on_frame = video.add_frame
         episode = run_episode(env, RandomPlanner(), PointNet(), seed=0, photograph=True, on_decision=video.set_decision)
     env.close()
     images = read(path)
