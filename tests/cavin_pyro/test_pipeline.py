@@ -146,7 +146,7 @@ def test_planning_leaves_a_table_a_picture_and_a_video(chain: SimpleNamespace) -
 
 
 def test_planning_does_not_write_over_another_run(chain: SimpleNamespace, shell: SimpleNamespace) -> None:
-    words = LINES["plan"].replace("seed=7", "seed=8").split()
+    words = LINES["plan"].replace("seed=7 output=episode", "seed=8").split()
     for name, said in (("episode", "seed=7, not 8: "), ("run", "")):  # the first is plan's own, the second train's
         before = shell.contents(chain.folder / name)
         answer = shell.run_command("plan", *words, f"output={name}", folder=chain.folder)
