@@ -26,7 +26,8 @@ def main(config: DictConfig) -> None:
         row = show_episode(setup, folder, seed=config.seed, video=True)
         setup.env.close()
         print(f"{task}: {row['outcome']} after {row['steps']} pushes")
-        print(f"  picture {folder / 'plan.png'}\n  video   {folder / 'episode.mp4'}", flush=True)
+        for what, name in (("picture", "plan.png"), ("from above", "plan-above.png"), ("video", "episode.mp4")):
+            print(f"  {what:<11}{folder / name}", flush=True)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ class Decision:
     Attributes:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
         milliseconds: from the observation to the plan. photograph: [height, width, 3] for figures, if wanted.
+        clouds: [M, 256, 3] metres, as observed, of real objects; None where nobody draws them.
     """
 
     step: int
@@ -34,6 +35,7 @@ class Decision:
     plan: Plan
     milliseconds: float
     photograph: NDArray[np.uint8] | None = None
+    clouds: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -58,17 +60,24 @@ class Push:
 
 @dataclass
 class Episode:
-    """What happened in one episode. outcome: one of `OUTCOMES`."""
+    """What happened in one episode. outcome: one of `OUTCOMES`; photograph, clouds: as of `Decision`, at the end."""
 
     seed: int
     outcome: str = "timeout"
     decisions: list[Decision] = field(default_factory=list)
     pushes: list[Push] = field(default_factory=list)
+    photograph: NDArray[np.uint8] | None = None
+    clouds: NDArray[np.float32] | None = None
 
     @property
     def total_reward(self) -> float:
         """The episode's return."""
         return sum(push.reward for push in self.pushes)
+
+    def reached(self, decision: Decision) -> NDArray[np.float32]:
+        """Where the objects were seen after each push of a decision: [n, M, 3] metres, n = T or fewer at the end."""
+        pushes = self.pushes[decision.step : decision.step + decision.plan.actions.shape[1]]
+        return np.array([push.centers for push in pushes], dtype=np.float32).reshape(-1, *decision.centers.shape)
 
 
 @torch.inference_mode()
@@ -93,6 +102,7 @@ def run_episode(
     seed: int,
     photograph: bool = False,
     on_decision: Callable[[Decision], None] | None = None,
+    on_observation: Callable[[ObservationDict], None] | None = None,
 ) -> Episode:
     """Run one episode from depth images alone.
 
@@ -100,10 +110,13 @@ def run_episode(
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
         photograph: keep a picture with every decision.
         on_decision: called after every plan, before its pushes.
+        on_observation: called with the first observation and with that after every push.
     """
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
     observation, _ = env.reset(seed=seed)
+    if on_observation is not None:
+        on_observation(observation)
     ended = False
     while not ended:
         began = time.perf_counter()
@@ -116,6 +129,7 @@ def run_episode(
             plan=plan,
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
+            clouds=observation["clouds"] if photograph else None,
         )
         episode.decisions.append(decision)
         if on_decision is not None:
@@ -124,6 +138,8 @@ def run_episode(
         for number, action in enumerate(actions):
             action = np.clip(action, -1.0, 1.0).astype(np.float32)
             observation, reward, terminated, truncated, info = env.step(action)
+            if on_observation is not None:
+                on_observation(observation)
             last = number == len(actions) - 1
             episode.pushes.append(
                 Push(
@@ -139,6 +155,8 @@ def run_episode(
             if ended:
                 episode.outcome = next((name for name in OUTCOMES[:3] if info[name]), "timeout")
                 break
+    if photograph:
+        episode.photograph, episode.clouds = env.render(), observation["clouds"]
     return episode
 
 

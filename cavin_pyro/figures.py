@@ -1,4 +1,4 @@
-"""Pictures of plans and of training. Every function writes one image, whole or not at all."""
+"""Pictures of training. Every function writes one image, whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,62 +8,23 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from cavin_pyro.episodes import Episode
-from cavin_pyro.figures_panel import RETURNS, counted, draw_decision, legend
 from cavin_pyro.files import replacing
-from envs.camera import Camera
-from envs.layouts import Layout
 from models.pointnet import PointNetAutoencoder
 
 DOTS_PER_INCH = 120
-PANELS = 6  # decisions shown
 COLORS = {"training": "#0072B2", "validation": "#D55E00"}
 SEEN, DRAWN = "#9A9A9A", "#E69F00"  # points of a cloud, and of its reconstruction
 
 
-def draw_plan(path: Path, episode: Episode, layout: Layout, camera: Camera) -> None:
-    """The paper's qualitative figure: what was considered, chosen and done over an episode, seen from above.
-
-    At most six decisions, evenly spread, in temporal order. Parts that a planner does not have are left out.
-
-    Args:
-        episode: its decisions hold photographs, or an empty table is drawn.
-        camera: that took the photographs, in any resolution.
-
-    Raises:
-        ValueError: the episode holds no decision.
-    """
-    if not episode.decisions:
-        raise ValueError("the episode holds no decision to draw: run it first")
-    chosen = np.linspace(0, len(episode.decisions) - 1, min(PANELS, len(episode.decisions))).round().astype(int)
-    decisions = [episode.decisions[index] for index in chosen]
-    columns = {1: 1, 2: 2, 4: 2}.get(len(decisions), 3)
-    rows = -(-len(decisions) // columns)
-    size = (max(8.4, 4.4 * columns), 0.9 + (5.3 if columns == 1 else 2.85) * rows)  # inches
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    returns = [decision.plan.candidate_returns[0].numpy() for decision in decisions]
-    scale = _scale(np.concatenate(returns))
-    for panel, decision in zip(axes.flat, decisions, strict=False):
-        draw_decision(panel, decision, layout, camera, scale)
-    for panel in axes.flat[len(decisions) :]:
-        panel.set_axis_off()
-    if scale is not None:
-        bar = figure.colorbar(ScalarMappable(scale, RETURNS), ax=axes, fraction=0.02, pad=0.01, aspect=30)
-        bar.set_label("return of a candidate", fontsize=9)
-        bar.ax.tick_params(labelsize=8)
-    title = f"{layout.task}, seed {episode.seed}: {episode.outcome} after {counted(len(episode.pushes))}"
-    figure.suptitle(title, fontsize=12)
-    handles = legend(layout, decisions, candidates=scale is not None)
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
-    _save(figure, path)
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as an image, whole or not at all."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, facecolor="white")
 
 
 def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None:
@@ -93,7 +54,7 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
         panel = figure.add_subplot(grid[row, 1 + column])
         _draw_curves(panel, {"validation": _curve(rows, term)})
         panel.set_title(term.removeprefix("validation_").replace("_", " "), fontsize=10)
-    _save(figure, path)
+    save_figure(path, figure)
 
 
 @torch.inference_mode()
@@ -128,16 +89,7 @@ def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: N
         Line2D([], [], color=DRAWN, marker="o", markersize=4, linestyle="", label="drawn again"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=9, frameon=False)
-    _save(figure, path)
-
-
-def _scale(returns: NDArray[np.float32]) -> Normalize | None:
-    """A colour scale for the returns [n] that are finite; None where none is."""
-    finite = returns[np.isfinite(returns)]
-    if len(finite) == 0:
-        return None
-    low, high = float(finite.min()), float(finite.max())
-    return Normalize(low, high if high > low else low + 1.0)
+    save_figure(path, figure)
 
 
 def _curve(rows: Sequence[Mapping[str, str | float]], key: str) -> NDArray[np.float64]:
@@ -164,8 +116,3 @@ def _draw_curves(panel: Axes, curves: Mapping[str, NDArray[np.float64]]) -> None
     panel.grid(color="#DDDDDD", linewidth=0.6)
     panel.spines[["top", "right"]].set_visible(False)
     panel.tick_params(labelsize=8)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with replacing(path) as temporary:
-        figure.savefig(temporary, facecolor="white")

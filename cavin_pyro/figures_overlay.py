@@ -6,19 +6,22 @@ are (column, row), as of `Camera.project`.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.episodes import Decision
-from envs.camera import Camera
 from envs.layouts import Layout, Tile
 from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, push_endpoints, tile_center
 
 Pixels = NDArray[np.float64]  # [..., 2]
 
 # Told apart by the colour-blind too (Okabe and Ito), and by shape besides.
-SUBGOAL_COLOR = "#E69F00"  # orange, as in the paper
+SUBGOAL_COLOR = "#E69F00"  # the target's: orange, as in the paper
+OBSTACLE_COLOR = "#56B4E9"  # the obstacles' subgoals: sky blue
 PREDICTION_COLOR = "#007A5A"  # green
+REACHED_COLOR = "#C5005E"  # crimson
 PUSH_COLOR = "#1A1A1A"
 TABLE_COLOR = "#C2B9AD"  # where there is no photograph
 
@@ -26,52 +29,64 @@ TARGET_RADIUS = 0.07  # metres; of the circle that marks the target
 MOVING = 0.01  # metres; objects that are to move less are left out
 
 
-def tile_corners(tile: Tile, camera: Camera) -> Pixels:
+class View(Protocol):
+    """From where a picture is seen: a camera, or a map."""
+
+    def project(self, points: NDArray[np.floating]) -> Pixels:
+        """Pixels (column, row) [..., 2] of points [..., 3] metres."""
+
+
+def tile_corners(tile: Tile, view: View) -> Pixels:
     """[4, 2], in order around the tile."""
     around = TILE_SIDE / 2 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-    return on_table(np.array(tile_center(tile)) + around, camera)
+    return on_table(np.array(tile_center(tile)) + around, view)
 
 
-def on_table(points: NDArray[np.floating], camera: Camera) -> Pixels:
+def on_table(points: NDArray[np.floating], view: View) -> Pixels:
     """Pixels [..., 2] of points (x, y) [..., 2] metres at the table's height."""
-    return camera.project(np.concatenate([points, np.zeros_like(points[..., :1])], axis=-1))
+    return view.project(np.concatenate([points, np.zeros_like(points[..., :1])], axis=-1))
 
 
-def table_box(camera: Camera) -> tuple[float, float, float, float]:
+def table_box(view: View) -> tuple[float, float, float, float]:
     """Left, top, right and bottom of the table's top."""
-    (left, top), (right, bottom) = on_table(np.array([TABLE_HIGH, TABLE_LOW]), camera)
+    (left, top), (right, bottom) = on_table(np.array([TABLE_HIGH, TABLE_LOW]), view)
     return float(left), float(top), float(right), float(bottom)
 
 
-def target_circle(decision: Decision, camera: Camera) -> tuple[tuple[float, float], float]:
-    """Centre and radius of a circle around the target."""
-    column, row = camera.project(decision.centers[0])
-    return (float(column), float(row)), TARGET_RADIUS * camera.focal_length / camera.position[2]
+def circle(center: NDArray[np.floating], view: View) -> tuple[tuple[float, float], float]:
+    """Centre and radius of a circle on the table around a point [3] metres, to mark the target with."""
+    column, row = view.project(center)
+    edge = on_table(np.array([[0.0, 0.0], [0.0, TARGET_RADIUS]]), view)
+    return (float(column), float(row)), float(np.linalg.norm(edge[1] - edge[0]))
 
 
-def observed_centers(decision: Decision, camera: Camera) -> Pixels:
-    """[objects, 2] of the real objects; the target's comes first if it was seen."""
-    return camera.project(decision.centers[decision.mask])
+def subgoal_chains(decision: Decision, view: View) -> dict[int, Pixels]:
+    """Where the chosen subgoals lead: a path [1 + segments, 2] of each object that moves; object 0 is the target."""
+    return _paths(decision, decision.plan.subgoals.centers[0].numpy()[: int(decision.plan.segments[0])], view)
 
 
-def subgoal_chains(decision: Decision, camera: Camera) -> list[Pixels]:
-    """Where the chosen subgoals lead: a path [1 + segments, 2] of each object that moves."""
-    return _paths(decision, decision.plan.subgoals.centers[0].numpy(), int(decision.plan.segments[0]), camera)
-
-
-def predicted_paths(decision: Decision, camera: Camera) -> list[Pixels]:
+def predicted_paths(decision: Decision, view: View) -> dict[int, Pixels]:
     """Where f predicts that the pushes lead: a path [1 + steps, 2] of each object that moves."""
     steps = int(decision.plan.segments[0]) * decision.plan.actions.shape[1]
-    return _paths(decision, decision.plan.predicted_centers[0].numpy(), steps, camera)
+    return _paths(decision, decision.plan.predicted_centers[0].numpy()[:steps], view)
 
 
-def pushes(decision: Decision, camera: Camera) -> Pixels:
+def reached_paths(decision: Decision, reached: NDArray[np.float32], view: View) -> dict[int, Pixels]:
+    """Where the pushes led: a path [1 + n, 2] of each object that moved.
+
+    Args:
+        reached: [n, M, 3] metres, centres seen after each push.
+    """
+    return _paths(decision, reached, view)
+
+
+def pushes(decision: Decision, view: View) -> Pixels:
     """Start and end [T, 2, 2] of the pushes that will be carried out."""
-    return on_table(np.stack(push_endpoints(decision.plan.actions[0].numpy()), axis=1), camera)
+    return on_table(np.stack(push_endpoints(decision.plan.actions[0].numpy()), axis=1), view)
 
 
 def candidate_subgoals(
-    decision: Decision, layout: Layout, camera: Camera, *, count: int
+    decision: Decision, layout: Layout, view: View, *, count: int
 ) -> tuple[Pixels, NDArray[np.float32]]:
     """Some of the subgoals that were considered, of the target alone or, in clearing, of every real object.
 
@@ -88,16 +103,16 @@ def candidate_subgoals(
     # Drawn, not every so many-th: those would be the same segment of every plan.
     chosen = np.random.default_rng(0).permutation(finite)[:count]
     chosen = chosen[np.argsort(every[chosen], kind="stable")]
-    return camera.project(points[chosen]), every[chosen]
+    return view.project(points[chosen]), every[chosen]
 
 
-def _paths(decision: Decision, centers: NDArray[np.float32], steps: int, camera: Camera) -> list[Pixels]:
-    """`centers`: [steps or more, M, 3] metres -> the paths of the real objects that move.
+def _paths(decision: Decision, centers: NDArray[np.float32], view: View) -> dict[int, Pixels]:
+    """`centers`: [steps, M, 3] metres -> the paths of the real objects that move, by their numbers.
 
     A plan may know of fewer objects than a decision has room for; those that it leaves out are padding.
     """
     objects = centers.shape[1]
-    ways = np.concatenate([decision.centers[None, :objects], centers[:steps]])
+    ways = np.concatenate([decision.centers[None, :objects], centers])
     furthest = np.linalg.norm(ways[..., :2] - ways[:1, :, :2], axis=-1).max(axis=0)
     moving = decision.mask[:objects] & (furthest > MOVING) & np.isfinite(furthest)
-    return [camera.project(ways[:, index]) for index in np.flatnonzero(moving)]
+    return {int(index): view.project(ways[:, index]) for index in np.flatnonzero(moving)}

@@ -11,21 +11,25 @@ from cavin_pyro.command import command
 def main(config: DictConfig) -> None:
     """Run one closed-loop episode from depth images and leave a folder with its table, picture and video."""
     import copy
+    from pathlib import Path
 
     from cavin_pyro.files import output_folder, write_json
     from cavin_pyro.provenance import provenance
-    from cavin_pyro.runs import write_config
+    from cavin_pyro.runs import check_same_run, write_config
     from cavin_pyro.setups import set_up
-    from cavin_pyro.showing import show_episode
+    from cavin_pyro.showing import episode_files, show_episode
+    from cavin_pyro.viewers import check_viewer
 
+    check_viewer(config.viewer)
+    check_same_run(Path(config.output), config, ignore=("output", "video", "viewer"))
     setup = set_up(copy.deepcopy(config), render=True)
     folder = output_folder(config.output)
     write_config(folder, config)
-    row = show_episode(setup, folder, seed=config.seed, video=config.video)
+    row = show_episode(setup, folder, seed=config.seed, video=config.video, viewer=config.viewer)
     setup.env.close()
     write_json(folder / "results.json", {**row, "provenance": provenance()})
     print(f"{config.task}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
-    for name in ("steps.csv", "plan.png", *(["episode.mp4"] if config.video else [])):
+    for name in episode_files(video=config.video, viewer=config.viewer):
         print(f"  {folder / name}")
 
 

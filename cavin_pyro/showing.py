@@ -3,41 +3,77 @@
 from __future__ import annotations
 
 import csv
-from contextlib import nullcontext
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from cavin_pyro.episodes import Episode, run_episode
+from cavin_pyro.episodes import Decision, Episode, run_episode
 from cavin_pyro.evaluation import episode_row
-from cavin_pyro.figures import draw_plan
+from cavin_pyro.figures_plan import draw_plan
 from cavin_pyro.files import replacing
 from cavin_pyro.setups import Setup
-from cavin_pyro.video import EpisodeVideo, film
-from envs.pushing import VIDEO_SIZE
+from cavin_pyro.video import EpisodeVideo
+from envs.pushing import ObservationDict
 
 
-def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool) -> dict[str, Any]:
-    """Run one episode and write `steps.csv`, `plan.png` and, if wanted, `episode.mp4`; returns its results' row."""
-    with EpisodeVideo(folder / "episode.mp4", setup.layout.task) if video else nullcontext() as reel:
-        if reel is not None:
-            film(setup.env, reel)
+class Onlooker(Protocol):
+    """Who is told of an episode while it goes on: a video, or a recording."""
+
+    def set_observation(self, observation: ObservationDict) -> None:
+        """What the camera saw, at the beginning and after every push."""
+
+    def set_decision(self, decision: Decision) -> None:
+        """What was planned, before it is carried out."""
+
+    def add_frame(self) -> None:
+        """Called a few times during every push."""
+
+    def end(self, episode: Episode) -> None:
+        """How it went."""
+
+
+def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool, viewer: str | None = None) -> dict[str, Any]:
+    """Run one episode and write `episode_files` about it; returns its results' row.
+
+    Args:
+        viewer: one of `cavin_pyro.viewers.VIEWERS`, whose module is installed, or None.
+    """
+    env = setup.env
+    with ExitStack() as stack:
+        onlookers: list[Onlooker] = []
+        if video:
+            onlookers.append(stack.enter_context(EpisodeVideo(folder / "episode.mp4", setup.layout, env=env)))
+        if viewer is not None:
+            from cavin_pyro.recording_rerun import recording  # an optional extra
+
+            onlookers.append(stack.enter_context(recording(folder / "episode.rrd", env, setup.layout)))
+
+        def tell(what: str, *about: object) -> None:
+            for onlooker in onlookers:
+                getattr(onlooker, what)(*about)
+
+        env.scene.on_frame = partial(tell, "add_frame")
         episode = run_episode(
-            setup.env,
+            env,
             setup.planner,
             setup.pointnet,
             seed=seed,
             photograph=True,
-            on_decision=reel.set_decision if reel is not None else None,
+            on_decision=partial(tell, "set_decision"),
+            on_observation=partial(tell, "set_observation"),
         )
-        if reel is not None:
-            reel.add(
-                setup.env.scene.photograph(setup.env.scene.camera.resized(*VIDEO_SIZE)),
-                phase=episode.outcome,
-                repeat=10,
-            )
+        tell("end", episode)
     write_steps(folder / "steps.csv", episode)
-    draw_plan(folder / "plan.png", episode, setup.layout, setup.env.scene.camera.resized(*VIDEO_SIZE))
+    draw_plan(folder / "plan.png", episode, setup.layout, env.scene.camera)
+    draw_plan(folder / "plan-above.png", episode, setup.layout, None)
     return episode_row(episode)
+
+
+def episode_files(*, video: bool, viewer: str | None = None) -> list[str]:
+    """Names of the files that `show_episode` writes."""
+    names = ["steps.csv", "plan.png", "plan-above.png"]
+    return names + ["episode.mp4"] * video + ["episode.rrd"] * (viewer is not None)
 
 
 def write_steps(path: Path, episode: Episode) -> None:

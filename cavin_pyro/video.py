@@ -1,4 +1,4 @@
-"""A video of an episode, with the plan that is being carried out drawn over it."""
+"""A video of an episode, with the plan that is being carried out drawn over it, as in the picture of the plans."""
 
 from __future__ import annotations
 
@@ -12,25 +12,23 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 from imageio_ffmpeg import count_frames_and_secs
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from cavin_pyro.episodes import Decision
-from cavin_pyro.figures_overlay import (
-    PUSH_COLOR,
-    SUBGOAL_COLOR,
-    Pixels,
-    pushes,
-    subgoal_chains,
-)
+from cavin_pyro.episodes import Decision, Episode
+from cavin_pyro.figures import DOTS_PER_INCH
+from cavin_pyro.figures_panel import draw_overlay
+from cavin_pyro.figures_plan import return_scale
 from cavin_pyro.files import replacing
 from envs.camera import Camera
-from envs.pushing import VIDEO_SIZE, PushingEnv
+from envs.layouts import Layout
+from envs.pushing import VIDEO_SIZE, ObservationDict, PushingEnv
 
 FRAMES_PER_SECOND = 10
 PAUSE = 0.5  # seconds for which a new plan is shown before it is carried out
 CAPTION_HEIGHT = 22  # pixels
-_FINE = 2  # the overlay is drawn this much larger, then shrunk, so that its edges are smooth
 
 
 class EpisodeVideo:
@@ -39,14 +37,18 @@ class EpisodeVideo:
     Use it as a context manager. Frames of odd sizes lose their last row or column, as the format wants.
 
     Args:
-        path: `.mp4`. task: for the caption; the frames show its tiles themselves. fps: frames per second.
-        camera: that takes the frames, in any resolution.
+        path: `.mp4`. layout: of the episode; the frames show its tiles themselves. fps: frames per second.
+        env: of which `add_frame` and `end` take photographs, with its own camera.
     """
 
-    def __init__(self, path: Path, task: str, fps: int = FRAMES_PER_SECOND, *, camera: Camera | None = None) -> None:
-        self.path, self.task, self.fps = path, task, fps
-        self.camera = camera or Camera()
+    def __init__(
+        self, path: Path, layout: Layout, fps: int = FRAMES_PER_SECOND, *, env: PushingEnv | None = None
+    ) -> None:
+        self.path, self.layout, self.fps = path, layout, fps
+        self.camera = Camera()
+        self._env = env
         self._decision: Decision | None = None
+        self._reached: list[NDArray[np.float32]] = []
         self._overlay: Image.Image | None = None
         self._font = ImageFont.load_default(14)
         self._writer: Any = None
@@ -64,9 +66,23 @@ class EpisodeVideo:
 
     def set_decision(self, decision: Decision) -> None:
         """Draw this plan over the frames to come, and show it for a moment if it has a photograph."""
-        self._decision, self._overlay = decision, None
+        self._decision, self._reached, self._overlay = decision, [], None
         if decision.photograph is not None:
             self.add(decision.photograph, phase="planned", repeat=max(1, round(PAUSE * self.fps)))
+
+    def set_observation(self, observation: ObservationDict) -> None:
+        """Draw where the objects were seen after a push of the plan over the frames to come."""
+        if self._decision is not None:
+            self._reached.append(observation["centers"])
+            self._overlay = None
+
+    def add_frame(self) -> None:
+        """Append a photograph of the environment as it is; for `Scene.on_frame`."""
+        self.add(self._photograph())
+
+    def end(self, episode: Episode) -> None:
+        """Show for a second how the episode ended."""
+        self.add(self._photograph(), phase=episode.outcome, repeat=self.fps)
 
     def add(self, frame: NDArray[np.uint8], *, phase: str = "pushing", repeat: int = 1) -> None:
         """Append a frame [H, W, 3], drawn over.
@@ -91,6 +107,13 @@ class EpisodeVideo:
         except OSError as error:  # from imageio, and without a number
             raise OSError(errno.EIO, "ffmpeg stopped, is the disk full?", str(self.path)) from error
         self._frames += repeat
+
+    def _photograph(self) -> NDArray[np.uint8]:
+        if self._env is None:
+            raise RuntimeError("this video was made without an environment: use add")
+        scene = self._env.scene
+        self.camera = scene.camera.resized(*VIDEO_SIZE)
+        return scene.photograph(self.camera)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -125,27 +148,25 @@ class EpisodeVideo:
 
     def _caption(self, phase: str) -> str:
         if self._decision is None:
-            return f"{self.task} · {phase}"
+            return f"{self.layout.task} · {phase}"
         first = self._decision.step + 1
         last = self._decision.step + self._decision.plan.actions.shape[1]
         numbers = f"push {first}" if first == last else f"pushes {first} to {last}"
-        return f"{self.task} · {numbers} · {phase}"
+        return f"{self.layout.task} · {numbers} · {phase}"
 
     def _draw_overlay(self, width: int, height: int) -> Image.Image:
-        """Everything that stays the same until the next plan, as a transparent image."""
-        camera = self.camera.resized(_FINE * width, _FINE * height)
-        image = Image.new("RGBA", (camera.width, camera.height))
-        draw = ImageDraw.Draw(image)
+        """Everything that stays the same until the next push, as a transparent image."""
+        camera = self.camera.resized(width, height)
+        figure = Figure(figsize=(width / DOTS_PER_INCH, height / DOTS_PER_INCH), dpi=DOTS_PER_INCH, facecolor="none")
+        canvas = FigureCanvasAgg(figure)
+        panel = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(height, 0))
+        panel.set_axis_off()
         if self._decision is not None:
-            _draw_decision(draw, self._decision, camera)
-        return image.resize((width, height), Image.Resampling.LANCZOS)
-
-
-def film(env: PushingEnv, video: EpisodeVideo) -> None:
-    """Have every push of the environment photographed for the video, from the environment's own camera."""
-    camera = env.scene.camera.resized(*VIDEO_SIZE)
-    video.camera = camera
-    env.scene.on_frame = lambda: video.add(env.scene.photograph(camera))
+            scale = return_scale(self._decision.plan.candidate_returns[0].numpy())
+            reached = np.array(self._reached, dtype=np.float32).reshape(-1, *self._decision.centers.shape)
+            draw_overlay(panel, self._decision, self.layout, camera, scale, reached)
+        canvas.draw()
+        return Image.fromarray(np.asarray(canvas.buffer_rgba()))
 
 
 def _open_writer(path: Path, fps: int) -> Any:
@@ -159,24 +180,3 @@ def _open_writer(path: Path, fps: int) -> Any:
         "ffmpeg_log_level": "error",
     }
     return imageio.get_writer(path, mode="I", **options)
-
-
-def _draw_decision(draw: ImageDraw.ImageDraw, decision: Decision, camera: Camera) -> None:
-    for chain in subgoal_chains(decision, camera):
-        draw.line(_points(chain), fill=SUBGOAL_COLOR, width=3 * _FINE, joint="curve")
-        for column, row in chain[1:]:
-            draw.circle((column, row), 4 * _FINE, fill=SUBGOAL_COLOR, outline="black", width=_FINE)
-    for start, end in pushes(decision, camera):
-        _draw_arrow(draw, start, end)
-
-
-def _draw_arrow(draw: ImageDraw.ImageDraw, start: Pixels, end: Pixels) -> None:
-    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
-    across = np.array([-along[1], along[0]])
-    neck = end - 8 * _FINE * along
-    draw.line(_points(np.stack([start, neck])), fill=PUSH_COLOR, width=2 * _FINE)
-    draw.polygon(_points(np.stack([end, neck + 4 * _FINE * across, neck - 4 * _FINE * across])), fill=PUSH_COLOR)
-
-
-def _points(pixels: Pixels) -> list[tuple[float, float]]:
-    return [(float(column), float(row)) for column, row in pixels]

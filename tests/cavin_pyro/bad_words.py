@@ -6,6 +6,7 @@ from __future__ import annotations
 BAD_WORDS = [
     # Names: the valid ones are named.
     ("plan", "task=juggling", "unknown task 'juggling': choose from clearing, insertion, crossing"),
+    ("plan", "viewer=screen", "unknown viewer 'screen': choose from rerun, or null for none"),
     ("plan", "reward=medium", "unknown reward 'medium': choose from dense, sparse"),
     (
         "plan",

@@ -205,7 +205,7 @@ def test_a_configuration_from_python_is_that_of_the_command() -> None:
     config = compose("plan", "task=clearing", "planner.samples=8")
     assert config.task == "clearing"
     assert config.planner.samples == 8
-    assert config.output == "runs/plan/clearing-0"  # nothing is left to be resolved
+    assert config.output == "runs/plan/clearing-sparse-3-cavin-0"  # nothing is left to be resolved
     assert "hydra" not in config
     assert compose("evaluate", "planner=random").output == "runs/evaluate/crossing-sparse-3-random-0"
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -9,21 +10,27 @@ import torch
 from matplotlib import colors
 from numpy.typing import NDArray
 
-from cavin_pyro import figures, figures_panel
-from cavin_pyro.episodes import Decision, Episode
-from cavin_pyro.figures import draw_plan, draw_reconstructions, draw_training
+from cavin_pyro import figures, figures_panel, figures_plan
+from cavin_pyro.episodes import Decision, Episode, Push
+from cavin_pyro.figures import draw_reconstructions, draw_training
+from cavin_pyro.figures_map import Map
 from cavin_pyro.figures_overlay import (
+    OBSTACLE_COLOR,
     PREDICTION_COLOR,
+    REACHED_COLOR,
     SUBGOAL_COLOR,
     candidate_subgoals,
     predicted_paths,
     pushes,
+    reached_paths,
     subgoal_chains,
     tile_corners,
 )
+from cavin_pyro.figures_plan import FAILURE_COLOR, SUCCESS_COLOR, draw_plan
 from envs.camera import Camera
 from envs.layouts import TASK_NAMES, load_layout
 from envs.markings import tile_groups
+from envs.scene import COLORS
 from envs.workspace import normalised_push, tile_center
 from models.pointnet import PointNetAutoencoder
 from models.state import State
@@ -88,7 +95,7 @@ def test_a_plans_figure_shows_subgoals_and_predictions(task: str, tmp_path: Path
     layout = load_layout(task, 0)
     draw_plan(tmp_path / "plan.png", episode(made_up_plan(), made_up_plan()), layout, CAMERA)
     image = imageio.imread(tmp_path / "plan.png")
-    assert image.shape[:2] == (round(120 * (0.9 + 2.85)), round(120 * 8.8))
+    assert image.shape[:2] == pytest.approx((120 * (0.9 + 2.95), 120 * 3 * 4.4), abs=1)
     assert (image[0, 0, :3] == 255).all()
     assert pixels_like(image, SUBGOAL_COLOR) > 100
     assert pixels_like(image, PREDICTION_COLOR) > 10
@@ -101,13 +108,13 @@ def test_a_plan_that_predicts_nothing_is_drawn_without_subgoals_and_predictions(
     assert pixels_like(image, SUBGOAL_COLOR) == pixels_like(image, PREDICTION_COLOR) == 0
 
 
-def test_at_most_six_decisions_are_shown_from_the_first_to_the_last(
+def test_at_most_five_decisions_are_shown_from_the_first_to_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = []
-    monkeypatch.setattr(figures, "draw_decision", lambda panel, shown_one, *rest: shown.append(shown_one.step))
+    monkeypatch.setattr(figures_plan, "draw_decision", lambda panel, shown_one, *rest: shown.append(shown_one.step))
     draw_plan(tmp_path / "plan.png", episode(*[random_plan()] * 20), load_layout("clearing", 0), CAMERA)
-    assert len(shown) == 6
+    assert len(shown) == 5
     assert shown == sorted(shown)
     assert (shown[0], shown[-1]) == (0, 19 * T)
 
@@ -132,15 +139,84 @@ def test_the_legend_names_what_is_drawn_and_nothing_else() -> None:
     layout = load_layout("crossing", 0)
     full = [entry.get_label() for entry in figures_panel.legend(layout, [decision(made_up_plan())], candidates=True)]
     bare = [entry.get_label() for entry in figures_panel.legend(layout, [decision(random_plan())], candidates=False)]
-    assert full == ["bridge", "goal", "target", "seen", "candidates", "subgoals", "predicted", "push"]
-    assert bare == ["bridge", "goal", "target", "seen", "push"]
+    assert full[:5] == ["bridge", "goal", "target", "seen", "candidates"]
+    assert full[5:] == ["target's subgoals", "obstacles' subgoals", "predicted", "reached", "push"]
+    assert bare == ["bridge", "goal", "target", "seen", "reached", "push"]
+
+
+def push(step: int, *, along_x: float = 0.0) -> Push:
+    """After which the target is seen `along_x` metres from where it was, and nothing else has moved."""
+    centers = seen_centers()
+    centers[0, 0] += along_x
+    flags = dict.fromkeys(("success", "violation", "fall", "unsafe", "ineffective"), False)
+    return Push(step, np.zeros(4, np.float32), -1.0, **flags, centers=centers, subgoal_distance=0.0)
+
+
+def test_what_was_reached_is_drawn_beside_what_was_predicted(tmp_path: Path) -> None:
+    run = episode(made_up_plan(), made_up_plan())
+    run.pushes += [push(number, along_x=0.03 * number) for number in (1, 2, 3, 4)]
+    first, second = run.decisions
+    assert run.reached(first).shape == (T, ROOM, 3)
+    assert run.reached(second).shape == (1, ROOM, 3)
+    (path,) = reached_paths(first, run.reached(first), CAMERA).values()
+    np.testing.assert_allclose(path[-1], CAMERA.project(seen_centers()[0] + [0.09, 0.0, 0.0]), atol=1e-3)
+    draw_plan(tmp_path / "plan.png", run, load_layout("insertion", 0), CAMERA)
+    assert pixels_like(imageio.imread(tmp_path / "plan.png"), REACHED_COLOR) > 50
+
+
+def test_the_targets_subgoals_and_the_obstacles_have_two_colours(tmp_path: Path) -> None:
+    plan = made_up_plan()
+    plan.subgoals.centers[:, :, 1, 1] += 0.1
+    moved = decision(plan)
+    assert set(subgoal_chains(moved, CAMERA)) == {0, 1}
+    draw_plan(tmp_path / "plan.png", Episode(0, "timeout", [moved]), load_layout("crossing", 0), CAMERA)
+    image = imageio.imread(tmp_path / "plan.png")
+    draw_plan(tmp_path / "still.png", episode(made_up_plan()), load_layout("crossing", 0), CAMERA)
+    still = imageio.imread(tmp_path / "still.png")
+    assert pixels_like(image, SUBGOAL_COLOR) > 100
+    assert pixels_like(image, OBSTACLE_COLOR) > pixels_like(still, OBSTACLE_COLOR) + 50
+
+
+@pytest.mark.parametrize(
+    ("outcome", "words", "color"),
+    [
+        ("success", "end, after 1 push: success", SUCCESS_COLOR),
+        ("violation", "end, after 1 push: failure (violation)", FAILURE_COLOR),
+        ("timeout", "end, after 1 push: failure (timeout)", FAILURE_COLOR),
+    ],
+)
+def test_the_last_panel_shows_the_end_and_says_how_it_went(
+    outcome: str, words: str, color: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(figures_plan, "save_figure", lambda path, figure: drawn.append(figure))
+    ended = Episode(7, outcome, [decision(made_up_plan())], [push(1, along_x=0.1)])
+    ended.photograph = np.full((424, 512, 3), 50, dtype=np.uint8)
+    draw_plan(tmp_path / "plan.png", ended, load_layout("insertion", 0), CAMERA)
+    *_, end = [panel for panel in drawn[0].axes if panel.get_title()]
+    assert (end.get_title(), end.title.get_color()) == (words, color)
+    assert (end.images[0].get_array() == 50).all()
+
+
+def test_a_map_is_true_to_scale_and_turned_as_the_cameras_image(tmp_path: Path) -> None:
+    origin, ahead, left = Map().project(np.array([[0.5, 0.1, 0.0], [0.6, 0.1, 0.3], [0.5, 0.2, 0.0]]))
+    np.testing.assert_allclose(ahead - origin, [0.0, -36.55], atol=1e-9)  # up, whatever its height
+    np.testing.assert_allclose(left - origin, [-36.55, 0.0], atol=1e-9)
+    seen = decision(made_up_plan(), photograph=False)
+    draw_plan(tmp_path / "plan.png", Episode(0, "fall", [seen]), load_layout("crossing", 0), None)
+    clouds = seen_centers()[:, None] + 0.02 * np.random.default_rng(0).standard_normal((ROOM, 256, 3))
+    seen = replace(seen, clouds=clouds.astype(np.float32))
+    draw_plan(tmp_path / "clouds.png", Episode(0, "fall", [seen]), load_layout("crossing", 0), None)
+    bare, full = (imageio.imread(tmp_path / name) for name in ("plan.png", "clouds.png"))
+    assert pixels_like(full, colors.to_hex(COLORS[1])) > pixels_like(bare, colors.to_hex(COLORS[1])) + 20
 
 
 @pytest.mark.parametrize("segments", [1, 2, K])
 def test_chains_end_where_the_plan_does_and_leave_out_what_hardly_moves(segments: int) -> None:
     seen = decision(made_up_plan(segments))
-    (chain,) = subgoal_chains(seen, CAMERA)
-    (path,) = predicted_paths(seen, CAMERA)
+    ((target, chain),) = subgoal_chains(seen, CAMERA).items()
+    (path,) = predicted_paths(seen, CAMERA).values()
+    assert target == 0
     assert len(chain) == 1 + segments
     assert len(path) == 1 + segments * T
     np.testing.assert_allclose(chain[0], CAMERA.project(seen.centers[0]))
@@ -155,7 +231,7 @@ def test_predictions_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     plan.candidate_centers[:, :20] = torch.nan
     plan.candidate_returns[:, 20:30] = -torch.inf
     seen = decision(plan)
-    assert predicted_paths(seen, CAMERA) == subgoal_chains(seen, CAMERA) == []
+    assert predicted_paths(seen, CAMERA) == subgoal_chains(seen, CAMERA) == {}
     dots, returns = candidate_subgoals(seen, load_layout("insertion", 0), CAMERA, count=1000)
     assert len(dots) == len(returns) == 10 * K
     assert np.isfinite(dots).all()

@@ -122,7 +122,7 @@ def test_training_leaves_a_checkpoint_with_its_record(chain: SimpleNamespace) ->
 
 def test_planning_leaves_a_table_a_picture_and_a_video(chain: SimpleNamespace) -> None:
     folder = chain.folder / "episode"
-    names = {"config.yaml", "results.json", "steps.csv", "plan.png", "episode.mp4"}
+    names = {"config.yaml", "results.json", "steps.csv", "plan.png", "plan-above.png", "episode.mp4"}
     assert {path.name for path in folder.iterdir()} == names
     results = json.loads((folder / "results.json").read_text())
     rows = read_csv(folder / "steps.csv")
@@ -135,13 +135,25 @@ def test_planning_leaves_a_table_a_picture_and_a_video(chain: SimpleNamespace) -
     aimed = [float(row["subgoal_distance_m"]) for row in rows if row["subgoal_distance_m"]]
     assert aimed and all(0 <= distance < 1 for distance in aimed)
     assert results["provenance"]["command"].startswith("python -m cavin_pyro.plan ")
-    assert imageio.imread(folder / "plan.png").std() > 10
+    for name in ("plan.png", "plan-above.png"):
+        assert imageio.imread(folder / name).std() > 10
     with imageio.get_reader(folder / "episode.mp4") as video:
         assert sum(1 for _ in video) > 10  # `list` asks for the length first, which is infinite
     said = chain.answers["plan"].output
     assert said.startswith(f"crossing: {results['outcome']} after {results['steps']} pushes")
-    for name in ("steps.csv", "plan.png", "episode.mp4"):
+    for name in ("steps.csv", "plan.png", "plan-above.png", "episode.mp4"):
         assert f"episode/{name}\n" in said
+
+
+def test_planning_does_not_write_over_another_run(chain: SimpleNamespace, shell: SimpleNamespace) -> None:
+    words = LINES["plan"].replace("seed=7 output=episode", "seed=8").split()
+    for name, said in (("episode", "seed=7, not 8: "), ("run", "")):  # the first is plan's own, the second train's
+        before = shell.contents(chain.folder / name)
+        answer = shell.run_command("plan", *words, f"output={name}", folder=chain.folder)
+        assert answer.status == 2
+        (line,) = answer.complaints
+        assert line.startswith(f"error: {name} holds a run with {said}")
+        assert shell.contents(chain.folder / name) == before
 
 
 def test_evaluation_leaves_rates_with_intervals_and_every_episode(chain: SimpleNamespace) -> None:

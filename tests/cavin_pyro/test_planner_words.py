@@ -15,7 +15,7 @@ from cavin_pyro import building
 from cavin_pyro.checkpoint import save_checkpoint
 from cavin_pyro.episodes import OUTCOMES, run_episode
 from cavin_pyro.errors import UserError
-from cavin_pyro.figures import draw_plan
+from cavin_pyro.figures_plan import draw_plan
 from cavin_pyro.setups import Setup, set_up
 from models.pointnet import PointNet
 from planning.optimisers import OPTIMISERS

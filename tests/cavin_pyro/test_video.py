@@ -12,13 +12,14 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from numpy.typing import NDArray
 
 from cavin_pyro.episodes import Decision, run_episode
-from cavin_pyro.video import EpisodeVideo, film
+from cavin_pyro.video import EpisodeVideo
+from envs.layouts import load_layout
 from envs.pushing import PushingEnv
 from models.pointnet import PointNet
 from models.state import State
 from planning import RandomPlanner
 
-TASK = "insertion"
+LAYOUT = load_layout("insertion", 0)
 
 
 def frame(height: int = 424, width: int = 512, grey: int = 200) -> NDArray[np.uint8]:
@@ -43,7 +44,7 @@ def read(path: Path) -> list[NDArray[np.uint8]]:
 
 
 def test_a_video_holds_the_frames_that_were_added(tmp_path: Path) -> None:
-    with EpisodeVideo(tmp_path / "episode.mp4", TASK) as video:
+    with EpisodeVideo(tmp_path / "episode.mp4", LAYOUT) as video:
         for number in range(12):
             video.add(frame(grey=20 * number))
         video.add(frame(), phase="success", repeat=5)
@@ -57,7 +58,7 @@ def test_a_video_holds_the_frames_that_were_added(tmp_path: Path) -> None:
 
 def test_browsers_can_play_it_and_begin_before_it_is_loaded(tmp_path: Path) -> None:
     path = tmp_path / "episode.mp4"
-    with EpisodeVideo(path, TASK, fps=20) as video:
+    with EpisodeVideo(path, LAYOUT, fps=20) as video:
         video.add(frame(), repeat=20)
     with imageio.get_reader(path) as reader:
         about = reader.get_meta_data()
@@ -68,13 +69,13 @@ def test_browsers_can_play_it_and_begin_before_it_is_loaded(tmp_path: Path) -> N
 
 
 def test_odd_sizes_are_made_even(tmp_path: Path) -> None:
-    with EpisodeVideo(tmp_path / "episode.mp4", TASK) as video:
+    with EpisodeVideo(tmp_path / "episode.mp4", LAYOUT) as video:
         video.add(frame(213, 257), repeat=3)
     assert [image.shape for image in read(tmp_path / "episode.mp4")] == [(212, 256, 3)] * 3
 
 
 def test_the_plan_is_drawn_over_the_frames_that_follow_it(tmp_path: Path) -> None:
-    with EpisodeVideo(tmp_path / "episode.mp4", TASK) as video:
+    with EpisodeVideo(tmp_path / "episode.mp4", LAYOUT) as video:
         video.add(frame(), repeat=2)
         video.set_decision(decision())
         video.add(frame(), repeat=2)
@@ -87,7 +88,7 @@ def test_the_plan_is_drawn_over_the_frames_that_follow_it(tmp_path: Path) -> Non
 
 
 def test_a_decision_with_a_photograph_is_shown_for_half_a_second(tmp_path: Path) -> None:
-    with EpisodeVideo(tmp_path / "episode.mp4", TASK, fps=10) as video:
+    with EpisodeVideo(tmp_path / "episode.mp4", LAYOUT, fps=10) as video:
         video.set_decision(decision(photograph=True))
         video.set_decision(decision(step=3))
     assert len(read(tmp_path / "episode.mp4")) == 5
@@ -97,12 +98,12 @@ def test_a_decision_with_a_photograph_is_shown_for_half_a_second(tmp_path: Path)
 def test_a_crash_leaves_no_file_and_keeps_the_video_of_an_earlier_run(
     error: type[BaseException], tmp_path: Path
 ) -> None:
-    with pytest.raises(error), EpisodeVideo(tmp_path / "new.mp4", TASK) as video:
+    with pytest.raises(error), EpisodeVideo(tmp_path / "new.mp4", LAYOUT) as video:
         video.add(frame())
         raise error
     assert not list(tmp_path.iterdir())
     (tmp_path / "old.mp4").write_bytes(b"old")
-    with pytest.raises(error), EpisodeVideo(tmp_path / "old.mp4", TASK) as video:
+    with pytest.raises(error), EpisodeVideo(tmp_path / "old.mp4", LAYOUT) as video:
         video.add(frame())
         raise error
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
@@ -114,14 +115,14 @@ def test_a_video_that_misses_frames_is_an_error_and_leaves_no_file(
     monkeypatch.setattr("cavin_pyro.video.count_frames_and_secs", lambda path: (1, 0.1))
     with (
         pytest.raises(OSError, match="1 of 2 frames"),
-        EpisodeVideo(tmp_path / "episode.mp4", TASK) as video,
+        EpisodeVideo(tmp_path / "episode.mp4", LAYOUT) as video,
     ):
         video.add(frame(), repeat=2)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_video_without_frames_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no frame"), EpisodeVideo(tmp_path / "episode.mp4", TASK):
+    with pytest.raises(ValueError, match="no frame"), EpisodeVideo(tmp_path / "episode.mp4", LAYOUT):
         pass
     assert not list(tmp_path.iterdir())
 
@@ -132,13 +133,13 @@ def test_a_video_without_frames_is_an_error_and_leaves_no_file(tmp_path: Path) -
 def test_what_is_not_a_frame_is_refused(wrong: NDArray, tmp_path: Path) -> None:
     with (
         pytest.raises(ValueError, match="a frame is"),
-        EpisodeVideo(tmp_path / "episode.mp4", TASK) as video,
+        EpisodeVideo(tmp_path / "episode.mp4", LAYOUT) as video,
     ):
         video.add(wrong)
 
 
 def test_frames_are_refused_before_and_after_the_with_block(tmp_path: Path) -> None:
-    video = EpisodeVideo(tmp_path / "episode.mp4", TASK)
+    video = EpisodeVideo(tmp_path / "episode.mp4", LAYOUT)
     with pytest.raises(RuntimeError, match="with block"):
         video.add(frame())
     with video:
@@ -149,7 +150,7 @@ def test_frames_are_refused_before_and_after_the_with_block(tmp_path: Path) -> N
 
 def test_drawing_over_a_frame_costs_little(tmp_path: Path) -> None:
     times = []
-    with EpisodeVideo(tmp_path / "episode.mp4", TASK) as video:
+    with EpisodeVideo(tmp_path / "episode.mp4", LAYOUT) as video:
         video.set_decision(decision())
         video._draw(frame(), "pushing")
         for _ in range(20):
@@ -163,8 +164,8 @@ def test_drawing_over_a_frame_costs_little(tmp_path: Path) -> None:
 def test_an_episode_is_filmed_from_the_first_push_to_the_last(tmp_path: Path) -> None:
     env = PushingEnv(task="insertion", objects=2, maximum_steps=4, render_mode="rgb_array")
     path = tmp_path / "episode.mp4"
-    with EpisodeVideo(path, TASK) as video:
-        film(env, video)
+    with EpisodeVideo(path, LAYOUT, env=env) as video:
+        env.scene.on_frame = video.add_frame
         episode = run_episode(env, RandomPlanner(), PointNet(), seed=0, photograph=True, on_decision=video.set_decision)
     env.close()
     images = read(path)
