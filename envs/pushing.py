@@ -32,8 +32,9 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is
     the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
 
-    `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and
-    `terms`, the named parts of the reward. An episode terminates at success, violation or fall, and is
+    `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push
+    early: "unreachable" and not begun, "blocked" by something in its way, contact with the "table"; "" if it did
+    not), `success`, `violation`, `fall`, and `terms`, the named parts of the reward. An episode terminates at success, violation or fall, and is
     truncated after `maximum_steps`.
 
     Args:
@@ -41,9 +42,11 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             is taken as it is, and its task counts.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
         maximum_steps: pushes per episode.
+        robot: what pushes, one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
 
     Raises:
-        ValueError: an argument is out of its range, or the layout has no room for the objects.
+        ValueError: an argument is out of its range, the layout has no room for the objects, or the robot's files
+            are missing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -60,6 +63,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         maximum_steps: int = EPISODE_STEPS,
         camera: Camera | None = None,
         render_mode: str | None = None,
+        robot: str = "stick",
+        assets: str | Path | None = None,
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
             raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
@@ -73,7 +78,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.reward = TaskReward(self.layout, reward=reward)
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.ranges = ranges or ObjectRanges()
-        self.scene = Scene(camera=camera)
+        self.scene = Scene(camera=camera, robot=robot, assets=assets)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
@@ -131,6 +136,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             "steps": self._steps,
             "unsafe": report.unsafe,
             "ineffective": report.ineffective,
+            "stopped": report.stopped,
             "success": success,
             "violation": violation,
             "fall": fallen,
