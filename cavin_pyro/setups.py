@@ -68,6 +68,8 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             ranges=object_ranges(config.env),
             maximum_steps=config.maximum_steps,
             render_mode="rgb_array" if render else None,
+            robot=config.env.robot,
+            assets=config.env.assets,
         )
         env.reset(seed=config.seed)  # tells at once whether the layout has room for the objects
     return Setup(env, planner, pointnet, layout)

@@ -6,24 +6,29 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.errors import UserError, user_input
 from envs.objects import ObjectRanges
+from envs.robots import ROBOTS, robot_maker
 from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
 
-CHOICES = {"robot": ("stick",), "objects": ("builtin",), "camera": ("ideal",), "segmentation": ("mask",)}
+CHOICES = {"robot": tuple(ROBOTS), "objects": ("builtin",), "camera": ("ideal",), "segmentation": ("mask",)}
 
 
 def check_world(env: DictConfig) -> None:
     """Check the parts that have names.
 
     Raises:
-        UserError: unknown part; the valid ones are named.
+        UserError: unknown part, the valid ones are named; or a part lacks files, and what to do is said.
     """
     for word, valid in CHOICES.items():
         if env[word] not in valid:
             raise UserError(f"unknown env.{word} {env[word]!r}: choose from {', '.join(valid)}")
+    if env.assets is not None and not isinstance(env.assets, str):
+        raise UserError(f"env.assets must be the path of a folder, not {env.assets!r}")
+    with user_input():
+        robot_maker(env.robot, env.assets)
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:
