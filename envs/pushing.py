@@ -34,8 +34,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
     `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push
     early: "unreachable" and not begun, "blocked" by something in its way, contact with the "table"; "" if it did
-    not), `success`, `violation`, `fall`, and `terms`, the named parts of the reward. An episode terminates at success, violation or fall, and is
-    truncated after `maximum_steps`.
+    not), `success`, `violation`, `fall`, and `terms`, the named parts of the reward. An episode terminates at
+    success, violation or fall, and is truncated after `maximum_steps`.
 
     Args:
         task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout. A `Layout`

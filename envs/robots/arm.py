@@ -97,9 +97,7 @@ class ArmRobot:
             return None
         return np.stack(path)
 
-    def _follow(
-        self, path: NDArray[np.float64] | None, place: Point, steps: int, *, guarded: bool = True
-    ) -> Stopped:
+    def _follow(self, path: NDArray[np.float64] | None, place: Point, steps: int, *, guarded: bool = True) -> Stopped:
         """Drive the joints along waypoints [K, J], evenly spaced in the way to go, in at least `steps` steps."""
         if path is None:
             return "unreachable"
@@ -124,4 +122,3 @@ class ArmRobot:
 
 def _line(start: Point, end: Point, count: int) -> NDArray[np.float64]:
     return start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-

@@ -22,7 +22,8 @@ _LINK = """<link name="{name}">
   <inertial><origin xyz="0 0 {middle}"/><mass value="{mass}"/>
     <inertia ixx="{wide}" iyy="{wide}" izz="{thin}" ixy="0" ixz="0" iyz="0"/></inertial>{shapes}
 </link>"""
-_SHAPE = """<{kind}><origin xyz="0 0 {middle}"/><geometry><cylinder radius="{radius}" length="{length}"/></geometry></{kind}>"""
+_SHAPE = """<{kind}><origin xyz="0 0 {middle}"/>
+  <geometry><cylinder radius="{radius}" length="{length}"/></geometry></{kind}>"""
 _JOINT = """<joint name="{child}_fixed" type="fixed"><origin xyz="0 0 {height}"/><parent link="{parent}"/>
   <child link="{child}"/></joint>"""
 

@@ -53,5 +53,3 @@ def settle(world: PhysicsWorld, robot: Robot, objects: Sequence[int], *, limit: 
         if (number + 1) % SETTLING_STEPS == 0 and world.fastest(objects) < SETTLED_SPEED:
             world.rest(objects)
             break
-
-

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.camera import Camera
-from envs.physics import TIME_STEP, PhysicsWorld
+from envs.physics import PhysicsWorld
 from envs.pushing import PushingEnv
 from envs.robots import ROBOTS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, ArmRobot, push, robot_maker
 from envs.robots.arm import inverse_kinematics
@@ -25,7 +25,7 @@ from envs.robots.panda import panda
 from envs.robots.robot import ABOVE_HEIGHT
 from envs.robots.sawyer import sawyer
 from envs.scene import Scene
-from envs.workspace import REACH_HIGH, REACH_LOW, push_endpoints
+from envs.workspace import REACH_HIGH, REACH_LOW
 
 ROOT = Path(__file__).parents[2]
 ASSETS = Path(os.environ.get("CAVIN_PYRO_ASSETS", ROOT.parent / "shared" / "assets"))
