@@ -60,7 +60,7 @@ class Watched:
             return {"slide": "push", "leave": "off stage", "reaches": "inverse kinematics", "wait": "settle"}.get(
                 verb, "the rest"
             )
-        return "above" if not self.tips else "up" if arguments[0][2] > 0.1 else "down"
+        return "up" if self.tips else "above" if arguments[0][2] > 0.1 else "down"
 
 
 def scenes(count: int, heavy: bool, seed: int) -> list[tuple[list[ObjectParameters], np.random.Generator]]:
