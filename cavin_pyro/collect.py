@@ -26,6 +26,10 @@ def main(config: DictConfig) -> None:
         )
     fraction("perturbed", config.perturbed)
     check_world(config.env)
+    if config.env.robot != "stick":
+        raise UserError(
+            f"data are collected with env.robot=stick, not {config.env.robot}: it pushes alike in less time"
+        )
     settings = CollectionSettings(
         seed=config.seed,
         steps=config.steps,

@@ -76,6 +76,7 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             assets=config.env.assets,
             maximum_steps=config.maximum_steps,
             render_mode="rgb_array" if render else None,
+            robot=config.env.robot,
         )
     try:
         with user_input():

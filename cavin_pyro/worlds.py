@@ -10,20 +10,25 @@ from cavin_pyro.errors import UserError, one_of, user_input
 from envs.object_asset import plain_name
 from envs.object_sets import OBJECT_SETS, chosen, load_object_set
 from envs.objects import ObjectRanges
+from envs.robots import ROBOTS, robot_maker
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
 
-CHOICES = {"robot": ("stick",), "objects": tuple(OBJECT_SETS), "camera": ("ideal",), "segmentation": ("mask",)}
+CHOICES = {"robot": tuple(ROBOTS), "objects": tuple(OBJECT_SETS), "camera": ("ideal",), "segmentation": ("mask",)}
 
 
 def check_world(env: DictConfig) -> None:
     """Check the parts that have names.
 
     Raises:
-        UserError: unknown part; the valid ones are named.
+        UserError: unknown part, the valid ones are named; or a part lacks files, and what to do is said.
     """
     for word, valid in CHOICES.items():
         one_of(f"env.{word}", env[word], valid)
+    if env.assets is not None and not isinstance(env.assets, str):
+        raise UserError(f"env.assets must be the path of a folder, not {env.assets!r}")
+    with user_input():
+        robot_maker(env.robot, env.assets)
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:

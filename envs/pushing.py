@@ -38,20 +38,23 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
 
     `info` of a reset: `steps`, which is 0, and the episode's `layout`, from which `envs.tasks.TaskReward` makes its
-    reward. `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `success`, `violation`, `fall`, and
-    `terms`, the named parts of the reward. An episode terminates at success, violation or fall, and is
-    truncated after `maximum_steps`.
+    reward. `info` of a step: `steps` so far, `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push
+    early: "unreachable" and not begun, "blocked" by something in its way, contact with the "table"; "" if it did
+    not), `success`, `violation`, `fall`, and `terms`, the named parts of the reward. An episode terminates at
+    success, violation or fall, and is truncated after `maximum_steps`.
 
     Args:
         task, layout, tiles: see `envs.random_layouts.possible_layouts`; `tiles` replaces fields of the layout. A
             `Layout` is taken as it is, and its task counts. `layout="random"` is drawn anew at every reset.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
+        robot: what pushes, one of `envs.robots.ROBOTS`.
         object_set: where the objects come from, a key of `envs.object_sets.OBJECT_SETS`.
-        assets: folder of meshes, for a set that needs one.
+        assets: folder of meshes, for robots and sets that need one.
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
 
     Raises:
-        ValueError: an argument is out of its range, or the layout has no room for the objects.
+        ValueError: an argument is out of its range, the layout has no room for the objects, or the robot's files
+            are missing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -71,6 +74,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         camera: Camera | None = None,
         render_mode: str | None = None,
         show_tiles: bool = True,
+        robot: str = "stick",
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
             raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
@@ -87,7 +91,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
         self.ranges = ranges or ObjectRanges(names=tuple(dict.fromkeys(map(plain_name, available.names))))
-        self.scene = Scene(camera=camera, object_set=available)
+        self.scene = Scene(camera=camera, object_set=available, robot=robot, assets=assets)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
@@ -154,6 +158,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             "steps": self._steps,
             "unsafe": report.unsafe,
             "ineffective": report.ineffective,
+            "stopped": report.stopped,
             "success": success,
             "violation": violation,
             "fall": fallen,

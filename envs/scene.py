@@ -9,6 +9,8 @@ import colorsys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +22,19 @@ from envs.object_sets import BuiltinObjects, ObjectSet
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_draw_streams
-from envs.robots import FrameHook, StickRobot
+from envs.robots import Stopped, push, robot_maker, settle
 from envs.segmentation import segment_by_mask
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
 MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
 MOVED = 0.005  # metres; less motion than this counts as none
 TURNED = 0.1  # radians
+FRAME_STEPS = 10  # physics steps between two frames of a film
 FALLEN = -0.02  # metres; an object whose centre is lower has left the table
 DRAWS = 50  # scenes drawn before giving up on an acceptable one
+
+FrameHook = Callable[[], None]
+"""Called a few times during a push, for whoever films it."""
 
 # The target is orange; obstacles are cool colours.
 COLORS = ((0.93, 0.42, 0.10), *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in (0.58, 0.45, 0.72, 0.33)))
@@ -57,12 +63,14 @@ class PushReport:
     Attributes:
         unsafe: the tool would have come down on an object, so nothing was done. ineffective: no object moved.
         moved: [objects] metres. fallen: an object left the table.
+        stopped: why the robot ended the push early, see `envs.robots.robot.Stopped`; "" if it did not.
     """
 
     unsafe: bool
     ineffective: bool
     moved: NDArray[np.float64]
     fallen: bool
+    stopped: Stopped = ""
 
 
 class Scene:
@@ -71,6 +79,10 @@ class Scene:
     Args:
         camera: the depth camera. object_set: what the objects' names mean, the builtin shapes by default.
         on_frame: called a few times during every push, for whoever films it.
+        robot: what pushes, one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
+
+    Raises:
+        ValueError: unknown robot, or its files are missing.
     """
 
     def __init__(
@@ -79,9 +91,12 @@ class Scene:
         camera: Camera | None = None,
         object_set: ObjectSet | None = None,
         on_frame: FrameHook | None = None,
+        robot: str = "stick",
+        assets: str | Path | None = None,
     ) -> None:
         self.camera = camera or Camera()
         self.object_set = object_set or BuiltinObjects()
+        self._make_robot = robot_maker(robot, assets)
         self.on_frame = on_frame
         self.world = PhysicsWorld()
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
@@ -131,8 +146,8 @@ class Scene:
         self.world.reset()
         self.objects = list(objects)
         self.bodies = [self._add(one, color) for one, color in zip(objects, COLORS, strict=False)]
-        self.robot = StickRobot(self.world)
-        self.robot.settle(self.bodies, limit=720)
+        self.robot = self._make_robot(self.world)
+        settle(self.world, self.robot, self.bodies, limit=720)
         self._points = point_generator
         self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
         self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
@@ -151,23 +166,34 @@ class Scene:
         began = time.process_time()
         before = self.ground_truth()
         start, end = push_endpoints(action)
-        safe = self.robot.push(start, end, self.bodies, on_frame=self.on_frame)
-        if safe:
-            self.robot.settle(self.bodies)
+        self.world.on_step = self._film()
+        try:
+            ended = push(self.robot, start, end)
+        finally:
+            self.world.on_step = None
+        if ended not in ("unsafe", "unreachable"):
+            settle(self.world, self.robot, self.bodies)
         after = self.ground_truth()
         moved = np.linalg.norm(after.positions - before.positions, axis=-1)
         turn = Rotation.from_quat(after.orientations) * Rotation.from_quat(before.orientations).inv()
         self.seconds["physics"] += time.process_time() - began
         return PushReport(
-            unsafe=not safe,
+            unsafe=ended == "unsafe",
             ineffective=bool((moved < MOVED).all() and (turn.magnitude() < TURNED).all()),
             moved=moved,
             fallen=self._any_fallen(),
+            stopped="" if ended == "unsafe" else ended,
         )
 
     def observe(self) -> Observation:
-        """Take a depth image and turn it into one cloud per object."""
+        """Take a depth image and turn it into one cloud per object.
+
+        Raises:
+            RuntimeError: the robot stands in the camera's view.
+        """
         began = time.process_time()
+        if not self.robot.clear_of_view(self.camera):
+            raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
         rendering = self.world.render(self.camera)
         rendered = time.process_time()
         visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
@@ -209,6 +235,13 @@ class Scene:
             orientation=one.orientation,
             color=color,
         )
+
+    def _film(self) -> Callable[[], None] | None:
+        """What the world calls after each step of a push: every `FRAME_STEPS`th, from the first on, is a frame."""
+        if self.on_frame is None:
+            return None
+        on_frame, steps = self.on_frame, count()
+        return lambda: on_frame() if next(steps) % FRAME_STEPS == 0 else None
 
     def _any_fallen(self) -> bool:
         return bool((self.ground_truth().positions[:, 2] < FALLEN).any())

@@ -83,7 +83,7 @@ def test_a_step_reports_all_that_happened(make: Make) -> None:
     assert env.observation_space.contains(seen) and info == {"steps": 0, "layout": env.layout}
     seen, reward, terminated, truncated, info = env.step(NOTHING)
     assert env.observation_space.contains(seen)
-    assert set(info) == {"steps", "unsafe", "ineffective", "success", "violation", "fall", "terms"}
+    assert set(info) == {"steps", "unsafe", "ineffective", "stopped", "success", "violation", "fall", "terms"}
     assert info["terms"] == {"goal": 0, "violation": 0, "time": -1, "progress": 0}
     assert (reward, terminated, truncated) == (-1, False, False)
     assert info["ineffective"] and not any(info[name] for name in ("unsafe", "success", "violation", "fall"))
@@ -304,6 +304,8 @@ def test_a_layout_may_be_a_number_a_file_or_an_object(make: Make, tmp_path: Path
         ({"task": "juggling"}, r"^unknown task 'juggling': choose from clearing, insertion, crossing$"),
         ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
         ({"layout": 3}, r"^unknown layout 3: choose 0, 1, 2, random or the path of a YAML file$"),
+        ({"robot": "hand"}, r"^unknown robot 'hand': choose from stick, sawyer, panda$"),
+        ({"robot": "sawyer"}, r"^robot sawyer needs a folder with sawyer/sawyer_stick.urdf, and none was given: get"),
         ({"layout": "nowhere.yaml"}, r"^layout nowhere.yaml cannot be read"),
         ({"tiles": {"goal": [[9, 9]]}}, r"goal: tile \[9, 9\] is off the table"),
         ({"tiles": {"bridge": [[1, 1]]}}, r"unknown key 'bridge'"),

@@ -1,0 +1,159 @@
+"""An arm in a simulated world: joints driven by motors, a stick in its hand.
+
+Only the stick touches objects. The other links collide with the table alone: a wrist that brushes a tall box is a
+matter of the hand's size, which pushing with a stick is meant to leave out (`stick` has no hand at all).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pybullet
+from numpy.typing import NDArray
+from pybullet_utils.bullet_client import BulletClient
+
+from envs.physics.world import TOOL_FRICTION, PhysicsWorld
+
+STICK, TIP = "stick", "stick_tip"  # the URDF's links of these names: what touches objects, and its lower end
+MOTOR_FORCE = 1e4  # newton metres; with the effort limits of real arms heavy objects bend the line of a push
+EVERYTHING, STATIC_ONLY = -1, 2  # Bullet's collision masks
+TOUCHING = 1e-4  # metres between arm and table that count as contact
+INVISIBLE = (1.0, 1.0, 1.0, 0.0)  # what is fully transparent is left out of every image
+
+
+@dataclass(frozen=True)
+class ArmDescription:
+    """Which arm stands where.
+
+    Attributes:
+        urdf: its file, with a link `stick` that ends in `stick_tip`; the tip's z axis points out of the stick.
+        base: (x, y, z) metres of the URDF's origin.
+        home: radians by joint, from base to tool; out of the camera's view. The first turns about the vertical.
+        posture: radians, in the order of `home`; of all ways to reach a place, the one nearest to this is taken.
+        held: what the other movable joints are held at, radians or metres.
+        stand: links that the arm stands on; they are not drawn, so that they are not in the camera's view.
+    """
+
+    urdf: Path
+    base: tuple[float, float, float]
+    home: tuple[tuple[str, float], ...]
+    posture: tuple[float, ...]
+    held: tuple[tuple[str, float], ...] = ()
+    stand: tuple[str, ...] = ()
+
+
+class LoadedArm:
+    """An arm's body in a simulation, and the numbers by which PyBullet calls its parts.
+
+    Raises:
+        ValueError: PyBullet cannot read the file, or a joint or link that the description names is not in it.
+    """
+
+    def __init__(self, client: BulletClient, description: ArmDescription) -> None:
+        self.client, self.description = client, description
+        try:
+            self.body = int(client.loadURDF(str(description.urdf), basePosition=description.base, useFixedBase=True))
+        except pybullet.error as error:
+            raise ValueError(f"{description.urdf} is not a URDF that PyBullet can read") from error
+        infos = [client.getJointInfo(self.body, number) for number in range(client.getNumJoints(self.body))]
+        joints = {info[1].decode(): info[0] for info in infos}
+        base = client.getBodyInfo(self.body)[0].decode()
+        self.links = {base: -1, **{info[12].decode(): info[0] for info in infos}}
+        named = {name for name, _ in (*description.home, *description.held)}
+        missing = sorted((named - set(joints)) | ({STICK, TIP, *description.stand} - set(self.links)))
+        if missing:
+            raise ValueError(f"{description.urdf} has no joint or link named {missing[0]!r}")
+        self.movable = [info[0] for info in infos if info[2] != pybullet.JOINT_FIXED]
+        self.joints = [joints[name] for name, _ in description.home]
+        self.home = np.array([angle for _, angle in description.home])
+        self.held = {joints[name]: value for name, value in description.held}
+        limits = [infos[joint] for joint in self.joints]
+        self.low, self.high = np.array([one[8] for one in limits]), np.array([one[9] for one in limits])
+        self.fastest = np.array([one[11] for one in limits])  # radians per second
+        for joint, value in self.held.items():
+            client.resetJointState(self.body, joint, value)
+        self.put(self.home)
+
+    def put(self, angles: NDArray[np.float64]) -> None:
+        """Set the joints [J] (radians) at once, whatever is in the way."""
+        for joint, angle in zip(self.joints, angles, strict=True):
+            self.client.resetJointState(self.body, joint, angle)
+
+
+class Arm:
+    """An arm in a `PhysicsWorld`, standing still in its home pose.
+
+    Raises:
+        ValueError: as `LoadedArm`.
+    """
+
+    def __init__(self, world: PhysicsWorld, description: ArmDescription) -> None:
+        self._loaded = LoadedArm(world.client, description)
+        self._client, self._table = world.client, world.table
+        self.body = self._loaded.body
+        for name in [*description.stand, *_without_picture(description.urdf)]:
+            self._client.changeVisualShape(self.body, self._loaded.links[name], rgbaColor=INVISIBLE)
+        for link in self._loaded.links.values():
+            mask = EVERYTHING if link == self._loaded.links[STICK] else STATIC_ONLY
+            self._client.setCollisionFilterGroupMask(self.body, link, 1, mask)
+        self._client.changeDynamics(
+            self.body, self._loaded.links[STICK], lateralFriction=TOOL_FRICTION, restitution=0.0
+        )
+        self._drive(list(self._loaded.held), list(self._loaded.held.values()), [0.0] * len(self._loaded.held))
+        self.command(self.angles(), np.zeros(len(self._loaded.joints)))
+
+    def command(self, angles: NDArray[np.float64], speeds: NDArray[np.float64]) -> None:
+        """From now on, correct the joints to `angles` [J] radians while they turn at `speeds` [J] radians per second.
+
+        Both gains are 1: an error is gone after one step, which is what a stiff controller would do in a few.
+        """
+        self._drive(self._loaded.joints, angles.tolist(), speeds.tolist())
+
+    def angles(self) -> NDArray[np.float64]:
+        """Joint angles now: [J] radians."""
+        return np.array([one[0] for one in self._client.getJointStates(self.body, self._loaded.joints)])
+
+    def tip(self) -> NDArray[np.float64]:
+        """Where the stick's tip is now: [3] metres."""
+        state = self._client.getLinkState(self.body, self._loaded.links[TIP], computeForwardKinematics=1)
+        return np.array(state[4])
+
+    def touches_table(self) -> bool:
+        """Whether any part of the arm touches the table, after the step just made."""
+        contacts = self._client.getContactPoints(self.body, self._table)
+        return any(contact[8] <= TOUCHING for contact in contacts)
+
+    def corners(self) -> NDArray[np.float64]:
+        """Corners of axis-aligned boxes around the links, the stand's left out: [L, 8, 3] metres."""
+        links = [link for name, link in self._loaded.links.items() if name not in self._loaded.description.stand]
+        boxes = np.array([self._client.getAABB(self.body, link) for link in links])
+        choice = np.array(list(product((0, 1), repeat=3)))
+        return boxes[:, choice, np.arange(3)]
+
+    def lift_out(self) -> None:
+        """Set the joints to the home pose at once, whatever holds them."""
+        self._loaded.put(self._loaded.home)
+        self.command(self._loaded.home, np.zeros_like(self._loaded.home))
+
+    def _drive(self, joints: list[int], positions: list[float], speeds: list[float]) -> None:
+        if joints:
+            self._client.setJointMotorControlArray(
+                self.body,
+                joints,
+                pybullet.POSITION_CONTROL,
+                targetPositions=positions,
+                targetVelocities=speeds,
+                forces=[MOTOR_FORCE] * len(joints),
+                positionGains=[1.0] * len(joints),
+                velocityGains=[1.0] * len(joints),
+            )
+
+
+def _without_picture(urdf: Path) -> list[str]:
+    """Links with a collision shape and no visual one: PyBullet would draw the collision shape."""
+    links = ElementTree.parse(urdf).getroot().iter("link")
+    return [link.attrib["name"] for link in links if link.find("collision") is not None and link.find("visual") is None]

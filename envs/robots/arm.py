@@ -1,0 +1,124 @@
+"""A simulated arm of seven joints: inverse kinematics at waypoints, motors that follow the path between them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from envs.camera import Camera
+from envs.physics import TIME_STEP, Arm, ArmDescription, PhysicsWorld
+from envs.robots.reach import InverseKinematics
+from envs.robots.robot import ABOVE_HEIGHT, PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
+from envs.workspace import TABLE_HIGH, TABLE_LOW
+
+WAYPOINTS = 11  # along a push, at most 14 mm apart
+WAYPOINTS_UP = 5  # between the table and `ABOVE_HEIGHT`
+MOVE_STEPS = 40  # physics steps, at least, for any motion that does not push
+LARGEST_GAP = 0.6  # radians between neighbouring waypoints; a path with a larger one is no path
+BEHIND = 0.02  # radians by which a joint may differ from where it should be; more, and the arm counts as blocked
+
+# One for each arm and process: it costs a fifth of a second, and knows nothing of any world.
+inverse_kinematics = lru_cache(maxsize=None)(InverseKinematics)
+
+
+class ArmRobot:
+    """An arm that stands off stage until it is told to move.
+
+    A push takes as many physics steps as the stick's and has its speed profile, unless a joint would have to turn
+    faster than it can: then it takes more. All other motions are as fast as the joints allow.
+
+    Raises:
+        ValueError: the arm's file cannot be used.
+    """
+
+    def __init__(self, world: PhysicsWorld, description: ArmDescription) -> None:
+        self.inverse = inverse_kinematics(description)
+        self._world, self.arm = world, Arm(world, description)
+        self._home = self._at = self.arm.angles()  # where the joints should be now
+        self._place = self.arm.tip()  # where the tip should be now
+
+    def fits(self, place: Point) -> bool:
+        return not self._world.occupied(place, radius=STICK_RADIUS, length=STICK_LENGTH)
+
+    def reaches(self, start: Point, end: Point) -> bool:
+        columns = [_line(np.append(place[:2], ABOVE_HEIGHT), place, WAYPOINTS_UP) for place in (start, end)]
+        paths = [self._angles(places) for places in (*columns, _line(start, end, WAYPOINTS))]
+        return all(path is not None for path in paths)
+
+    def move(self, place: Point) -> Stopped:
+        if np.allclose(place[:2], self._place[:2]):
+            path = self._angles(_line(self._place, place, WAYPOINTS_UP))
+        else:
+            angles = self.inverse.angles(place)
+            path = None if angles is None else np.stack([self._at, angles])
+        return self._follow(path, place, MOVE_STEPS)
+
+    def slide(self, end: Point) -> Stopped:
+        return self._follow(self._angles(_line(self._place, end, WAYPOINTS)), end, PUSH_STEPS)
+
+    def leave(self) -> Stopped:
+        if self._at is self._home:
+            return ""
+        stopped = self._follow(np.stack([self._at, self._home]), self.arm.tip(), MOVE_STEPS, guarded=False)
+        if np.abs(self.arm.angles() - self._home).max() > BEHIND:
+            self.arm.lift_out()  # pinned under something immovable; on a real arm somebody has to help
+        self._at, self._place = self._home, self.arm.tip()
+        return stopped
+
+    def clear_of_view(self, camera: Camera) -> bool:
+        x, y, z = camera.position
+        corners = self.arm.corners()
+        # The shadow that the arm would throw if the camera were a lamp; what is above it throws none.
+        depth = z - corners[..., 2:]
+        below = (depth > 0.0).any(axis=(1, 2))
+        shadow = (corners[below, :, :2] - (x, y)) * z / np.maximum(depth[below], 1e-3) + (x, y)
+        apart = (shadow.max(axis=1) < TABLE_LOW) | (shadow.min(axis=1) > TABLE_HIGH)
+        return bool(apart.any(axis=1).all())
+
+    def stop(self) -> None:
+        self._at, self._place = self.arm.angles(), self.arm.tip()
+        self.arm.command(self._at, np.zeros_like(self._at))
+
+    def wait(self) -> None:
+        self._world.step()
+
+    def tip(self) -> Point:
+        return self.arm.tip()
+
+    def _angles(self, places: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Joint angles [K, J] for places [K, 3], or None where there is no smooth path through them."""
+        found = [self.inverse.angles(place) for place in places]
+        path = [angles for angles in found if angles is not None]
+        if len(path) < len(found) or np.abs(np.diff(path, axis=0)).max() > LARGEST_GAP:
+            return None
+        return np.stack(path)
+
+    def _follow(self, path: NDArray[np.float64] | None, place: Point, steps: int, *, guarded: bool = True) -> Stopped:
+        """Drive the joints along waypoints [K, J], evenly spaced in the way to go, in at least `steps` steps."""
+        if path is None:
+            return "unreachable"
+        spline = CubicSpline(np.linspace(0.0, 1.0, len(path)), path)  # of two waypoints, a straight line
+        slope = np.abs(np.diff(spline(np.linspace(0.0, 1.0, 50)), axis=0)).max(axis=0) * 49
+        # The peak of the profile below is pi / 2 times its mean.
+        needed = float((slope / self.inverse.forward.fastest).max()) * np.pi / 2 / TIME_STEP
+        phase = np.linspace(0.0, np.pi, max(steps, int(np.ceil(needed))) + 1)
+        for now, then in pairwise(spline((1.0 - np.cos(phase)) / 2.0)):
+            self.arm.command(now, (then - now) / TIME_STEP)
+            self._world.step()
+            if guarded:
+                behind = np.abs(self.arm.angles() - then).max() > BEHIND
+                stopped: Stopped = "table" if self.arm.touches_table() else "blocked" if behind else ""
+                if stopped:
+                    self.stop()
+                    return stopped
+        self._at, self._place = path[-1], np.array(place)
+        self.arm.command(self._at, np.zeros_like(self._at))
+        return ""
+
+
+def _line(start: Point, end: Point, count: int) -> NDArray[np.float64]:
+    return start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)

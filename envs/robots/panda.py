@@ -1,0 +1,70 @@
+"""Franka Emika's Panda from PyBullet's own data, with a stick on its flange: an arm for which nothing is downloaded."""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import tempfile
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+from envs.physics import PYBULLET_DATA, ArmDescription
+from envs.physics.arm import STICK, TIP
+from envs.robots.robot import STICK_LENGTH, STICK_RADIUS
+
+POSTURE = (0.0, 0.3, 0.0, -1.8, 0.0, 2.2, 0.78)  # radians
+HOME = (1.51, 0.0, -0.03, -1.92, 0.02, 1.79, 0.63)  # radians; turned to the left, beside the table
+# Close to the table: the Panda's arm is shorter than the Sawyer's. Even so it reaches 120 of 132 places on a grid
+# over the reachable box; the two far corners are too far away.
+BASE = (0.10, 0.0, 0.0)  # metres
+_LINK = """<link name="{name}">
+  <inertial><origin xyz="0 0 {middle}"/><mass value="{mass}"/>
+    <inertia ixx="{wide}" iyy="{wide}" izz="{thin}" ixy="0" ixz="0" iyz="0"/></inertial>{shapes}
+</link>"""
+_SHAPE = """<{kind}><origin xyz="0 0 {middle}"/>
+  <geometry><cylinder radius="{radius}" length="{length}"/></geometry></{kind}>"""
+_JOINT = """<joint name="{child}_fixed" type="fixed"><origin xyz="0 0 {height}"/><parent link="{parent}"/>
+  <child link="{child}"/></joint>"""
+
+
+def panda(assets: str | Path | None = None) -> ArmDescription:
+    """Where the Panda stands. It needs no assets; a folder given for other parts of the world is not looked at."""
+    return ArmDescription(
+        urdf=_urdf(),
+        base=BASE,
+        home=tuple((f"panda_joint{number}", angle) for number, angle in enumerate(HOME, 1)),
+        posture=POSTURE,
+        stand=("panda_link0", "panda_link1"),
+    )
+
+
+@cache
+def _urdf() -> Path:
+    """PyBullet's Panda without its hand, a stick on the flange instead, in a temporary folder of this process.
+
+    A part of the arm rather than a body tied to it: a constraint between bodies gives way under load.
+    """
+    source = PYBULLET_DATA / "franka_panda"
+    tree = ElementTree.parse(source / "panda.urdf")
+    robot = tree.getroot()
+    for part in list(robot):
+        if any(word in part.attrib.get("name", "") for word in ("hand", "finger", "grasp")):
+            robot.remove(part)
+    for mesh in robot.iter("mesh"):
+        mesh.attrib["filename"] = mesh.attrib["filename"].replace("package://", f"{source.as_posix()}/")
+    middle = STICK_LENGTH / 2
+    cylinder = {"middle": middle, "radius": STICK_RADIUS, "length": STICK_LENGTH}
+    shapes = "".join(_SHAPE.format(kind=kind, **cylinder) for kind in ("visual", "collision"))
+    for text in (
+        _LINK.format(name=STICK, middle=middle, mass=0.1, wide=2e-4, thin=1e-5, shapes=shapes),
+        _JOINT.format(parent="panda_link8", child=STICK, height=0.0),
+        _LINK.format(name=TIP, middle=0.0, mass=1e-4, wide=1e-8, thin=1e-8, shapes=""),
+        _JOINT.format(parent=STICK, child=TIP, height=STICK_LENGTH),
+    ):
+        robot.append(ElementTree.fromstring(text))
+    folder = Path(tempfile.mkdtemp(prefix="cavin_pyro_panda_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    path = folder / "panda_stick.urdf"
+    tree.write(path)
+    return path

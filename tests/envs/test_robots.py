@@ -1,0 +1,345 @@
+"""Arms that push, and what they have in common with the stick."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.camera import Camera
+from envs.physics import PhysicsWorld
+from envs.pushing import PushingEnv
+from envs.robots import ROBOTS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, ArmRobot, push, robot_maker
+from envs.robots.arm import inverse_kinematics
+from envs.robots.panda import panda
+from envs.robots.robot import ABOVE_HEIGHT
+from envs.robots.sawyer import sawyer
+from envs.scene import Scene
+from envs.workspace import REACH_HIGH, REACH_LOW
+
+ROOT = Path(__file__).parents[2]
+ASSETS = Path(os.environ.get("CAVIN_PYRO_ASSETS", ROOT.parent / "shared" / "assets"))
+NO_SAWYER = "the Sawyer's URDF lies neither in ../shared/assets nor where CAVIN_PYRO_ASSETS says"
+with_sawyer = pytest.mark.skipif(not (ASSETS / "sawyer" / "sawyer_stick.urdf").is_file(), reason=NO_SAWYER)
+ARMS = [pytest.param("sawyer", marks=with_sawyer), "panda"]
+EVERY_ROBOT = [*ARMS, "stick"]
+CAMERAS = [Camera(position=(x, y, z)) for x in (0.55, 0.65) for y in (-0.05, 0.05) for z in (0.95, 1.05)]
+
+
+@pytest.fixture(scope="module")
+def scene_of() -> Callable[[str], Scene]:
+    made: dict[str, Scene] = {}
+    yield lambda name: made.setdefault(name, Scene(robot=name, assets=ASSETS))
+    for scene in made.values():
+        scene.close()
+
+
+def drawn(scene: Scene) -> set[int]:
+    """Bodies that the observing camera sees."""
+    return set(np.unique(scene.world.render(scene.camera).bodies).tolist()) - {-1}
+
+
+# A push.
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("direction", [(0.08, 0.0), (-0.05, 0.06)])
+def test_an_arm_pushes_an_object_to_where_the_stick_pushes_it(
+    scene_of: Callable, put: Callable, push: Callable, name: str, direction: tuple[float, float]
+) -> None:
+    ends = []
+    for robot in ("stick", name):
+        scene = scene_of(robot)
+        scene.reset([put("rubiks_cube", 0.55, 0.0), put("mug", 0.55, 0.3)], np.random.default_rng(0))
+        way = np.array(direction) / np.linalg.norm(direction)
+        report = scene.push(push(*(np.array([0.55, 0.0]) - 0.065 * way), *direction))
+        assert (report.unsafe, report.ineffective, report.stopped) == (False, False, "")
+        ends.append(scene.ground_truth().positions)
+    assert np.linalg.norm(ends[0][0, :2] - (0.55, 0.0)) > 0.03
+    np.testing.assert_allclose(ends[1], ends[0], atol=0.005)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_tip_follows_its_line_with_the_sticks_profile(scene_of: Callable, put: Callable, name: str) -> None:
+    scene = scene_of(name)
+    heavy = replace(put("rubiks_cube", 0.55, 0.0), mass=10.0, friction=0.8)
+    scene.reset([heavy], np.random.default_rng(0))
+    robot, tips = scene.robot, []
+    start, end = np.array([0.48, -0.03, TIP_HEIGHT]), np.array([0.58, 0.05, TIP_HEIGHT])
+    assert robot.reaches(start, end)
+    assert not robot.move(start + (0, 0, 0.2)) and not robot.move(start)
+    scene.world.on_step = lambda: tips.append(robot.tip())
+    assert robot.slide(end) == ""
+    scene.world.on_step = None
+    way = (1 - np.cos(np.linspace(0, np.pi, len(tips) + 1)))[1:, None] / 2
+    off = np.linalg.norm(np.array(tips) - (start + way * (end - start)), axis=1)
+    assert np.median(off) < 0.002 and off.max() < 0.005
+    robot.leave()
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_an_arm_touches_nothing_on_its_way_between_off_stage_and_above(
+    scene_of: Callable, put: Callable, name: str
+) -> None:
+    scene = scene_of(name)
+    tall = put("sugar_box", 0.5, 0.12, scale=1.2, orientation=(0.0, 0.0, 0.0, 1.0))
+    scene.reset([tall, put("mug", 0.5, -0.12)], np.random.default_rng(0))
+    robot, before, heights = scene.robot, scene.ground_truth(), []
+    scene.world.on_step = lambda: heights.append(robot.tip()[2])
+    for x, y in [(0.35, -0.3), (0.5, 0.12), (0.6, 0.3), (0.5, -0.12)]:
+        assert robot.move(np.array([x, y, ABOVE_HEIGHT])) == ""
+        robot.leave()
+    scene.world.on_step = None
+    assert min(heights) > 0.2
+    after = scene.ground_truth()
+    np.testing.assert_allclose(after.positions, before.positions, atol=1e-5)
+    np.testing.assert_allclose(after.orientations, before.orientations, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_arm_is_in_the_photograph_of_a_push_and_never_in_the_image_that_is_observed(
+    put: Callable, push: Callable, name: str
+) -> None:
+    during: list[set[int]] = []
+    photographs: list[np.ndarray] = []
+
+    def film() -> None:
+        during.append(drawn(scene))
+        photographs.append(scene.photograph(scene.camera))
+
+    scene = Scene(robot=name, assets=ASSETS)
+    scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
+    arm, without = scene.robot.arm.body, scene.photograph(scene.camera)
+    assert arm not in drawn(scene)
+    for action in (push(0.45, 0.0, 0.0, 0.1), push(0.55, 0.0, 0.0, 0.1), push(0.45, 0.2, 0.08, 0.0)):
+        scene.on_frame = film if not during else None
+        scene.push(action)
+        assert arm not in drawn(scene)
+        assert all(scene.robot.clear_of_view(camera) for camera in CAMERAS)
+    assert arm in set().union(*during)
+    shown = max(np.abs(image.astype(int) - without).max(axis=-1).mean() for image in photographs)
+    assert shown > 2  # of 255, over the whole image
+    scene.close()
+
+
+def test_who_looks_while_the_arm_is_in_the_way_is_told(scene_of: Callable, put: Callable) -> None:
+    scene = scene_of("panda")
+    scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
+    scene.robot.move(np.array([0.5, 0.2, ABOVE_HEIGHT]))
+    assert not scene.robot.clear_of_view(scene.camera)
+    with pytest.raises(RuntimeError, match=r"^the robot stands in the camera's view"):
+        scene.observe()
+    scene.robot.leave()
+    assert scene.observe().visible[0]
+
+
+# What ends a push early.
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_a_push_onto_an_object_is_unsafe_under_every_robot(
+    scene_of: Callable, put: Callable, push: Callable, name: str
+) -> None:
+    scene = scene_of(name)
+    scene.reset([put("rubiks_cube", 0.55, 0.0), put("mug", 0.55, 0.2)], np.random.default_rng(0))
+    before = scene.ground_truth()
+    report = scene.push(push(0.55, 0.01, 0.1, 0.0))
+    assert report.unsafe and report.ineffective and report.stopped == ""
+    np.testing.assert_array_equal(scene.ground_truth().positions, before.positions)
+
+
+def test_whether_the_tool_fits_is_the_same_for_a_shape_and_for_the_stick_itself(
+    scene_of: Callable, put: Callable
+) -> None:
+    scene = scene_of("stick")
+    scene.reset([put("mug", 0.5, 0.0), put("banana", 0.6, 0.1)], np.random.default_rng(0))
+    places = np.random.default_rng(0).uniform((0.42, -0.08), (0.68, 0.2), size=(500, 2))
+    fits = [scene.robot.fits(np.append(place, TIP_HEIGHT)) for place in places]
+    scene.robot.leave()
+    size = {"radius": STICK_RADIUS, "length": STICK_LENGTH}
+    assert fits == [not scene.world.occupied((*place, TIP_HEIGHT), **size) for place in places]
+    assert 0.1 < np.mean(fits) < 0.9
+
+
+def test_a_push_out_of_reach_is_not_begun(scene_of: Callable, put: Callable, push: Callable) -> None:
+    scene = scene_of("panda")
+    scene.reset([put("rubiks_cube", 0.75, 0.45)], np.random.default_rng(0))
+    before = scene.ground_truth()
+    report = scene.push(push(0.78, 0.53, -0.02, -0.02))
+    assert report.stopped == "unreachable" and report.ineffective and not report.unsafe
+    np.testing.assert_array_equal(scene.ground_truth().positions, before.positions)
+    assert scene.push(push(0.5, 0.0, 0.05, 0.0)).stopped == ""  # and the next one is
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_an_arm_that_meets_the_table_stops_and_leaves(scene_of: Callable, put: Callable, name: str) -> None:
+    scene = scene_of(name)
+    scene.reset([put("rubiks_cube", 0.55, 0.2)], np.random.default_rng(0))
+    robot = scene.robot
+    assert not robot.move(np.array([0.5, 0.0, ABOVE_HEIGHT]))
+    assert robot.move(np.array([0.5, 0.0, -0.05])) == "table"
+    assert robot.tip()[2] > -0.01
+    robot.leave()
+    assert robot.clear_of_view(scene.camera)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_push_against_what_cannot_move_is_blocked_and_ends_off_stage(
+    scene_of: Callable, put: Callable, push: Callable, name: str
+) -> None:
+    scene = scene_of(name)
+    anvil = replace(put("rubiks_cube", 0.55, 0.0, scale=1.2), mass=1e6, friction=1.0)
+    scene.reset([anvil], np.random.default_rng(0))
+    report = scene.push(push(0.47, 0.0, 0.1, 0.0))
+    assert report.stopped == "blocked" and report.moved[0] < 0.01
+    assert scene.robot.clear_of_view(scene.camera)
+    assert scene.observe().visible[0]
+
+
+class Deaf:
+    """A robot that stops at one verb, to see that the push still ends off stage."""
+
+    def __init__(self, verb: str) -> None:
+        self.verb, self.called = verb, []
+
+    def tip(self) -> np.ndarray:
+        return np.array([0.5, 0.0, TIP_HEIGHT])
+
+    def __getattr__(self, verb: str) -> Callable:
+        def call(*arguments: object) -> object:
+            self.called.append(verb)
+            return True if verb in ("fits", "reaches") else "blocked" if verb == self.verb else ""
+
+        return call
+
+
+@pytest.mark.parametrize("verb", ["move", "slide"])
+def test_whatever_stops_a_push_the_robot_goes_up_and_off_stage(verb: str) -> None:
+    robot = Deaf(verb)
+    assert push(robot, np.array([0.5, 0.0]), np.array([0.6, 0.0])) == "blocked"
+    assert robot.called[-3:] == ["stop", "move", "leave"]
+    assert ("slide" in robot.called) == (verb == "slide")
+
+
+# Inverse kinematics.
+
+
+@with_sawyer
+@settings(max_examples=60)
+@given(st.floats(REACH_LOW[0], REACH_HIGH[0]), st.floats(REACH_LOW[1], REACH_HIGH[1]))
+def test_the_sawyer_reaches_every_place_and_holds_the_stick_upright(x: float, y: float) -> None:
+    inverse = inverse_kinematics(sawyer(ASSETS))
+    for height in (TIP_HEIGHT, ABOVE_HEIGHT):
+        angles = inverse.angles(np.array([x, y, height]))
+        assert angles is not None
+        assert (inverse.forward.low <= angles).all() and (angles <= inverse.forward.high).all()
+        found = inverse.forward(angles)
+        np.testing.assert_allclose(found.position, [x, y, height], atol=2e-4)
+        assert found.axis[2] < -0.999
+
+
+def test_the_panda_reaches_nine_tenths_of_the_table_and_says_where_it_does_not() -> None:
+    inverse = inverse_kinematics(panda())
+    grid = [np.array([x, y, TIP_HEIGHT]) for x in np.linspace(0.3, 0.8, 6) for y in np.linspace(-0.55, 0.55, 7)]
+    reached = [inverse.angles(place) is not None for place in grid]
+    assert np.mean(reached) > 0.85
+    assert inverse.angles(np.array([0.8, 0.55, TIP_HEIGHT])) is None
+    assert inverse.angles(np.array([np.nan, 0.0, 0.1])) is None
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_answer_does_not_depend_on_what_was_asked_before(name: str) -> None:
+    description = panda() if name == "panda" else sawyer(ASSETS)
+    places = np.random.default_rng(0).uniform((0.3, -0.4, 0.0), (0.6, 0.4, 0.2), size=(10, 3))
+    one, other = (type(inverse_kinematics(description))(description) for _ in range(2))
+    forwards = [one.angles(place) for place in places]
+    backwards = [other.angles(place) for place in places[::-1]][::-1]
+    np.testing.assert_array_equal(forwards, backwards)
+
+
+# Files.
+
+
+def test_missing_files_are_told_in_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "sawyer"
+    folder.mkdir()
+    urdf = folder / "sawyer_stick.urdf"
+    for text, message in (
+        (None, "needs sawyer/sawyer_stick.urdf, which is not in "),
+        ("<robot", "is no URDF"),
+        ('<robot><mesh filename="meshes/hand.stl"/></robot>', "needs meshes/hand.stl, which is not in "),
+    ):
+        if text is not None:
+            urdf.write_text(text)
+        with pytest.raises(ValueError, match=message) as caught:
+            Scene(robot="sawyer", assets=tmp_path)
+        assert "\n" not in str(caught.value)
+        assert "python -m cavin_pyro.assets sawyer --to DIR" in str(caught.value)
+
+
+def test_a_urdf_of_something_else_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "sawyer").mkdir()
+    (tmp_path / "sawyer" / "sawyer_stick.urdf").write_text('<robot name="r"><link name="base"/></robot>')
+    world = PhysicsWorld()
+    with pytest.raises(ValueError, match=r"has no joint or link named 'controller_box'"):
+        robot_maker("sawyer", tmp_path)(world)
+    world.close()
+
+
+# Environments.
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_gymnasium_finds_nothing_wrong_with_an_arm(name: str) -> None:
+    env = gymnasium.make("cavin/Crossing-v0", robot=name, assets=str(ASSETS), objects=2, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.close()
+
+
+def episode(name: str) -> bytes:
+    """Everything that fixed actions show."""
+    env, seen = PushingEnv(robot=name, assets=ASSETS, objects=3), b""
+    actions = np.random.default_rng(0).uniform(-0.6, 0.6, size=(3, 4)).astype(np.float32)
+    first, _ = env.reset(seed=1)
+    for observed in (first, *(env.step(action)[0] for action in actions)):
+        seen += b"".join(array.tobytes() for array in observed.values())
+    env.close()
+    return seen
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_equal_seeds_and_actions_give_equal_observations_here_and_in_another_process(name: str) -> None:
+    script = (
+        "import importlib.util, sys\n"
+        "spec = importlib.util.spec_from_file_location('robots', sys.argv[1])\n"
+        "module = importlib.util.module_from_spec(spec)\n"
+        "spec.loader.exec_module(module)\n"
+        "sys.stdout.buffer.write(module.episode(sys.argv[2]))\n"
+    )
+    command = [sys.executable, "-c", script, str(Path(__file__).resolve()), name]
+    elsewhere = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    here = episode(name)
+    assert here == episode(name) == elsewhere.stdout
+
+
+def test_every_name_makes_a_robot_that_has_every_verb() -> None:
+    from envs.robots import Robot
+
+    verbs = {name for name in vars(Robot) if not name.startswith("_")}
+    assert verbs == {"fits", "reaches", "move", "slide", "leave", "clear_of_view", "stop", "wait", "tip"}
+    assert set(ROBOTS) == {"stick", "sawyer", "panda"}
+    world = PhysicsWorld()
+    for robot in (robot_maker("stick")(world), robot_maker("panda")(world)):
+        assert all(callable(getattr(robot, verb)) for verb in verbs)
+    assert isinstance(robot, ArmRobot)
+    world.close()
