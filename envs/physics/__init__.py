@@ -1,8 +1,9 @@
 """The only package that calls PyBullet: bodies, steps, contacts, images and arms of one simulated world."""
 
 from envs.physics.arm import Arm, ArmDescription
+from envs.physics.bullet import PYBULLET_DATA
 from envs.physics.kinematics import Kinematics
-from envs.physics.world import PYBULLET_DATA, TIME_STEP, PhysicsWorld, Poses, Rendering, Visual
+from envs.physics.world import TIME_STEP, PhysicsWorld, Poses, Rendering, Visual
 
 __all__ = [
     "PYBULLET_DATA",

@@ -12,10 +12,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
-from pybullet_utils.bullet_client import BulletClient
 
+from envs.physics.bullet import BulletClient, pybullet
 from envs.physics.world import TOOL_FRICTION, PhysicsWorld
 
 STICK, TIP = "stick", "stick_tip"  # the URDF's links of these names: what touches objects, and its lower end

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from envs.physics.arm import TIP, ArmDescription, LoadedArm
-from envs.physics.world import connect
+from envs.physics.bullet import connect, pybullet
 
 
 class Forward(NamedTuple):

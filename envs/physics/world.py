@@ -6,10 +6,7 @@ velocity are set before every step, so that contacts are solved as with an arm t
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,37 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.camera import FAR, NEAR, Camera
+from envs.physics.bullet import connect, pybullet
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
-
-@contextmanager
-def _quiet(descriptor: int) -> Iterator[None]:
-    """Keep what Bullet prints at import and on connecting out of the streams with the program's own words."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    kept = os.dup(descriptor)
-    with open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), descriptor)
-    try:
-        yield
-    finally:
-        os.dup2(kept, descriptor)
-        os.close(kept)
-
-
-with _quiet(2):
-    import pybullet
-    import pybullet_data
-    from pybullet_utils.bullet_client import BulletClient
-
-
-def connect() -> BulletClient:
-    """A simulation of its own, without a window, and without Bullet's greeting."""
-    with _quiet(1):
-        return BulletClient(pybullet.DIRECT)
-
-
-PYBULLET_DATA = Path(pybullet_data.getDataPath())  # the models that PyBullet ships with
 TIME_STEP = 1.0 / 240.0  # seconds
 # Per step. Measured over 240 pushes of the policy among 3 to 5 objects: 50 iterations leave 72 % of the
 # objects that move within 1 mm of where 20 leave them, 92 % within 3 mm and all within 12 mm, and take 1.3 to

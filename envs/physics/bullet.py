@@ -1,0 +1,41 @@
+"""PyBullet itself, without what it prints at import and on connecting."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def _quiet(descriptor: int) -> Iterator[None]:
+    """Keep what Bullet prints at import and on connecting out of the streams with the program's own words."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = os.dup(descriptor)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), descriptor)
+    try:
+        yield
+    finally:
+        os.dup2(kept, descriptor)
+        os.close(kept)
+
+
+with _quiet(2):
+    import pybullet
+    import pybullet_data
+    from pybullet_utils.bullet_client import BulletClient
+
+
+def connect() -> BulletClient:
+    """A simulation of its own, without a window, and without Bullet's greeting."""
+    with _quiet(1):
+        return BulletClient(pybullet.DIRECT)
+
+
+PYBULLET_DATA = Path(pybullet_data.getDataPath())  # the models that PyBullet ships with
+
+__all__ = ["PYBULLET_DATA", "BulletClient", "connect", "pybullet"]
