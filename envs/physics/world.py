@@ -6,6 +6,7 @@ velocity are set before every step, so that contacts are solved as with an arm t
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.camera import FAR, NEAR, Camera
-from envs.physics.bullet import connect, pybullet
+from envs.physics.bullet import BulletClient, connect, pybullet
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
 TIME_STEP = 1.0 / 240.0  # seconds
