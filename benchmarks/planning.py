@@ -3,8 +3,8 @@
 Milliseconds per plan with the shipped checkpoint, the floating-point operations in it, and the share of this machine's
 own rate of matrix products that planning reaches; then the flat problem (30 pushes searched at once, the same dynamics,
 reward and samples) for our MPC and for two public planners, in turn. Crossing, sparse, horizon 30, T = 3. Wall time;
-set OMP_NUM_THREADS for the number of threads. The public planners are no dependencies of ours:
-`pip install pytorch_mppi torchrl`, or `--no-flat`.
+set OMP_NUM_THREADS for the number of threads. The public planners come with the extra `benchmarks`; `--no-flat` leaves
+them out.
 """
 
 from __future__ import annotations
