@@ -35,6 +35,8 @@ def main(config: DictConfig) -> None:
         maximum_objects=config.maximum_objects,
         episodes_per_shard=config.episodes_per_shard,
         ranges=object_ranges(config.env),
+        camera=config.env.camera,
+        segmentation=config.env.segmentation,
     )
     folder = output_folder(config.output)
     if config.repair:

@@ -21,6 +21,7 @@ from envs.scene import Observation, PushReport, Scene
 from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
+SIGHT = {"camera": "ideal", "segmentation": "mask"}
 CROWD_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are drawn from this range
 
 
@@ -33,6 +34,7 @@ class CollectionSettings:
         perturbed: share of pushes that start elsewhere than the heuristic wants (see `envs.policy`).
         minimum_objects, maximum_objects: how many lie on the table, drawn uniformly.
         episodes_per_shard: episodes per file, the unit of work and of resuming. ranges: object parameters.
+        camera, segmentation: by name, see `envs.scene.Scene`.
     """
 
     seed: int = 0
@@ -43,6 +45,8 @@ class CollectionSettings:
     maximum_objects: int = MAXIMUM_OBJECTS
     episodes_per_shard: int = 50
     ranges: ObjectRanges = field(default_factory=lambda: ObjectRanges(clearance=0.12))
+    camera: str = "ideal"
+    segmentation: str = "mask"
 
 
 def collect(settings: CollectionSettings, folder: Path, *, transitions: int, workers: int) -> dict[str, Any]:
@@ -144,21 +148,23 @@ def _record_push(
     arrays["target"][step], arrays["angle"][step] = policy.intent.target, policy.intent.angle
 
 
-_scene: Scene | None = None  # one per worker process
+_scenes: dict[tuple[str, str], Scene] = {}  # in each worker process, one per camera and segmentation
 
 
 def _collect_shard(job: tuple[CollectionSettings, int]) -> tuple[Arrays, dict[str, float]]:
-    global _scene
     settings, shard = job
-    _scene = _scene or Scene()
+    sight = settings.camera, settings.segmentation
+    if sight not in _scenes:
+        _scenes[sight] = Scene(camera=settings.camera, segmentation=settings.segmentation)
+    scene = _scenes[sight]
     began = time.process_time()
-    _scene.seconds = dict.fromkeys(_scene.seconds, 0.0)
+    scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     first = shard * settings.episodes_per_shard
     episodes = [
-        collect_episode(_scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
+        collect_episode(scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
     ]
     arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
-    return arrays, {"cpu": time.process_time() - began, **_scene.seconds}
+    return arrays, {"cpu": time.process_time() - began, **scene.seconds}
 
 
 def _shards(settings: CollectionSettings, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
@@ -195,9 +201,11 @@ def _begin(settings: CollectionSettings, folder: Path) -> dict[str, Any]:
         (folder / "metadata.json").unlink()
         return _begin(settings, folder)
     for name, value in wanted.items():
-        if metadata["settings"].get(name) != value:
+        # Older datasets do not name what there was no choice of.
+        held = metadata["settings"].get(name, SIGHT.get(name))
+        if held != value:
             raise UserError(
-                f"{folder} holds a dataset with {name}={metadata['settings'].get(name)}, not {value}: "
+                f"{folder} holds a dataset with {name}={held}, not {value}: "
                 "resume with the same settings, or choose another output=DIR"
             )
     return metadata
@@ -210,8 +218,8 @@ def _write(folder: Path, metadata: dict[str, Any]) -> None:
 def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:
     """Where the time of each shard went; apart from the data, which must not depend on the machine's speed."""
     path = folder / "timing.csv"
-    header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,points_s\n"
-    row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "points"))
+    header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
+    row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "segmentation", "points"))
     with open(path, "a", encoding="utf-8") as file:
         file.write(f"{header}{shard},{transitions},{row}\n")
 

@@ -67,6 +67,8 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             objects=config.objects,
             ranges=object_ranges(config.env),
             maximum_steps=config.maximum_steps,
+            camera=config.env.camera,
+            segmentation=config.env.segmentation,
             render_mode="rgb_array" if render else None,
         )
         env.reset(seed=config.seed)  # tells at once whether the layout has room for the objects

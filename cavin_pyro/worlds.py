@@ -8,11 +8,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.errors import UserError
 from envs.objects import ObjectRanges
+from envs.segmentation import SEGMENTERS
+from envs.sensors import CAMERAS
 from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
 
-CHOICES = {"robot": ("stick",), "objects": ("builtin",), "camera": ("ideal",), "segmentation": ("mask",)}
+CHOICES = {
+    "robot": ("stick",),
+    "objects": ("builtin",),
+    "camera": tuple(CAMERAS),
+    "segmentation": tuple(SEGMENTERS),
+}
 
 
 def check_world(env: DictConfig) -> None:

@@ -92,7 +92,8 @@ class Camera:
         seen = (np.asarray(points, dtype=np.float64) - np.array(self.position)) @ self.axes.T
         along_row, along_column, column, row = self.intrinsics
         return np.stack(
-            [seen[..., 0] / seen[..., 2] * along_row + column, seen[..., 1] / seen[..., 2] * along_column + row], axis=-1
+            [seen[..., 0] / seen[..., 2] * along_row + column, seen[..., 1] / seen[..., 2] * along_column + row],
+            axis=-1,
         )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.camera import FAR, NEAR, Camera
+from envs.sensors.sensor import Rendering
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
 
@@ -52,21 +53,6 @@ TOOL_MASS = 100.0  # kilograms; so heavy that no contact changes its velocity wi
 ROLLING_FRICTION = 0.003  # metres; stops cans and cups that lie on their side, as a cloth does
 SPINNING_FRICTION = 0.003  # metres
 ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """What a camera sees.
-
-    Attributes:
-        depth: [height, width] metres along the optical axis.
-        bodies: [height, width] body number per pixel, -1 where there is none.
-        color: [height, width, 3] uint8.
-    """
-
-    depth: NDArray[np.float64]
-    bodies: NDArray[np.int64]
-    color: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from envs.camera import Camera
 from envs.layouts import Layout, Tile, load_layout
 from envs.objects import Area, ObjectRanges
 from envs.scene import Observation, Scene
+from envs.sensors import DepthSensor
 from envs.tasks import GOAL_REWARD, TIME_REWARD, VIOLATION_REWARD, Outcome, TaskReward
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
 
@@ -40,7 +41,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         task, layout, tiles: see `envs.layouts.load_layout`; `tiles` replaces fields of the layout. A `Layout`
             is taken as it is, and its task counts.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
-        maximum_steps: pushes per episode.
+        maximum_steps: pushes per episode. camera, segmentation: see `envs.scene.Scene`.
 
     Raises:
         ValueError: an argument is out of its range, or the layout has no room for the objects.
@@ -58,7 +59,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         objects: int = 3,
         ranges: ObjectRanges | None = None,
         maximum_steps: int = EPISODE_STEPS,
-        camera: Camera | None = None,
+        camera: str | Camera | DepthSensor = "ideal",
+        segmentation: str = "mask",
         render_mode: str | None = None,
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
@@ -73,7 +75,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.reward = TaskReward(self.layout, reward=reward)
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.ranges = ranges or ObjectRanges()
-        self.scene = Scene(camera=camera)
+        self.scene = Scene(camera=camera, segmentation=segmentation)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]

@@ -23,7 +23,8 @@ from envs.camera import Camera, sample_cloud
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
 from envs.robots import FrameHook, StickRobot
-from envs.segmentation import segment_by_mask
+from envs.segmentation import Pixels, segmenter_of
+from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.shapes import builtin_shape, write_mesh
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
@@ -79,17 +80,38 @@ class Scene:
     """One world in which scenes are drawn, pushed and looked at.
 
     Args:
-        camera: the depth camera.
+        camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
+        segmentation: a name in `envs.segmentation.SEGMENTERS`.
         on_frame: called a few times during every push, for whoever films it.
+
+    Raises:
+        ValueError: unknown camera or segmentation.
     """
 
-    def __init__(self, *, camera: Camera | None = None, on_frame: FrameHook | None = None) -> None:
-        self.camera = camera or Camera()
+    def __init__(
+        self,
+        *,
+        camera: str | Camera | DepthSensor = "ideal",
+        segmentation: str = "mask",
+        on_frame: FrameHook | None = None,
+    ) -> None:
+        self.sensor = sensor_of(camera)
+        self.segmenter = segmenter_of(segmentation, self.truth)
         self.on_frame = on_frame
         self.world = PhysicsWorld()
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
-        self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # where the time went, summed
+        self.seconds = {
+            "physics": 0.0,
+            "rendering": 0.0,
+            "segmentation": 0.0,
+            "points": 0.0,
+        }  # where the time went, summed
+
+    @property
+    def camera(self) -> Camera:
+        """Where the camera was meant to be mounted; pictures for people are taken from there."""
+        return self.sensor.nominal
 
     def close(self) -> None:
         """Free the simulator. Closing twice is harmless."""
@@ -147,10 +169,12 @@ class Scene:
         self.robot = StickRobot(self.world)
         self.robot.settle(self.bodies, limit=720)
         self._points = point_generator
+        (sensor_generator,) = point_generator.spawn(1)
+        self.sensor.reset(sensor_generator)
         self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
         self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
         self.seconds["physics"] += time.perf_counter() - began
-        return self.observe()
+        return self._observe(first=True)
 
     def push(self, action: NDArray[np.floating]) -> PushReport:
         """Carry out one normalised push [4] and wait until the objects rest.
@@ -180,20 +204,56 @@ class Scene:
 
     def observe(self) -> Observation:
         """Take a depth image and turn it into one cloud per object."""
+        return self._observe(first=False)
+
+    def _observe(self, *, first: bool) -> Observation:
         began = time.perf_counter()
-        rendering = self.world.render(self.camera)
+        image, self._seen = self.sensor.look(self.world.render)
         rendered = time.perf_counter()
+        if first:
+            found = self.segmenter.start(image, self._point_at_target(image))
+            self._put_in_order(found)
+        else:
+            found = self.segmenter.follow(image)
+        segmented = time.perf_counter()
         visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
-        for slot, (rows, columns) in enumerate(segment_by_mask(rendering, self.bodies)):
+        for slot, (rows, columns) in enumerate(found):
             if len(rows) >= MINIMUM_PIXELS:
-                points = self.camera.points(rendering.depth, rows, columns)
+                points = image.camera.points(image.depth, rows, columns)
                 self._clouds[slot] = sample_cloud(points, POINTS_PER_OBJECT, self._points)
                 visible[slot] = True
         self._mask |= visible
         centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
         self.seconds["rendering"] += rendered - began
-        self.seconds["points"] += time.perf_counter() - rendered
+        self.seconds["segmentation"] += segmented - rendered
+        self.seconds["points"] += time.perf_counter() - segmented
         return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
+
+    def truth(self) -> list[NDArray[np.bool_]]:
+        """The simulator's word on the latest image: the pixels [height, width] of each body. No robot has it."""
+        return [self._seen == body for body in self.bodies]
+
+    def _point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
+        """What a person does once, before an episode: point at the target in the image."""
+        rows, columns = np.nonzero(self.truth()[0] & (image.depth > 0.0))
+        if len(rows) < MINIMUM_PIXELS:
+            return None
+        # Of its pixels the one nearest to their middle, which need not lie on the object itself.
+        nearest = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
+        return int(rows[nearest]), int(columns[nearest])
+
+    def _put_in_order(self, found: list[Pixels]) -> None:
+        """Number the bodies as the segmentation numbers what it found: bookkeeping for reports, which tell of both."""
+        named: list[int] = []
+        for pixels in found[: len(self.bodies)]:
+            counts = np.bincount(self._seen[pixels] + 1, minlength=1)
+            body = int(counts.argmax()) - 1
+            named.append(body if body in self.bodies and body not in named else -1)
+        left = iter([body for body in self.bodies if body not in named])
+        named += [-1] * (len(self.bodies) - len(named))
+        ordered = [next(left) if body < 0 else body for body in named]
+        self.objects = [self.objects[self.bodies.index(body)] for body in ordered]
+        self.bodies = ordered
 
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
         """A colour image [height, width, 3] of the scene, for people."""
