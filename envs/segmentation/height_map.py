@@ -74,8 +74,8 @@ def cells_of(image: DepthImage, pixels: Pixels) -> tuple[NDArray[np.intp], Mask]
     """The cell [P, 2] over which each pixel's point lies, and whether that is on the map [P]."""
     points = image.camera.points(image.depth, *pixels)
     cells = np.floor((points[:, :2] - ORIGIN) / CELL).astype(np.intp)
-    inside: Mask = np.logical_and(cells >= 0, cells < SHAPE).all(axis=-1)
-    return cells, inside
+    inside = np.all((cells >= 0) & (cells < SHAPE), axis=-1)
+    return cells, np.asarray(inside, dtype=np.bool_)
 
 
 def fit_table(image: DepthImage) -> NDArray[np.float64]:
