@@ -119,7 +119,7 @@ def one_episode(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
         named = owners(found, truth)
         images += 1
         visible = sum(mask.sum() >= MINIMUM_PIXELS for mask in truth)
-        counted += sum(name is not None for name in named) == visible
+        counted += int(sum(name is not None for name in named) == visible)
         lost = any(name not in (None, was) for name, was in zip(named, first, strict=True))
         if lost and kept:
             picture(f"episode_{number}", image, np.array(truth), found)

@@ -66,8 +66,20 @@ def map_heights(image: DepthImage) -> HeightMap:
     cells, inside = cells_of(image, (rows, columns))
     rows, columns, cells = rows[inside], columns[inside], cells[inside]
     heights = np.zeros(SHAPE, np.float32)
-    np.maximum.at(heights, (cells[:, 0], cells[:, 1]), above[rows, columns])
+    for covered in _covered(image, (rows, columns), cells):
+        np.maximum.at(heights, (covered[:, 0], covered[:, 1]), above[rows, columns])
     return HeightMap(image, heights, (rows, columns), cells, above)
+
+
+def _covered(image: DepthImage, pixels: Pixels, cells: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """The cells that pixels cover: their own, and where a pixel shows more than a cell, those around it too."""
+    side = float(np.median(image.depth[pixels])) / image.camera.focal_length if len(cells) else 0.0
+    if side <= CELL:
+        return [cells]
+    points = image.camera.points(image.depth, *pixels)[:, :2]
+    shifts = [np.array([x, y]) * side / 4 for x in (-1, 1) for y in (-1, 1)]
+    covered = [np.floor((points + shift - ORIGIN) / CELL).astype(np.intp) for shift in shifts]
+    return [np.clip(one, 0, np.array(SHAPE) - 1) for one in covered]
 
 
 def cells_of(image: DepthImage, pixels: Pixels) -> tuple[NDArray[np.intp], Mask]:

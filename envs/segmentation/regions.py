@@ -13,9 +13,9 @@ MINIMUM_AREA = 3e-4  # square metres; smaller things are noise (the smallest obj
 MINIMUM_PIXELS = 30  # of such a region
 NECK = 3  # cells, at most, that are taken off all around to see whether a region falls into parts
 PART_AREA = 10e-4  # square metres that each part must have
-NARROW = 0.6  # of a part's own half width: a wider neck belongs to the object
+NARROW = 0.5  # of a part's own half width: a wider neck belongs to the object
 GAP_AREA = 1e-4  # square metres; smaller holes are lost measurements
-CORE_AREA = 1.5e-4  # square metres of it that must be left
+CORE_AREA = 2.5e-4  # square metres of it that must be left
 HOLLOW_AREA = 7e-4  # square metres; the hollow of a vessel is larger, the eye of a handle smaller
 
 

@@ -19,10 +19,10 @@ from envs.segmentation.regions import AROUND, MINIMUM_AREA, nearest_owner
 from envs.segmentation.splitting import HEIGHT_WEIGHT, Points, split_by_shapes
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
+INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
 SAME_HEIGHT = 0.008  # metres
 FARTHEST = 0.5  # metres; no object goes farther between two images
 REACH = 0.03  # metres from a moved object's region within which a smaller one is taken for its other half
-MERGED = 0.005  # metres by which two shapes must explain a region better than one
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,18 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Ma
 
 
 def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
+    """Whether the object shows its former heights, and most of the free cells around it are still free.
+
+    The second is for objects of one height that are pushed in a row: each then stands where the next one stood.
+    """
     core = ndimage.binary_erosion(track.region, AROUND)
     core = core if core.any() else track.region
     before, now = track.heights[core], heights[core]
     # A cell without a measurement now and then says nothing.
-    return bool((np.abs(before - now) < SAME_HEIGHT).sum() >= STILL * (before > 0.0).sum())
+    same = (np.abs(before - now) < SAME_HEIGHT).sum() >= STILL * (before > 0.0).sum()
+    around = ndimage.binary_dilation(track.region, AROUND, iterations=3) & (track.heights == 0.0)
+    around &= ~ndimage.binary_dilation(track.region, AROUND)
+    return bool(same and (heights[around] > 0.0).sum() <= INVADED * around.sum())
 
 
 def _match(

@@ -71,8 +71,7 @@ def test_a_segmenter_that_clusters_is_told_the_depth_and_the_camera_alone() -> N
     segmenter = SEGMENTERS["clusters"](betray)
     segmenter.start(image, pixel(image, 0.6, 0.1))
     assert len(segmenter.follow(image)) == 1
-    imported = {name for name in vars(clusters_module) if "physics" in name.lower()}
-    assert not imported
+    assert not {name for name in vars(clusters_module) if "physics" in name.lower()}
 
 
 def test_the_mask_gives_each_object_its_own_measured_pixels_in_order() -> None:
