@@ -34,7 +34,7 @@ def split_at_necks(region: Mask) -> list[Mask]:
     Objects that touch with a corner or an edge come apart. Hollow vessels are filled first, so that their rims do not;
     the eye of a handle is not, so that the handle vanishes instead of counting as a part.
     """
-    (box,) = ndimage.find_objects(region)
+    (box,) = ndimage.find_objects(region.astype(np.int8))
     own = region[box]
     holes = ndimage.binary_fill_holes(own) & ~own
     solid = np.pad(own | (holes & ~_large(holes, GAP_AREA)) | _large(holes, HOLLOW_AREA), 1)

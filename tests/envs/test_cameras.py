@@ -51,9 +51,10 @@ def test_the_renderer_draws_what_the_geometry_says_of_a_turned_and_shifted_camer
     camera = Camera(512, 424, (0.63, -0.04, 1.03), (0.02, -0.025, 0.02), (12.0, -9.0, -14.0, 15.0))
     rendering = scene.world.render(camera)
     points = camera.points(rendering.depth, *np.nonzero(rendering.bodies == scene.bodies[0]))
-    top = points[points[:, 2] > 0.05]
-    np.testing.assert_allclose(top.mean(axis=0)[:2], scene.ground_truth().positions[0, :2], atol=0.002)
-    np.testing.assert_allclose(top[:, 2], 2 * scene.ground_truth().positions[0, 2], atol=0.001)
+    truth = scene.ground_truth().positions[0]
+    top = points[points[:, 2] > 2 * truth[2] - 0.001]
+    assert len(top) > 0.7 * len(points)  # the rest is a side of the cube
+    np.testing.assert_allclose(top.mean(axis=0), (truth[0], truth[1], 2 * truth[2]), atol=0.002)
 
 
 def test_the_table_that_the_kinect_computes_is_the_one_that_the_renderer_draws(scene: Scene, put: Callable) -> None:
