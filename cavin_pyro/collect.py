@@ -41,6 +41,8 @@ def main(config: DictConfig) -> None:
         ranges=object_ranges(config.env),
         object_set=config.env.objects,
         assets=config.env.assets,
+        camera=config.env.camera,
+        segmentation=config.env.segmentation,
     )
     folder = output_folder(config.output)
     if config.repair:

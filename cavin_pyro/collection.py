@@ -37,6 +37,7 @@ class CollectionSettings:
         episodes_per_shard: episodes per file, the unit of work and of resuming. ranges: object parameters.
         object_set: where the objects come from. assets: folder of meshes, for a set that needs one; where it lies
             decides nothing.
+        camera, segmentation: by name, see `envs.scene.Scene`.
     """
 
     seed: int = 0
@@ -49,6 +50,8 @@ class CollectionSettings:
     ranges: ObjectRanges = field(default_factory=lambda: ObjectRanges(clearance=0.12))
     object_set: str = "builtin"
     assets: str | None = None
+    camera: str = "ideal"
+    segmentation: str = "mask"
 
 
 def collect(settings: CollectionSettings, folder: Path, *, transitions: int, workers: int) -> dict[str, Any]:
@@ -151,15 +154,15 @@ def _record_push(
 
 
 @cache
-def _scene(object_set: str, assets: str | None) -> Scene:
+def _scene(object_set: str, assets: str | None, camera: str, segmentation: str) -> Scene:
     """One per worker process."""
     with user_input():
-        return Scene(object_set=load_object_set(object_set, assets))
+        return Scene(object_set=load_object_set(object_set, assets), camera=camera, segmentation=segmentation)
 
 
 def _collect_shard(job: tuple[CollectionSettings, int]) -> tuple[Arrays, dict[str, float]]:
     settings, shard = job
-    scene = _scene(settings.object_set, settings.assets)
+    scene = _scene(settings.object_set, settings.assets, settings.camera, settings.segmentation)
     began = time.process_time()
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     first = shard * settings.episodes_per_shard
@@ -222,8 +225,8 @@ def _write(folder: Path, metadata: dict[str, Any]) -> None:
 def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:
     """Where the time of each shard went; apart from the data, which must not depend on the machine's speed."""
     path = folder / "timing.csv"
-    header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,points_s\n"
-    row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "points"))
+    header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
+    row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "segmentation", "points"))
     with open(path, "a", encoding="utf-8") as file:
         file.write(f"{header}{shard},{transitions},{row}\n")
 

@@ -75,6 +75,8 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             object_set=config.env.objects,
             assets=config.env.assets,
             maximum_steps=config.maximum_steps,
+            camera=config.env.camera,
+            segmentation=config.env.segmentation,
             render_mode="rgb_array" if render else None,
             robot=config.env.robot,
         )

@@ -11,10 +11,17 @@ from envs.object_asset import plain_name
 from envs.object_sets import OBJECT_SETS, chosen, load_object_set
 from envs.objects import ObjectRanges
 from envs.robots import ROBOTS, robot_maker
+from envs.segmentation import SEGMENTERS
+from envs.sensors import CAMERAS
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
 
-CHOICES = {"robot": tuple(ROBOTS), "objects": tuple(OBJECT_SETS), "camera": ("ideal",), "segmentation": ("mask",)}
+CHOICES = {
+    "robot": tuple(ROBOTS),
+    "objects": tuple(OBJECT_SETS),
+    "camera": tuple(CAMERAS),
+    "segmentation": tuple(SEGMENTERS),
+}
 
 
 def check_world(env: DictConfig) -> None:

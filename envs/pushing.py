@@ -20,6 +20,7 @@ from envs.objects import Area, ObjectRanges
 from envs.random_layouts import possible_layouts
 from envs.randomness import layout_stream, next_scene_stream
 from envs.scene import Observation, Scene
+from envs.sensors import DepthSensor
 from envs.tasks import GOAL_REWARD, TIME_REWARD, VIOLATION_REWARD, Outcome, TaskReward
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
 
@@ -49,6 +50,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
         robot: what pushes, one of `envs.robots.ROBOTS`.
         object_set: where the objects come from, a key of `envs.object_sets.OBJECT_SETS`.
+        camera, segmentation: see `envs.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
 
@@ -71,7 +73,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         object_set: str = "builtin",
         assets: str | Path | None = None,
         maximum_steps: int = EPISODE_STEPS,
-        camera: Camera | None = None,
+        camera: str | Camera | DepthSensor = "ideal",
+        segmentation: str = "mask",
         render_mode: str | None = None,
         show_tiles: bool = True,
         robot: str = "stick",
@@ -91,7 +94,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
         self.ranges = ranges or ObjectRanges(names=tuple(dict.fromkeys(map(plain_name, available.names))))
-        self.scene = Scene(camera=camera, object_set=available, robot=robot, assets=assets)
+        self.scene = Scene(camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets)
         shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]

@@ -21,9 +21,10 @@ from envs.markings import LEVEL, TileGroup, paint_tiles
 from envs.object_sets import BuiltinObjects, ObjectSet
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
-from envs.randomness import next_draw_streams
+from envs.randomness import next_draw_streams, sensor_stream
 from envs.robots import Stopped, push, robot_maker, settle
-from envs.segmentation import segment_by_mask
+from envs.segmentation import Pixels, segmenter_of
+from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
 MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
@@ -77,24 +78,28 @@ class Scene:
     """One world in which scenes are drawn, pushed and looked at.
 
     Args:
-        camera: the depth camera. object_set: what the objects' names mean, the builtin shapes by default.
+        camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
+        segmentation: a name in `envs.segmentation.SEGMENTERS`.
+        object_set: what the objects' names mean, the builtin shapes by default.
         on_frame: called a few times during every push, for whoever films it.
         robot: what pushes, one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
 
     Raises:
-        ValueError: unknown robot, or its files are missing.
+        ValueError: unknown camera, segmentation or robot, or its files are missing.
     """
 
     def __init__(
         self,
         *,
-        camera: Camera | None = None,
+        camera: str | Camera | DepthSensor = "ideal",
+        segmentation: str = "mask",
         object_set: ObjectSet | None = None,
         on_frame: FrameHook | None = None,
         robot: str = "stick",
         assets: str | Path | None = None,
     ) -> None:
-        self.camera = camera or Camera()
+        self.sensor = sensor_of(camera)
+        self.segmenter = segmenter_of(segmentation, self.truth)
         self.object_set = object_set or BuiltinObjects()
         self._make_robot = robot_maker(robot, assets)
         self.on_frame = on_frame
@@ -102,7 +107,13 @@ class Scene:
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
-        self.seconds = {"physics": 0.0, "rendering": 0.0, "points": 0.0}  # of CPU time, summed
+        # Where the CPU time went, summed.
+        self.seconds = dict.fromkeys(("physics", "rendering", "segmentation", "points"), 0.0)
+
+    @property
+    def camera(self) -> Camera:
+        """Where the camera was meant to be mounted; pictures for people are taken from there."""
+        return self.sensor.nominal
 
     def close(self) -> None:
         """Free the simulator. Closing twice is harmless."""
@@ -149,10 +160,11 @@ class Scene:
         self.robot = self._make_robot(self.world)
         settle(self.world, self.robot, self.bodies, limit=720)
         self._points = point_generator
+        self.sensor.reset(sensor_stream(point_generator))
         self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
         self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
         self.seconds["physics"] += time.process_time() - began
-        return self.observe()
+        return self._observe(first=True)
 
     def push(self, action: NDArray[np.floating]) -> PushReport:
         """Carry out one normalised push [4] and wait until the objects rest.
@@ -191,22 +203,58 @@ class Scene:
         Raises:
             RuntimeError: the robot stands in the camera's view.
         """
+        return self._observe(first=False)
+
+    def _observe(self, *, first: bool) -> Observation:
         began = time.process_time()
         if not self.robot.clear_of_view(self.camera):
             raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
-        rendering = self.world.render(self.camera)
+        image, self._seen = self.sensor.look(self.world.render)
         rendered = time.process_time()
+        if first:
+            found = self.segmenter.start(image, self._point_at_target(image))
+            self._put_in_order(found)
+        else:
+            found = self.segmenter.follow(image)
+        segmented = time.process_time()
         visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
-        for slot, (rows, columns) in enumerate(segment_by_mask(rendering, self.bodies)):
+        for slot, (rows, columns) in enumerate(found):
             if len(rows) >= MINIMUM_PIXELS:
-                points = self.camera.points(rendering.depth, rows, columns)
+                points = image.camera.points(image.depth, rows, columns)
                 self._clouds[slot] = sample_cloud(points, POINTS_PER_OBJECT, self._points)
                 visible[slot] = True
         self._mask |= visible
         centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
         self.seconds["rendering"] += rendered - began
-        self.seconds["points"] += time.process_time() - rendered
+        self.seconds["segmentation"] += segmented - rendered
+        self.seconds["points"] += time.process_time() - segmented
         return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
+
+    def truth(self) -> list[NDArray[np.bool_]]:
+        """The simulator's word on the latest image: the pixels [height, width] of each body. No robot has it."""
+        return [self._seen == body for body in self.bodies]
+
+    def _point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
+        """What a person does once, before an episode: point at the target in the image."""
+        rows, columns = np.nonzero(self.truth()[0] & (image.depth > 0.0))
+        if len(rows) < MINIMUM_PIXELS:
+            return None
+        # Of its pixels the one nearest to their middle, which need not lie on the object itself.
+        nearest = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
+        return int(rows[nearest]), int(columns[nearest])
+
+    def _put_in_order(self, found: list[Pixels]) -> None:
+        """Number the bodies as the segmentation numbers what it found: bookkeeping for reports, which tell of both."""
+        named: list[int] = []
+        for pixels in found[: len(self.bodies)]:
+            counts = np.bincount(self._seen[pixels] + 1, minlength=1)
+            body = int(counts.argmax()) - 1
+            named.append(body if body in self.bodies and body not in named else -1)
+        left = iter([body for body in self.bodies if body not in named])
+        named += [-1] * (len(self.bodies) - len(named))
+        ordered = [next(left) if body < 0 else body for body in named]
+        self.objects = [self.objects[self.bodies.index(body)] for body in ordered]
+        self.bodies = ordered
 
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
         """A colour image [height, width, 3] of the scene with the `markings` on the table, for people."""

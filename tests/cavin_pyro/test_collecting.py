@@ -177,7 +177,7 @@ def test_an_empty_dataset_is_begun_again(small: SimpleNamespace, tmp_path: Path)
 
 def test_the_time_of_every_file_is_recorded_apart_from_the_data(pushes: Path) -> None:
     header, *rows = (pushes / "timing.csv").read_text().splitlines()
-    assert header == "shard,transitions,cpu_s,physics_s,rendering_s,points_s"
+    assert header == "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s"
     assert [row.split(",")[0] for row in rows] == ["0", "1", "2"]
     for row in rows:
         _, transitions, cpu, *parts = map(float, row.split(","))

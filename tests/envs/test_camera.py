@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.camera import RAY_COLUMN, RAY_ROW, Camera, sample_cloud
-from envs.physics import Rendering
 from envs.scene import Scene
-from envs.segmentation import segment_by_mask
 
 
 @settings(deadline=None)
@@ -94,13 +92,3 @@ def test_a_cloud_repeats_points_only_where_there_are_too_few(present: int, count
 def test_a_cloud_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="the object is not visible"):
         sample_cloud(np.zeros((0, 3)), 4, np.random.default_rng(0))
-
-
-def test_the_mask_gives_each_body_its_own_pixels_in_the_order_asked_for() -> None:
-    bodies = np.array([[0, 0, 2], [1, 2, 2], [-1, -1, 0]])
-    blank = np.zeros((3, 3))
-    rendering = Rendering(blank, bodies, np.zeros((3, 3, 3), np.uint8))
-    two, seven, one = segment_by_mask(rendering, [2, 7, 1])
-    assert list(zip(*two, strict=True)) == [(0, 2), (1, 1), (1, 2)]
-    assert len(seven[0]) == 0
-    assert list(zip(*one, strict=True)) == [(1, 0)]

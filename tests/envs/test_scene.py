@@ -16,6 +16,7 @@ from envs.objects import WHOLE_TABLE, Area, ObjectRanges
 from envs.physics import PhysicsWorld
 from envs.robots import OFF_STAGE, SETTLED_SPEED, STICK_RADIUS
 from envs.scene import MOVED, TURNED, PushReport, Scene
+from envs.sensors import IdealSensor
 from envs.shapes import BUILTIN_NAMES
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
@@ -224,7 +225,7 @@ def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scen
 def test_an_object_out_of_view_keeps_its_last_cloud(put: Callable) -> None:
     scene = Scene()
     first = scene.reset([put("mug", 0.6, 0.3), put("rubiks_cube", 0.6, -0.3)], np.random.default_rng(0))
-    scene.camera = Camera(position=(0.6, -0.3, 0.4))
+    scene.sensor = IdealSensor(Camera(position=(0.6, -0.3, 0.4)))
     second = scene.observe()
     assert second.visible.tolist() == [False, True, False, False, False]
     assert second.mask.tolist() == first.mask.tolist() == [True, True, False, False, False]

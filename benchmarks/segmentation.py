@@ -1,0 +1,187 @@
+"""How well objects are found in depth images alone: `python benchmarks/segmentation.py [--scenes N] [--episodes N]`.
+
+Under `camera=kinect2`, `segmentation=clusters` against the simulator's own mask of the same images. First single images
+of random scenes of 1 to 5 objects: the number of objects, and the distance between the centres that both give. Then
+episodes of the heuristic policy: whether every object keeps its place in the list from the first image to the last.
+An episode in whose first image the number is wrong does not begin, as in `Scene.draw`.
+Results go to a file line by line (--log), from which a run that was stopped goes on. --pictures DIR draws what failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest, bootstrap
+
+from cavin_pyro.progress import progress_bar
+from envs.objects import WHOLE_TABLE, ObjectRanges
+from envs.policy import HeuristicPushingPolicy
+from envs.scene import MINIMUM_PIXELS, Scene
+from envs.segmentation import ClusterSegmenter, Pixels
+from envs.sensors import DepthImage
+
+SEED = 5
+PUSHES = 10
+Pictures = Callable[[str, DepthImage, np.ndarray, list[Pixels]], None]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=1000)
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--log", type=Path, default=Path("runs/segmentation.jsonl"))
+    parser.add_argument("--pictures", type=Path)
+    words = parser.parse_args()
+    words.log.parent.mkdir(parents=True, exist_ok=True)
+    done = [json.loads(line) for line in words.log.read_text().splitlines()] if words.log.exists() else []
+    scene = Scene(camera="kinect2", segmentation="mask")
+    picture = draw_into(words.pictures) if words.pictures else lambda *_: None
+    with open(words.log, "a", encoding="utf-8") as log:
+        for kind, count, run in (("scene", words.scenes, one_scene), ("episode", words.episodes, one_episode)):
+            known = {line["number"] for line in done if line["kind"] == kind}
+            with progress_bar(kind + "s", total=count, initial=len(known), unit=kind) as bar:
+                for number in sorted(set(range(count)) - known):
+                    line = {"kind": kind, "number": number, **run(scene, number, picture)}
+                    done.append(line)
+                    log.write(json.dumps(line) + "\n")
+                    log.flush()
+                    bar.update(1)
+    report(done)
+
+
+def begin(scene: Scene, number: int) -> tuple[np.random.Generator, Any]:
+    """Draw a scene of 1 to 5 objects anywhere on the table; each is seen by the camera."""
+    generator = np.random.default_rng([SEED, number])
+    count = int(generator.integers(1, 6))
+    return generator, scene.draw([WHOLE_TABLE] * count, ObjectRanges(), generator)
+
+
+def look(scene: Scene) -> tuple[DepthImage, list[np.ndarray]]:
+    """A new image, and for each object the pixels that the simulator says are its own and have a measurement."""
+    image, scene._seen = scene.sensor.look(scene.world.render)
+    return image, [mask & (image.depth > 0.0) for mask in scene.truth()]
+
+
+def owners(found: list[Pixels], truth: list[np.ndarray]) -> list[int | None]:
+    """For each place in the list the object to which most of its pixels belong; -1 for none, None if not seen."""
+    named: list[int | None] = []
+    for pixels in found:
+        counts = [int(mask[pixels].sum()) for mask in truth]
+        enough = len(pixels[0]) >= MINIMUM_PIXELS
+        named.append((int(np.argmax(counts)) if 2 * max(counts) > len(pixels[0]) else -1) if enough else None)
+    return named
+
+
+def one_scene(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
+    begin(scene, number)
+    image, truth = look(scene)
+    began = time.process_time()
+    found = ClusterSegmenter().start(image, scene._point_at_target(image))
+    spent = time.process_time() - began
+    named = owners(found, truth)
+    seen = [body for body, mask in enumerate(truth) if mask.sum() >= MINIMUM_PIXELS]
+    right = sum(name is not None for name in named) == len(seen)
+    errors = []
+    for name, pixels in zip(named, found, strict=True):
+        if name is not None and name >= 0:
+            centers = [
+                image.camera.points(image.depth, *where).mean(axis=0) for where in (np.nonzero(truth[name]), pixels)
+            ]
+            errors.append(float(np.linalg.norm(centers[0] - centers[1])))
+    if not right:
+        picture(f"scene_{number}", image, np.array(truth), found)
+    names = [one.name for one in scene.objects]
+    return {"objects": len(seen), "right": right, "errors": errors, "names": names, "seconds": spent}
+
+
+def one_episode(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
+    generator, seen = begin(scene, 10**6 + number)
+    policy = HeuristicPushingPolicy(generator.spawn(1)[0])
+    segmenter = ClusterSegmenter()
+    image, truth = look(scene)
+    named = first = owners(segmenter.start(image, scene._point_at_target(image)), truth)
+    if sorted(name for name in first if name is not None) != list(range(len(truth))):
+        return {"begun": False}
+    kept, counted, images, seconds = True, 0, 0, 0.0
+    for _ in range(PUSHES):
+        fallen = scene.push(policy.act(seen)).fallen
+        seen = scene.observe()
+        image, truth = look(scene)
+        began = time.process_time()
+        found = segmenter.follow(image)
+        seconds += time.process_time() - began
+        named = owners(found, truth)
+        images += 1
+        visible = sum(mask.sum() >= MINIMUM_PIXELS for mask in truth)
+        counted += int(sum(name is not None for name in named) == visible)
+        lost = any(name not in (None, was) for name, was in zip(named, first, strict=True))
+        if lost and kept:
+            picture(f"episode_{number}", image, np.array(truth), found)
+        kept = kept and not lost
+        if fallen:
+            break
+    return {"begun": True, "kept": kept, "counted": counted, "images": images, "seconds": seconds}
+
+
+def report(lines: list[dict[str, Any]]) -> None:
+    scenes = [line for line in lines if line["kind"] == "scene"]
+    episodes = [line for line in lines if line["kind"] == "episode" and line["begun"]]
+    if scenes:
+        print(share("right number of objects", sum(line["right"] for line in scenes), len(scenes)))
+        for count in range(1, 6):
+            some = [line["right"] for line in scenes if line["objects"] == count]
+            if some:
+                print(share(f"  of {count}", sum(some), len(some)))
+        errors = 1e3 * np.array([error for line in scenes for error in line["errors"]])
+        interval = bootstrap((errors,), np.median, n_resamples=1000, rng=0).confidence_interval
+        tail = ", ".join(f"{np.percentile(errors, rank):.1f} mm in {rank} %" for rank in (90, 95, 99))
+        print(
+            f"centre error: median {np.median(errors):.2f} mm [{interval.low:.2f}, {interval.high:.2f}], at most {tail}"
+        )
+        print(f"CPU time: {1e3 * np.median([line['seconds'] for line in scenes]):.1f} ms for a first image")
+    if episodes:
+        print(share("identities kept over the episode", sum(line["kept"] for line in episodes), len(episodes)))
+        images = sum(line["images"] for line in episodes)
+        print(share("right number of objects in later images", sum(line["counted"] for line in episodes), images))
+        print(f"CPU time: {1e3 * sum(line['seconds'] for line in episodes) / images:.1f} ms for a later image")
+
+
+def share(what: str, count: int, of: int) -> str:
+    interval = binomtest(count, of).proportion_ci(method="wilson")
+    return f"{what}: {100 * count / of:.1f} % [{100 * interval.low:.1f}, {100 * interval.high:.1f}], {count} of {of}"
+
+
+def draw_into(folder: Path) -> Pictures:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def picture(name: str, image: DepthImage, truth: np.ndarray, found: list[Pixels]) -> None:
+        figure, panels = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
+        panels[0].imshow(np.where(image.depth > 0, image.depth, np.nan), cmap="viridis_r", vmin=0.8, vmax=1.1)
+        labels = np.full((2, *image.depth.shape), np.nan)
+        for number, mask in enumerate(truth):
+            labels[0][mask] = number
+        for number, pixels in enumerate(found):
+            labels[1][pixels] = number
+        for panel, label in zip(panels[1:], labels, strict=True):
+            panel.imshow(label, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
+        for panel, title in zip(panels, (f"{name}: depth", "mask (simulator)", "clusters (depth alone)"), strict=True):
+            panel.set(title=title, xticks=[], yticks=[])
+        figure.savefig(folder / f"{name}.png", dpi=70)
+        pyplot.close(figure)
+
+    return picture
+
+
+if __name__ == "__main__":
+    main()

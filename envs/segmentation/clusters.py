@@ -1,0 +1,99 @@
+"""Objects found in the depth image alone, as on a real robot.
+
+The table's plane is fitted and taken away, what is left is mapped from above and falls into connected regions, regions
+that touch are split, and from image to image objects are known again by where they were and what they looked like.
+The objects are those of the first image: later arrivals are taken for noise or for parts of these.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from envs.segmentation.height_map import HeightMap, Mask, cells_of, map_heights
+from envs.segmentation.regions import AROUND, find_regions, split_at_necks
+from envs.segmentation.segmenter import Pixels
+from envs.segmentation.tracking import Track, follow_tracks
+from envs.sensors.sensor import DepthImage
+from envs.workspace import MAXIMUM_OBJECTS
+
+CLICK = 8  # cells by which a person may miss the target
+NO_PIXELS: Pixels = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+
+
+class ClusterSegmenter:
+    """Finds objects by clustering what rises above the table."""
+
+    def __init__(self) -> None:
+        self._tracks: list[Track | None] = []
+
+    def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
+        """Find the objects of a new episode; the target is the one at the pixel that a person has confirmed.
+
+        Raises:
+            ValueError: the image shows no table.
+        """
+        heights = map_heights(image)
+        regions = [part for region in find_regions(heights) for part in split_at_necks(region)]
+        regions.sort(key=lambda region: -int(region.sum()))
+        first = _confirmed(regions, image, target)
+        others = [region for number, region in enumerate(regions) if number != first]
+        kept = [None if first is None else regions[first], *others][:MAXIMUM_OBJECTS]
+        self._tracks = [None if region is None else Track(region, heights.heights) for region in kept]
+        return pixels_of(kept, heights)
+
+    def follow(self, image: DepthImage) -> list[Pixels]:
+        """Find the same objects again.
+
+        Raises:
+            ValueError: the image shows no table.
+        """
+        heights = map_heights(image)
+        regions = follow_tracks(self._tracks, heights)
+        for number, region in enumerate(regions):
+            if region is not None:
+                self._tracks[number] = Track(region, heights.heights)
+        return pixels_of(regions, heights)
+
+
+def _confirmed(regions: list[Mask], image: DepthImage, target: tuple[int, int] | None) -> int | None:
+    """The region at the confirmed pixel, or the nearest within a person's aim."""
+    if target is None or not regions:
+        return None
+    (cell,), (inside,) = cells_of(image, (np.array([target[0]]), np.array([target[1]])))
+    if not inside:
+        return None
+    distances = [ndimage.distance_transform_edt(~region)[tuple(cell)] for region in regions]
+    nearest = int(np.argmin(distances))
+    return nearest if distances[nearest] <= CLICK else None
+
+
+def pixels_of(regions: list[Mask | None], heights: HeightMap) -> list[Pixels]:
+    """Pixels of each region; the floors of vessels, which hardly rise above the table, are part of them."""
+    rows, columns = heights.pixels
+    found = []
+    for region in regions:
+        if region is None:
+            found.append(NO_PIXELS)
+            continue
+        own = region[tuple(heights.cells.T)]
+        pixels = rows[own], columns[own]
+        inside = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(region, 2), AROUND)[2:-2, 2:-2]) & ~region
+        if inside.any() and len(pixels[0]):
+            low = _floor(heights, inside, pixels)
+            pixels = np.concatenate([pixels[0], low[0]]), np.concatenate([pixels[1], low[1]])
+        found.append(pixels)
+    return found
+
+
+def _floor(heights: HeightMap, inside: Mask, pixels: Pixels) -> Pixels:
+    """Pixels over the cells `inside` that do not rise above the table, looked for around an object's own `pixels`."""
+    box = tuple(slice(int(axis.min()), int(axis.max()) + 1) for axis in pixels)
+    window = np.zeros(heights.above.shape, np.bool_)
+    window[box] = True
+    window[heights.pixels] = False
+    rows, columns = np.nonzero(window & (heights.image.depth > 0.0))
+    cells, on_map = cells_of(heights.image, (rows, columns))
+    own = np.zeros(len(rows), np.bool_)
+    own[on_map] = inside[tuple(cells[on_map].T)]
+    return rows[own], columns[own]

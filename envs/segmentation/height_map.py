@@ -1,0 +1,114 @@
+"""From a depth image to a map of the table seen from above: how high something stands on each little cell of it.
+
+In the image, a tall object leans outwards and hides what is behind it; on the map objects stand apart as they do
+on the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.camera import RAY_COLUMN, RAY_ROW
+from envs.segmentation.segmenter import Pixels
+from envs.sensors.sensor import DepthImage
+from envs.workspace import TABLE_HIGH, TABLE_LOW
+
+CELL = 0.004  # metres; a little more than what a pixel of the Kinect2 shows from one metre
+MARGIN = 0.06  # metres around the table
+LOWEST, HIGHEST = 0.008, 0.35  # metres above the table between which something counts as an object
+STRIDE = 6  # every sixth pixel on each axis says where the table is
+TRIMMING = (0.04, 0.02, 0.01, 0.006)  # metres from the table beyond which a pixel is left out of the next fit
+ORIGIN = np.array(TABLE_LOW) - MARGIN  # metres
+SHAPE = tuple(int(side) for side in np.ceil((np.array(TABLE_HIGH) + MARGIN - ORIGIN) / CELL))
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """What stands on the table.
+
+    Attributes:
+        heights: [I, J] metres above the table of the highest point on each cell; 0 where nothing stands.
+        pixels: rows and columns of the pixels above the table, each [P]. cells: [P, 2] the cell of each of them.
+        above: [height, width] metres above the fitted table, for all pixels.
+    """
+
+    image: DepthImage
+    heights: NDArray[np.float32]
+    pixels: Pixels
+    cells: NDArray[np.intp]
+    above: NDArray[np.float32]
+
+    @property
+    def occupied(self) -> Mask:
+        """Cells on which something stands, [I, J]."""
+        return self.heights > 0.0
+
+
+def map_heights(image: DepthImage) -> HeightMap:
+    """Fit the table's plane and map what stands on it.
+
+    Raises:
+        ValueError: the image shows no table.
+    """
+    camera, depth = image.camera, image.depth
+    plane = fit_table(image)
+    along_row, along_column, column, row = camera.intrinsics
+    right = (np.arange(camera.width) + RAY_COLUMN - column) / along_row
+    down = (np.arange(camera.height) + RAY_ROW - row) / along_column
+    inverse = (plane[0] * right + plane[2]) + (plane[1] * down)[:, None]  # of the table's depth at each pixel
+    above = ((1.0 - depth * inverse.astype(np.float32)) / np.linalg.norm(plane)).astype(np.float32)
+    rows, columns = np.nonzero((above > LOWEST) & (above < HIGHEST) & (depth > 0.0))
+    cells, inside = cells_of(image, (rows, columns))
+    rows, columns, cells = rows[inside], columns[inside], cells[inside]
+    heights = np.zeros(SHAPE, np.float32)
+    for covered in _covered(image, (rows, columns), cells):
+        np.maximum.at(heights, (covered[:, 0], covered[:, 1]), above[rows, columns])
+    return HeightMap(image, heights, (rows, columns), cells, above)
+
+
+def _covered(image: DepthImage, pixels: Pixels, cells: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """The cells that pixels cover: their own, and where a pixel shows more than a cell, those around it too."""
+    side = float(np.median(image.depth[pixels])) / image.camera.focal_length if len(cells) else 0.0
+    if side <= CELL:
+        return [cells]
+    points = image.camera.points(image.depth, *pixels)[:, :2]
+    shifts = [np.array([x, y]) * side / 4 for x in (-1, 1) for y in (-1, 1)]
+    covered = [np.floor((points + shift - ORIGIN) / CELL).astype(np.intp) for shift in shifts]
+    return [np.clip(one, 0, np.array(SHAPE) - 1) for one in covered]
+
+
+def cells_of(image: DepthImage, pixels: Pixels) -> tuple[NDArray[np.intp], Mask]:
+    """The cell [P, 2] over which each pixel's point lies, and whether that is on the map [P]."""
+    points = image.camera.points(image.depth, *pixels)
+    cells = np.floor((points[:, :2] - ORIGIN) / CELL).astype(np.intp)
+    inside = np.all((cells >= 0) & (cells < SHAPE), axis=-1)
+    return cells, np.asarray(inside, dtype=np.bool_)
+
+
+def fit_table(image: DepthImage) -> NDArray[np.float64]:
+    """The plane that most of the image lies in: [3] n such that n . p = 1 for its points p in the image's axes.
+
+    Least squares, again and again without what was far from the last plane; the first is level and at the median
+    height. Objects must cover less than half of what is seen.
+
+    Raises:
+        ValueError: the image shows no table.
+    """
+    camera = image.camera
+    rows, columns = np.mgrid[STRIDE // 2 : camera.height : STRIDE, STRIDE // 2 : camera.width : STRIDE].reshape(2, -1)
+    depth = image.depth[rows, columns].astype(np.float64)
+    points = camera.rays(rows, columns)[depth > 0.0] * depth[depth > 0.0][:, None]
+    level = -camera.axes[:, 2]
+    for trimming in TRIMMING:
+        if trimming == TRIMMING[0]:
+            plane = level / np.median(points @ level) if len(points) else level
+        near = np.abs(1.0 - points @ plane) / np.linalg.norm(plane) < trimming
+        if near.sum() < 3:
+            raise ValueError("no table in the depth image: too few pixels have a measurement")
+        plane, *_ = np.linalg.lstsq(points[near], np.ones(int(near.sum())), rcond=None)
+    return plane

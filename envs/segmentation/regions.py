@@ -1,0 +1,70 @@
+"""Regions of the height map that may be one object each."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from envs.segmentation.height_map import CELL, HeightMap, Mask
+
+AROUND = np.ones((3, 3), np.bool_)  # eight neighbours
+MINIMUM_AREA = 3e-4  # square metres; smaller things are noise (the smallest object covers 10e-4)
+MINIMUM_PIXELS = 30  # of such a region
+NECK = 3  # cells, at most, that are taken off all around to see whether a region falls into parts
+PART_AREA = 10e-4  # square metres that each part must have
+NARROW = 0.5  # of a part's own half width: a wider neck belongs to the object
+GAP_AREA = 1e-4  # square metres; smaller holes are lost measurements
+CORE_AREA = 2.5e-4  # square metres of it that must be left
+HOLLOW_AREA = 7e-4  # square metres; the hollow of a vessel is larger, the eye of a handle smaller
+
+
+def find_regions(heights: HeightMap) -> list[Mask]:
+    """Connected regions [I, J] large enough to be objects; single empty cells do not part them."""
+    closed = ndimage.binary_closing(heights.occupied, AROUND) | heights.occupied
+    labels, count = ndimage.label(closed, AROUND)
+    areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, count + 1)) * CELL**2
+    pixels = np.bincount(labels[tuple(heights.cells.T)], minlength=count + 1)[1:]
+    return [labels == 1 + number for number in np.flatnonzero((areas >= MINIMUM_AREA) & (pixels >= MINIMUM_PIXELS))]
+
+
+def split_at_necks(region: Mask) -> list[Mask]:
+    """The parts into which a region falls when a little is taken off all around; itself, if it does not.
+
+    Objects that touch with a corner or an edge come apart. Hollow vessels are filled first, so that their rims do not;
+    the eye of a handle is not, so that the handle vanishes instead of counting as a part.
+    """
+    (box,) = ndimage.find_objects(region.astype(np.int8))
+    own = region[box]
+    holes = ndimage.binary_fill_holes(own) & ~own
+    solid = np.pad(own | (holes & ~_large(holes, GAP_AREA)) | _large(holes, HOLLOW_AREA), 1)
+    depth = ndimage.distance_transform_cdt(solid)
+    for neck in range(1, NECK + 1):
+        labels, count = ndimage.label(_large(depth > neck, CORE_AREA), AROUND)
+        if count > 1:
+            owner = nearest_owner([labels == 1 + part for part in range(count)])[1:-1, 1:-1]
+            areas = np.bincount(owner[own], minlength=count) * CELL**2
+            widths = ndimage.maximum(depth, labels, np.arange(1, count + 1))
+            large = np.flatnonzero((areas >= PART_AREA) & (neck <= NARROW * widths))
+            if len(large) > 1:
+                owner = nearest_owner([labels == 1 + part for part in large])[1:-1, 1:-1]
+                parts = np.zeros((len(large), *region.shape), np.bool_)
+                for number in range(len(large)):
+                    parts[number][box] = own & (owner == number)
+                return list(parts)
+    return [region]
+
+
+def _large(mask: Mask, area: float) -> Mask:
+    """What is left of a mask without its regions smaller than `area` square metres."""
+    labels, count = ndimage.label(mask, AROUND)
+    return (np.bincount(labels.ravel(), minlength=count + 1) * CELL**2 >= area)[labels] & mask
+
+
+def nearest_owner(parts: list[Mask]) -> NDArray[np.intp]:
+    """For every cell [I, J] the number of the part that is nearest to it."""
+    numbers = np.full(parts[0].shape, -1)
+    for number, part in enumerate(parts):
+        numbers[part] = number
+    nearest = ndimage.distance_transform_edt(numbers < 0, return_distances=False, return_indices=True)
+    return numbers[tuple(nearest)]

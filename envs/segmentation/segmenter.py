@@ -1,0 +1,34 @@
+"""What a segmentation is to the scene: from depth images to the pixels of each object."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.sensors.sensor import DepthImage
+
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Rows and columns of an object's pixels, each [P]."""
+
+
+class Segmenter(Protocol):
+    """Finds the objects in an episode's images, and knows them again in each further image.
+
+    The list that comes back holds the pixels of one object per entry, at most `MAXIMUM_OBJECTS` of them. An object
+    keeps its place in the list throughout the episode; the first is the target. An object out of sight has no pixels.
+    """
+
+    def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
+        """Begin an episode.
+
+        Args:
+            target: row and column of a pixel on the target, as a person confirms it once; None if it cannot be
+                seen, which leaves the first place empty.
+        """
+        ...
+
+    def follow(self, image: DepthImage) -> list[Pixels]:
+        """Find the same objects in the episode's next image."""
+        ...

@@ -1,0 +1,27 @@
+"""Depth cameras to choose from, by name."""
+
+from __future__ import annotations
+
+from envs.camera import Camera
+from envs.sensors.kinect2 import Kinect2
+from envs.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering, SensorMaker
+
+CAMERAS: dict[str, SensorMaker] = {"ideal": IdealSensor, "kinect2": Kinect2}
+
+
+def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:
+    """The sensor of a name; a camera's geometry alone makes one without errors; a sensor is taken as it is.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if isinstance(camera, Camera):
+        return IdealSensor(camera)
+    if not isinstance(camera, str):
+        return camera
+    if camera not in CAMERAS:
+        raise ValueError(f"unknown camera {camera!r}: choose from {', '.join(CAMERAS)}")
+    return CAMERAS[camera]()
+
+
+__all__ = ["CAMERAS", "DepthImage", "DepthSensor", "IdealSensor", "Kinect2", "Renderer", "Rendering", "sensor_of"]
