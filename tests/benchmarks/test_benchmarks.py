@@ -37,7 +37,8 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
 def test_collection_tells_where_its_time_goes() -> None:
     printed = run("collection", "12")
     shares = [float(share) for share in re.findall(r"([\d.]+) %", printed)]
-    assert len(shares) == 5 and sum(shares) == pytest.approx(100, abs=0.5)  # physics, rendering, points, writing, rest
+    # Physics, rendering, segmentation, points, writing, rest.
+    assert len(shares) == 6 and sum(shares) == pytest.approx(100, abs=0.5)
 
 
 def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_subgoal_distances_compare_what_was_wanted_with_what_was_seen(env: Pushi
     class Wishful(RandomPlanner):
         """Wants every object 30 cm above where it is, and does nothing about it."""
 
-        def plan(self, state: Any, generators: Any) -> Plan:
+        def plan(self, state: Any, generators: Any, previous: Any = None) -> Plan:
             plan = super().plan(state, generators)
             there = state.map(lambda field: field[:, None].clone())
             there.centers[..., 2] += 0.3

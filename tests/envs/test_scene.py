@@ -296,7 +296,7 @@ def test_the_time_is_booked_where_it_goes(scene: Scene, put: Callable, push: Cal
     before = dict(scene.seconds)
     scene.reset([put("mug", 0.55, 0.0)], np.random.default_rng(0))
     scene.push(push(0.45, 0.0, 0.1, 0.0))
-    assert set(before) == {"physics", "rendering", "points"}
+    assert set(before) == {"physics", "rendering", "segmentation", "points"}
     assert all(scene.seconds[name] > before[name] for name in before)
 
 
