@@ -215,7 +215,7 @@ def test_help_shows_the_words_and_their_defaults(command: str, helps: dict[str, 
         "collect": ["transitions: 100000", "workers: 2"],
         "pretrain": ["steps: 6000", "feature_dimension: 64"],
         "train": ["batch_size: 64", "model: cascaded", "validation_fraction: 0.1"],
-        "plan": ["task: crossing", "samples: 1024", "horizon: 30", "planner: cavin, cavin_evolution, cvae_mpc, mpc, random, sectar"],
+        "plan": ["task: crossing", "samples: 1024", "horizon: 30", "planner: cavin, cavin_evolution, cvae_mpc"],
         "evaluate": ["episodes: 200", "reward: sparse", "objects: 3"],
         "demo": ["output: runs/demo", "- insertion"],
     }
