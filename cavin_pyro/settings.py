@@ -41,4 +41,5 @@ def window_settings(config: DictConfig) -> WindowSettings:
         at_least(f"windows.{name}", windows[name], 0)
     at_least("model.segment_length", config.model.segment_length, 1)
     sizes = {str(name): value for name, value in windows.items()}
+    sizes["without"] = tuple(sizes.get("without", ()))  # older checkpoints do not tell
     return WindowSettings(segment_length=config.model.segment_length, seed=config.seed, **sizes)

@@ -48,7 +48,7 @@ def write(folder: Path, *shards: Arrays) -> Path:
         "episodes": sum(len(arrays["length"]) for arrays in shards),
         "transitions": 0,
     }
-    write_metadata(folder, {"settings": {"steps": STEPS}, **counts})
+    write_metadata(folder, {"settings": {"steps": STEPS}, "shape_names": ["can", "mug", "ycb/mug"], **counts})
     return folder
 
 
@@ -269,3 +269,23 @@ def test_the_whole_shards_of_a_damaged_dataset_are_used_if_asked_for(
     table = load_windows([folder], PointNet(), EVERY, skip_corrupt=True)
     assert "left out: shard" in capsys.readouterr().out
     assert len(table.starts) == 36
+
+
+def test_episodes_with_an_object_that_is_held_out_do_not_count(tmp_path: Path) -> None:
+    arrays = episodes(60)
+    arrays["shape"] = np.random.default_rng(0).integers(3, size=(60, OBJECTS))
+    arrays["scale"] = np.ones((60, OBJECTS), np.float32)
+    arrays["scale"][:20, 1] = 0.0  # padding, whatever its shape says
+    there = arrays["scale"] > 0
+    with_mug = ((arrays["shape"] > 0) & there).any(axis=-1)
+    folder = write(tmp_path / "data", arrays)
+    whole, without = (
+        load_windows([folder], PointNet(), WindowSettings(validation_fraction=0.5, quiet_fraction=1.0, without=names))
+        for names in ((), ("mug",))
+    )
+    assert 0 < with_mug.sum() < 60
+    assert len(without.starts) * 60 == len(whole.starts) * (60 - with_mug.sum())
+    for table in (whole, without):
+        table.batch(table.validation)
+    with pytest.raises(UserError, match=r"^unknown object 'fork' in windows.without: .* has can, mug$"):
+        load_windows([folder], PointNet(), WindowSettings(without=("fork",)))
