@@ -32,8 +32,9 @@ class CavinPlanner:
     reward: the task.
     samples: N, at both levels.
     horizon: H steps, a multiple of the model's T.
-    optimizer: how codes are searched, at both levels: `shooting` (paper), `cem`, `icem`, `mppi` or `smc`, with
-        `optimizer_options` of its own (see `planning.optimisers`).
+    optimizer: how codes are searched: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution` or `smc`, with
+        `optimizer_options` of its own (see `planning.optimisers`); at both levels, unless `motion_optimizer`, with
+        `motion_optimizer_options`, searches the motions.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
     stride_limits: metres, two of them; a subgoal towards which every object moves less than the first, or any more
@@ -104,7 +105,9 @@ class CavinPlanner:
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
 
-        An environment's plan depends on its own state and generator only. For errors see `planning.bulk.in_bulk`.
+        `previous`: the last plans of the same episodes, of which one segment has been executed, for optimisers with a
+        memory. An environment's plan depends on its own state, generator and last plan only. For errors see
+        `planning.bulk.in_bulk`.
         """
         # Lines 2, 3, 11 and 12 (repeat until the episode is done, execute, t = t + T) are the caller's.
         # Line 4, the new s_t, is what it was given.
