@@ -23,9 +23,9 @@ COLORS = {"sawyer": "#D55E00", "panda": "#0072B2", "stick, beside": "#777777"}
 LABELS = {"sawyer": "Sawyer", "panda": "Panda", "stick, beside": "stick, carried 0.5 mm beside"}
 WEIGHTS = {"light": "light objects", "heavy": "10 kg, friction 0.8"}
 VIEWPOINT, LOOKED_AT = (1.65, -0.95, 0.75), (0.35, 0.0, 0.25)  # metres
-SHOWN = slice(230, 790), slice(220, 880)  # rows and columns of the picture
+SHOWN = slice(170, 740), slice(200, 880)  # rows and columns of the picture
 STAND_COLOR = (0.35, 0.35, 0.38, 1.0)
-OBJECTS = (("mug", 0.55, 0.0), ("sugar_box", 0.62, 0.2), ("rubiks_cube", 0.65, -0.05), ("banana", 0.45, -0.2))
+OBJECTS = (("mug", 0.55, 0.0), ("sugar_box", 0.62, 0.2), ("rubiks_cube", 0.68, 0.04), ("banana", 0.45, -0.2))
 PUSH = (0.47, 0.0), (0.12, 0.0)  # start and motion, metres
 
 
