@@ -53,6 +53,7 @@ def draw_deviations(path: Path, results: Mapping[str, Any]) -> None:
     ):
         panel.set_title(title, fontsize=10)
         panel.set_xscale("log")
+        panel.xaxis.set_major_formatter("{x:g}")
         panel.set_xlim(near, far)
         panel.set_ylim(0.0, 100.0)
         panel.legend(fontsize=9, frameon=False, loc="upper left")
