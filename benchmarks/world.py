@@ -5,6 +5,7 @@ resident memory over time and its slope, objects that went through the table, th
 what became of every kind of action. Exit status 1 where something crashed, hung, fell through or jumped.
 
 Every five hundred are a line of the log. Started again with the same log, it goes on after the last line.
+`--robot sawyer --assets DIR` does the same with an arm, at an eighth of the stick's rate.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +31,10 @@ from envs.objects import ObjectRanges
 from envs.physics import TIME_STEP
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import ObservationDict, PushingEnv
+from envs.robots import ROBOTS
 from envs.scene import FALLEN, Observation, Scene
 from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, normalised_push
 
-CHUNK = 500
 EPISODE = 20  # pushes after which a scene is drawn anew, if it has not ended before
 EVERY = 5  # physics steps between two looks at the objects
 SPEED = 2.0  # metres per second, sideways or upwards; the tool goes at most 0.7
@@ -112,9 +114,9 @@ KINDS = ("NaN", "infinite", "out of range", "onto an object", "into the pile", "
 class World:
     """The environments that are reset and pushed in, one per task, and what was seen in them."""
 
-    def __init__(self) -> None:
-        ranges = ObjectRanges(clearance=0.1)
-        self.envs = [PushingEnv(task=task, layout="random", ranges=ranges) for task in TASK_NAMES]
+    def __init__(self, robot: str, assets: Path | None) -> None:
+        words: dict[str, Any] = {"layout": "random", "ranges": ObjectRanges(clearance=0.1), "robot": robot}
+        self.envs = [PushingEnv(task=task, assets=assets, **words) for task in TASK_NAMES]
         self.watches = [Watch(env.scene) for env in self.envs]
 
     def reset(self, number: int) -> tuple[PushingEnv, ObservationDict]:
@@ -167,7 +169,8 @@ def push_some(world: World, first: int, count: int, advance: Callable[[], Any], 
                 still = np.array_equal(before, env.scene.ground_truth().positions)
                 ends[f"{kind}: {'refused' if still and kind in ('NaN', 'infinite') else 'WRONG'}"] += 1
                 continue
-            accepted = "WRONG" if kind in ("NaN", "infinite") else "unsafe, not done" if info["unsafe"] else "done"
+            done = "unsafe, not done" if info["unsafe"] else info["stopped"] or "done"
+            accepted = "WRONG" if kind in ("NaN", "infinite") else done
             ends[f"{kind}: {accepted}"] += 1
             ends["objects off the table"] += info["fall"]
             if terminated:
@@ -190,13 +193,21 @@ def _hung(*_: object) -> None:
     raise TimeoutError(f"a reset or push took more than {PATIENCE:g} s of CPU time")
 
 
-def run(phase: str, some: Callable[..., Counter[str]], total: int, log: Path, lines: list[dict[str, Any]]) -> None:
+def run(
+    phase: str,
+    some: Callable[..., Counter[str]],
+    total: int,
+    log: Path,
+    lines: list[dict[str, Any]],
+    make_world: Callable[[], World],
+    chunk: int,
+) -> None:
     """Do what the log does not hold yet of one phase, chunk by chunk, in a world of its own."""
     done = sum(line["count"] for line in lines if line["phase"] == phase)
-    world, unit = World(), {"resets": "reset", "pushes": "push"}[phase]
+    world, unit = make_world(), {"resets": "reset", "pushes": "push"}[phase]
     with progress_bar(phase, total=total, initial=done, unit=unit) as bar:
         while done < total:
-            count, began, cpu = min(CHUNK, total - done), time.perf_counter(), time.process_time()
+            count, began, cpu = min(chunk, total - done), time.perf_counter(), time.process_time()
             ends = some(world, done, count, bar.update)
             signal.setitimer(signal.ITIMER_PROF, 0)
             line = {
@@ -251,18 +262,23 @@ def main() -> None:
     parser.add_argument("--resets", type=int, default=1000)
     parser.add_argument("--pushes", type=int, default=1000)
     parser.add_argument("--adversarial", type=float, default=0.25, help="share of the pushes that mean harm")
-    parser.add_argument("--log", type=Path, default=Path("runs/world.jsonl"))
+    parser.add_argument("--robot", default="stick", choices=list(ROBOTS))
+    parser.add_argument("--assets", type=Path, help="folder of the files that some robots need")
+    parser.add_argument("--chunk", type=int, default=500, help="resets or pushes per line of the log")
+    parser.add_argument("--log", type=Path, help="by default runs/world-ROBOT.jsonl")
     words = parser.parse_args()
+    words.log = words.log or Path("runs", f"world-{words.robot}.jsonl")
     words.log.parent.mkdir(parents=True, exist_ok=True)
     text = words.log.read_text(encoding="utf-8") if words.log.exists() else ""
     lines = [json.loads(line) for line in text.splitlines()]
     signal.signal(signal.SIGPROF, _hung)
-    run("resets", reset_some, words.resets, words.log, lines)
+    world = partial(World, words.robot, words.assets)
+    run("resets", reset_some, words.resets, words.log, lines, world, words.chunk)
 
     def push(*arguments: Any) -> Counter[str]:
         return push_some(*arguments, share=words.adversarial)
 
-    run("pushes", push, words.pushes, words.log, lines)
+    run("pushes", push, words.pushes, words.log, lines, world, words.chunk)
     well = [summary(phase, lines) for phase in ("resets", "pushes")]
     sys.exit(0 if all(well) else 1)
 

@@ -22,7 +22,7 @@ from envs.object_sets import BuiltinObjects, ObjectSet
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_draw_streams, sensor_stream
-from envs.robots import Stopped, push, robot_maker, settle
+from envs.robots import TIP_HEIGHT, Stopped, push, robot_maker, settle
 from envs.segmentation import Pixels, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
@@ -31,6 +31,7 @@ MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
 MOVED = 0.005  # metres; less motion than this counts as none
 TURNED = 0.1  # radians
 FRAME_STEPS = 10  # physics steps between two frames of a film
+TRAVEL_FRAME_STEPS = 40  # the same while the tool is in the air; an arm travels four fifths of the time
 FALLEN = -0.02  # metres; an object whose centre is lower has left the table
 DRAWS = 50  # scenes drawn before giving up on an acceptable one
 
@@ -289,7 +290,15 @@ class Scene:
         if self.on_frame is None:
             return None
         on_frame, steps = self.on_frame, count()
-        return lambda: on_frame() if next(steps) % FRAME_STEPS == 0 else None
+
+        def film() -> None:
+            number = next(steps)
+            if number % FRAME_STEPS == 0:
+                low = self.robot.tip()[2] < 2 * TIP_HEIGHT
+                if low or number % TRAVEL_FRAME_STEPS == 0:
+                    on_frame()
+
+        return film
 
     def _any_fallen(self) -> bool:
         return bool((self.ground_truth().positions[:, 2] < FALLEN).any())

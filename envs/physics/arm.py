@@ -94,6 +94,7 @@ class Arm:
         self._loaded = LoadedArm(world.client, description)
         self._client, self._table = world.client, world.table
         self.body = self._loaded.body
+        self.stand = [self._loaded.links[name] for name in description.stand]  # links that are not drawn
         for name in [*description.stand, *_without_picture(description.urdf)]:
             self._client.changeVisualShape(self.body, self._loaded.links[name], rgbaColor=INVISIBLE)
         for link in self._loaded.links.values():

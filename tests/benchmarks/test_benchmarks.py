@@ -50,3 +50,21 @@ def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(t
     assert "NaN: refused" in printed and "WRONG" not in printed
     counts = [json.loads(line)["count"] for line in (tmp_path / "world.jsonl").read_text().splitlines()]
     assert counts == [2, 10, 3, 30]
+
+
+def test_an_arm_outlives_pushes_that_mean_harm_and_its_memory_stays(tmp_path: Path) -> None:
+    words = ["--resets", "4", "--pushes", "12", "--adversarial", "0.7", "--robot", "panda"]
+    printed = run("world", *words, "--log", str(tmp_path / "world.jsonl"))
+    assert printed.count("0 jumps, 0 looks at an object inside the table") == 2 and "WRONG" not in printed
+    assert "12 pushes: " in printed and "heuristic: done" in printed and ": refused" in printed
+
+
+def test_the_robots_pushes_are_compared_with_the_sticks_and_drawn(tmp_path: Path) -> None:
+    file, pictures = tmp_path / "robots.json", tmp_path / "pictures"
+    run("robots", "--pushes", "5", "--robots", "panda", "--weights", "heavy", "--json", str(file))
+    found = json.loads(file.read_text())
+    assert list(found) == ["heavy, stick", "heavy, stick, beside", "heavy, panda"]
+    assert {one["apart"] for one in found["heavy, stick"]["objects"]} == {0.0}  # the same pushes of the same robot
+    assert max(found["heavy, panda"]["line"]) < 0.005
+    run("robots", "--read", str(file), "--robots", "panda", "--draw", str(pictures))
+    assert sorted(path.name for path in pictures.iterdir()) == ["robots-deviations.png", "robots.png"]

@@ -28,8 +28,8 @@ from envs.scene import Scene
 from envs.workspace import REACH_HIGH, REACH_LOW
 
 ROOT = Path(__file__).parents[2]
-ASSETS = Path(os.environ.get("CAVIN_PYRO_ASSETS", ROOT.parent / "shared" / "assets"))
-NO_SAWYER = "the Sawyer's URDF lies neither in ../shared/assets nor where CAVIN_PYRO_ASSETS says"
+ASSETS = Path(os.environ.get("CAVIN_ASSETS", ROOT.parent / "shared" / "assets"))
+NO_SAWYER = "the Sawyer's URDF lies neither in ../shared/assets nor where CAVIN_ASSETS says"
 with_sawyer = pytest.mark.skipif(not (ASSETS / "sawyer" / "sawyer_stick.urdf").is_file(), reason=NO_SAWYER)
 ARMS = [pytest.param("sawyer", marks=with_sawyer), "panda"]
 EVERY_ROBOT = [*ARMS, "stick"]
