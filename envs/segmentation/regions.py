@@ -20,6 +20,13 @@ CORE_AREA = 2.5e-4  # square metres of it that must be left
 HOLLOW_AREA = 7e-4  # square metres; the hollow of a vessel is larger, the eye of a handle smaller
 
 
+def box_around(region: Mask, margin: int) -> tuple[slice, slice]:
+    """The rectangle of cells around a region that is not empty, `margin` cells wider if the map goes on so far."""
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    row, column = (slice(max(0, int(side[0]) - margin), int(side[-1]) + 1 + margin) for side in (rows, columns))
+    return row, column
+
+
 def find_regions(heights: HeightMap) -> list[Mask]:
     """Connected regions [I, J] large enough to be objects; single empty cells do not part them.
 

@@ -15,11 +15,12 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from envs.segmentation.height_map import CELL, HeightMap, Mask
-from envs.segmentation.regions import AROUND, MINIMUM_AREA, nearest_owner
+from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_owner
 from envs.segmentation.splitting import HEIGHT_WEIGHT, Points, split_by_shapes
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
 INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
+INVADED_CELLS = 3  # how wide around it
 SAME_HEIGHT = 0.008  # metres
 FARTHEST = 0.5  # metres; no object goes farther between two images
 REACH = 0.03  # metres from a moved object's region within which a smaller one is taken for its other half
@@ -91,14 +92,16 @@ def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
 
     The second is for objects of one height that are pushed in a row: each then stands where the next one stood.
     """
-    core = ndimage.binary_erosion(track.region, AROUND)
-    core = core if core.any() else track.region
-    before, now = track.heights[core], heights[core]
+    box = box_around(track.region, INVADED_CELLS + 1)
+    region, former, latest = track.region[box], track.heights[box], heights[box]
+    core = ndimage.binary_erosion(region, AROUND)
+    core = core if core.any() else region
+    before, now = former[core], latest[core]
     # A cell without a measurement now and then says nothing.
     same = (np.abs(before - now) < SAME_HEIGHT).sum() >= STILL * (before > 0.0).sum()
-    around = ndimage.binary_dilation(track.region, AROUND, iterations=3) & (track.heights == 0.0)
-    around &= ~ndimage.binary_dilation(track.region, AROUND)
-    return bool(same and (heights[around] > 0.0).sum() <= INVADED * around.sum())
+    around = ndimage.binary_dilation(region, AROUND, iterations=INVADED_CELLS) & (former == 0.0)
+    around &= ~ndimage.binary_dilation(region, AROUND)
+    return bool(same and (latest[around] > 0.0).sum() <= INVADED * around.sum())
 
 
 def _match(
