@@ -2,7 +2,8 @@
 
 Under `camera=kinect2`, `segmentation=clusters` against the simulator's own mask of the same images. First single images
 of random scenes of 1 to 5 objects: the number of objects, and the distance between the centres that both give. Then
-episodes of the heuristic policy: whether every object keeps its place in the list from the first image to the last.
+episodes of the heuristic policy, from such scenes and from objects crowded together as when collecting: whether every
+object keeps its place in the list from the first image to the last.
 An episode in whose first image the number is wrong does not begin, as in `Scene.draw`.
 Results go to a file line by line (--log), from which a run that was stopped goes on. --pictures DIR draws what failed.
 """
@@ -12,29 +13,33 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, bootstrap
 
+from cavin_pyro.collection import crowd
 from cavin_pyro.progress import progress_bar
 from envs.objects import WHOLE_TABLE, ObjectRanges
 from envs.policy import HeuristicPushingPolicy
-from envs.scene import MINIMUM_PIXELS, Scene
+from envs.scene import MINIMUM_PIXELS, Observation, Scene
 from envs.segmentation import ClusterSegmenter, Pixels
 from envs.sensors import DepthImage
 
 SEED = 5
 PUSHES = 10
-Pictures = Callable[[str, DepthImage, np.ndarray, list[Pixels]], None]
+View = tuple[DepthImage, list[np.ndarray]]
+Pictures = Callable[[str, View, list[Pixels], list[Any]], None]  # the last: whose colour each place has
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=1000)
     parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--crowds", type=int, default=200)
     parser.add_argument("--log", type=Path, default=Path("runs/segmentation.jsonl"))
     parser.add_argument("--pictures", type=Path)
     words = parser.parse_args()
@@ -43,7 +48,11 @@ def main() -> None:
     scene = Scene(camera="kinect2", segmentation="mask")
     picture = draw_into(words.pictures) if words.pictures else lambda *_: None
     with open(words.log, "a", encoding="utf-8") as log:
-        for kind, count, run in (("scene", words.scenes, one_scene), ("episode", words.episodes, one_episode)):
+        for kind, count, run in (
+            ("scene", words.scenes, one_scene),
+            ("episode", words.episodes, one_episode),
+            ("crowd", words.crowds, partial(one_episode, crowded=True)),
+        ):
             known = {line["number"] for line in done if line["kind"] == kind}
             with progress_bar(kind + "s", total=count, initial=len(known), unit=kind) as bar:
                 for number in sorted(set(range(count)) - known):
@@ -55,16 +64,17 @@ def main() -> None:
     report(done)
 
 
-def begin(scene: Scene, number: int) -> tuple[np.random.Generator, Any]:
-    """Draw a scene of 1 to 5 objects anywhere on the table; each is seen by the camera."""
+def begin(scene: Scene, number: int, *, crowded: bool = False) -> tuple[np.random.Generator, Any]:
+    """Draw a scene of 1 to 5 objects anywhere on the table, or of 2 to 5 as close to each other as when collecting."""
     generator = np.random.default_rng([SEED, number])
-    count = int(generator.integers(1, 6))
-    return generator, scene.draw([WHOLE_TABLE] * count, ObjectRanges(), generator)
+    count = int(generator.integers(2 if crowded else 1, 6))
+    area, ranges = (crowd(generator), ObjectRanges(clearance=0.12)) if crowded else (WHOLE_TABLE, ObjectRanges())
+    return generator, scene.draw([area] * count, ranges, generator)
 
 
-def look(scene: Scene) -> tuple[DepthImage, list[np.ndarray]]:
+def look(scene: Scene) -> View:
     """A new image, and for each object the pixels that the simulator says are its own and have a measurement."""
-    image, scene._seen = scene.sensor.look(scene.world.render)
+    image = scene.look()
     return image, [mask & (image.depth > 0.0) for mask in scene.truth()]
 
 
@@ -80,9 +90,14 @@ def owners(found: list[Pixels], truth: list[np.ndarray]) -> list[int | None]:
 
 def one_scene(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
     begin(scene, number)
-    image, truth = look(scene)
+    view = look(scene)
+    return judge_scene(view, scene.point_at_target(view[0]), number, picture)
+
+
+def judge_scene(view: View, target: tuple[int, int] | None, number: int, picture: Pictures) -> dict[str, Any]:
+    image, truth = view
     began = time.process_time()
-    found = ClusterSegmenter().start(image, scene._point_at_target(image))
+    found = ClusterSegmenter().start(image, target)
     spent = time.process_time() - began
     named = owners(found, truth)
     seen = [body for body, mask in enumerate(truth) if mask.sum() >= MINIMUM_PIXELS]
@@ -95,43 +110,50 @@ def one_scene(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
             ]
             errors.append(float(np.linalg.norm(centers[0] - centers[1])))
     if not right:
-        picture(f"scene_{number}", image, np.array(truth), found)
-    names = [one.name for one in scene.objects]
-    return {"objects": len(seen), "right": right, "errors": errors, "names": names, "seconds": spent}
+        picture(f"scene {number}", view, found, list(range(len(found))))
+    return {"objects": len(seen), "right": right, "errors": errors, "seconds": spent}
 
 
-def one_episode(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
-    generator, seen = begin(scene, 10**6 + number)
+def one_episode(scene: Scene, number: int, picture: Pictures, *, crowded: bool = False) -> dict[str, Any]:
+    generator, seen = begin(scene, (2 if crowded else 1) * 10**6 + number, crowded=crowded)
     policy = HeuristicPushingPolicy(generator.spawn(1)[0])
+
+    def later(seen: Observation) -> Iterator[View]:
+        for _ in range(PUSHES):
+            fallen = scene.push(policy.act(seen)).fallen
+            seen = scene.observe()
+            yield look(scene)
+            if fallen:
+                return
+
+    view = look(scene)
+    name = f"{'crowd' if crowded else 'episode'} {number}"
+    return judge_episode(view, scene.point_at_target(view[0]), later(seen), name, picture)
+
+
+def judge_episode(
+    view: View, target: tuple[int, int] | None, later: Iterable[View], episode: str, picture: Pictures
+) -> dict[str, Any]:
     segmenter = ClusterSegmenter()
-    image, truth = look(scene)
-    named = first = owners(segmenter.start(image, scene._point_at_target(image)), truth)
-    if sorted(name for name in first if name is not None) != list(range(len(truth))):
+    first = owners(segmenter.start(view[0], target), view[1])
+    if sorted(name for name in first if name is not None) != list(range(len(view[1]))):
         return {"begun": False}
-    kept, counted, images, seconds = True, 0, 0, 0.0
-    for _ in range(PUSHES):
-        fallen = scene.push(policy.act(seen)).fallen
-        seen = scene.observe()
-        image, truth = look(scene)
+    kept, counted, seconds = True, 0, []
+    for image, truth in later:
         began = time.process_time()
         found = segmenter.follow(image)
-        seconds += time.process_time() - began
+        seconds.append(time.process_time() - began)
         named = owners(found, truth)
-        images += 1
-        visible = sum(mask.sum() >= MINIMUM_PIXELS for mask in truth)
-        counted += int(sum(name is not None for name in named) == visible)
+        counted += int(sum(name is not None for name in named) == sum(mask.sum() >= MINIMUM_PIXELS for mask in truth))
         lost = any(name not in (None, was) for name, was in zip(named, first, strict=True))
         if lost and kept:
-            picture(f"episode_{number}", image, np.array(truth), found)
+            picture(f"{episode} image {len(seconds)}", (image, truth), found, first)
         kept = kept and not lost
-        if fallen:
-            break
-    return {"begun": True, "kept": kept, "counted": counted, "images": images, "seconds": seconds}
+    return {"begun": True, "kept": kept, "counted": counted, "images": len(seconds), "seconds": seconds}
 
 
 def report(lines: list[dict[str, Any]]) -> None:
     scenes = [line for line in lines if line["kind"] == "scene"]
-    episodes = [line for line in lines if line["kind"] == "episode" and line["begun"]]
     if scenes:
         print(share("right number of objects", sum(line["right"] for line in scenes), len(scenes)))
         for count in range(1, 6):
@@ -145,11 +167,19 @@ def report(lines: list[dict[str, Any]]) -> None:
             f"centre error: median {np.median(errors):.2f} mm [{interval.low:.2f}, {interval.high:.2f}], at most {tail}"
         )
         print(f"CPU time: {1e3 * np.median([line['seconds'] for line in scenes]):.1f} ms for a first image")
-    if episodes:
-        print(share("identities kept over the episode", sum(line["kept"] for line in episodes), len(episodes)))
-        images = sum(line["images"] for line in episodes)
-        print(share("right number of objects in later images", sum(line["counted"] for line in episodes), images))
-        print(f"CPU time: {1e3 * sum(line['seconds'] for line in episodes) / images:.1f} ms for a later image")
+    for kind, where in (("episode", "anywhere"), ("crowd", "crowded")):
+        some = [line for line in lines if line["kind"] == kind]
+        begun = [line for line in some if line["begun"]]
+        if not begun:
+            continue
+        print(f"{where}: {len(begun)} of {len(some)} episodes begun")
+        print(share("identities kept over the episode", sum(line["kept"] for line in begun), len(begun)))
+        images = sum(line["images"] for line in begun)
+        print(share("right number of objects in later images", sum(line["counted"] for line in begun), images))
+        spent = 1e3 * np.concatenate([line["seconds"] for line in begun])
+        print(
+            f"CPU time of a later image: median {np.median(spent):.1f}, mean {spent.mean():.1f}, {spent.max():.0f} ms"
+        )
 
 
 def share(what: str, count: int, of: int) -> str:
@@ -165,19 +195,20 @@ def draw_into(folder: Path) -> Pictures:
 
     folder.mkdir(parents=True, exist_ok=True)
 
-    def picture(name: str, image: DepthImage, truth: np.ndarray, found: list[Pixels]) -> None:
+    def picture(name: str, view: View, found: list[Pixels], colors: list[Any]) -> None:
+        image, truth = view
         figure, panels = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
         panels[0].imshow(np.where(image.depth > 0, image.depth, np.nan), cmap="viridis_r", vmin=0.8, vmax=1.1)
         labels = np.full((2, *image.depth.shape), np.nan)
         for number, mask in enumerate(truth):
             labels[0][mask] = number
-        for number, pixels in enumerate(found):
-            labels[1][pixels] = number
+        for color, pixels in zip(colors, found, strict=True):
+            labels[1][pixels] = color
         for panel, label in zip(panels[1:], labels, strict=True):
             panel.imshow(label, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
         for panel, title in zip(panels, (f"{name}: depth", "mask (simulator)", "clusters (depth alone)"), strict=True):
             panel.set(title=title, xticks=[], yticks=[])
-        figure.savefig(folder / f"{name}.png", dpi=70)
+        figure.savefig(folder / f"{name.replace(' ', '_')}.png", dpi=70)
         pyplot.close(figure)
 
     return picture

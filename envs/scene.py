@@ -210,10 +210,10 @@ class Scene:
         began = time.process_time()
         if not self.robot.clear_of_view(self.camera):
             raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
-        image, self._seen = self.sensor.look(self.world.render)
+        image = self.look()
         rendered = time.process_time()
         if first:
-            found = self.segmenter.start(image, self._point_at_target(image))
+            found = self.segmenter.start(image, self.point_at_target(image))
             self._put_in_order(found)
         else:
             found = self.segmenter.follow(image)
@@ -231,11 +231,16 @@ class Scene:
         self.seconds["points"] += time.process_time() - segmented
         return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
 
+    def look(self) -> DepthImage:
+        """Take a depth image, and leave the clouds of the last observation as they are; `truth` then tells of it."""
+        image, self._seen = self.sensor.look(self.world.render)
+        return image
+
     def truth(self) -> list[NDArray[np.bool_]]:
         """The simulator's word on the latest image: the pixels [height, width] of each body. No robot has it."""
         return [self._seen == body for body in self.bodies]
 
-    def _point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
+    def point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
         """What a person does once, before an episode: point at the target in the image."""
         rows, columns = np.nonzero(self.truth()[0] & (image.depth > 0.0))
         if len(rows) < MINIMUM_PIXELS:

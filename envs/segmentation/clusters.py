@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from envs.segmentation.height_map import HeightMap, Mask, cells_of, map_heights
-from envs.segmentation.regions import AROUND, find_regions, split_at_necks
+from envs.segmentation.regions import AROUND, box_around, find_regions, split_at_necks
 from envs.segmentation.segmenter import Pixels
 from envs.segmentation.tracking import Track, follow_tracks
 from envs.sensors.sensor import DepthImage
@@ -78,12 +78,21 @@ def pixels_of(regions: list[Mask | None], heights: HeightMap) -> list[Pixels]:
             continue
         own = region[tuple(heights.cells.T)]
         pixels = rows[own], columns[own]
-        inside = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(region, 2), AROUND)[2:-2, 2:-2]) & ~region
+        inside = _inside(region) & ~region
         if inside.any() and len(pixels[0]):
             low = _floor(heights, inside, pixels)
             pixels = np.concatenate([pixels[0], low[0]]), np.concatenate([pixels[1], low[1]])
         found.append(pixels)
     return found
+
+
+def _inside(region: Mask) -> Mask:
+    """A region [I, J] with all that it encloses."""
+    filled = np.zeros_like(region)
+    if region.any():
+        box = box_around(region, 0)
+        filled[box] = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(region[box], 2), AROUND)[2:-2, 2:-2])
+    return filled
 
 
 def _floor(heights: HeightMap, inside: Mask, pixels: Pixels) -> Pixels:

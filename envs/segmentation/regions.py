@@ -11,21 +11,42 @@ from envs.segmentation.height_map import CELL, HeightMap, Mask
 AROUND = np.ones((3, 3), np.bool_)  # eight neighbours
 MINIMUM_AREA = 3e-4  # square metres; smaller things are noise (the smallest object covers 10e-4)
 MINIMUM_PIXELS = 30  # of such a region
+SLIVER_GAP = 2  # cells, at most, between a part and the object it belongs to
 NECK = 3  # cells, at most, that are taken off all around to see whether a region falls into parts
-PART_AREA = 10e-4  # square metres that each part must have
+PART_AREA = 15e-4  # square metres; what is smaller and beside something larger is its handle or its rim
 NARROW = 0.5  # of a part's own half width: a wider neck belongs to the object
 GAP_AREA = 1e-4  # square metres; smaller holes are lost measurements
 CORE_AREA = 2.5e-4  # square metres of it that must be left
 HOLLOW_AREA = 7e-4  # square metres; the hollow of a vessel is larger, the eye of a handle smaller
 
 
+def box_around(region: Mask, margin: int) -> tuple[slice, slice]:
+    """The rectangle of cells around a region that is not empty, `margin` cells wider if the map goes on so far."""
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    row, column = (slice(max(0, int(side[0]) - margin), int(side[-1]) + 1 + margin) for side in (rows, columns))
+    return row, column
+
+
 def find_regions(heights: HeightMap) -> list[Mask]:
-    """Connected regions [I, J] large enough to be objects; single empty cells do not part them."""
+    """Connected regions [I, J] large enough to be objects; single empty cells do not part them.
+
+    Slivers beside a larger region are the part of it that lost measurements at an edge have cut off, as a handle's.
+    """
     closed = ndimage.binary_closing(heights.occupied, AROUND) | heights.occupied
     labels, count = ndimage.label(closed, AROUND)
-    areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, count + 1)) * CELL**2
-    pixels = np.bincount(labels[tuple(heights.cells.T)], minlength=count + 1)[1:]
-    return [labels == 1 + number for number in np.flatnonzero((areas >= MINIMUM_AREA) & (pixels >= MINIMUM_PIXELS))]
+    areas = np.bincount(labels.ravel(), minlength=count + 1) * CELL**2
+    pixels = np.bincount(labels[tuple(heights.cells.T)], minlength=count + 1)
+    kept = (areas >= MINIMUM_AREA) & (pixels >= MINIMUM_PIXELS)
+    kept[0] = False  # the table
+    labels[~kept[labels]] = 0
+    whole = kept & (areas >= PART_AREA)
+    for sliver in np.flatnonzero(kept & ~whole):
+        beside = labels[ndimage.binary_dilation(labels == sliver, AROUND, iterations=SLIVER_GAP)]
+        beside = np.bincount(beside[whole[beside]], minlength=1)
+        if beside.any():
+            labels[labels == sliver] = beside.argmax()
+            kept[sliver] = False
+    return [labels == number for number in np.flatnonzero(kept)]
 
 
 def split_at_necks(region: Mask) -> list[Mask]:

@@ -15,13 +15,17 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from envs.segmentation.height_map import CELL, HeightMap, Mask
-from envs.segmentation.regions import AROUND, MINIMUM_AREA, nearest_owner
+from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_owner
 from envs.segmentation.splitting import HEIGHT_WEIGHT, Points, split_by_shapes
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
 INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
+INVADED_CELLS = 3  # how wide around it
 SAME_HEIGHT = 0.008  # metres
 FARTHEST = 0.5  # metres; no object goes farther between two images
+REMNANT = 0.1  # of an object's former area; less is not the object but what another one left over
+FRAGMENT, PENALTY = 0.4, 0.15  # a piece of less than this share is worth these metres less: a handle, say
+SHARED = 0.3  # of its own area by which a piece must exceed another object's for an object to hide in it too
 REACH = 0.03  # metres from a moved object's region within which a smaller one is taken for its other half
 
 
@@ -45,6 +49,11 @@ class Track:
     def center(self) -> NDArray[np.float64]:
         """Planar centre [2] in cells."""
         return np.argwhere(self.region).mean(axis=0)
+
+    @property
+    def area(self) -> int:
+        """In cells."""
+        return int(self.region.sum())
 
     def features(self) -> NDArray[np.float64]:
         """What stays alike as an object moves [2]: the root of its area, and its height; metres."""
@@ -91,14 +100,16 @@ def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
 
     The second is for objects of one height that are pushed in a row: each then stands where the next one stood.
     """
-    core = ndimage.binary_erosion(track.region, AROUND)
-    core = core if core.any() else track.region
-    before, now = track.heights[core], heights[core]
+    box = box_around(track.region, INVADED_CELLS + 1)
+    region, former, latest = track.region[box], track.heights[box], heights[box]
+    core = ndimage.binary_erosion(region, AROUND)
+    core = core if core.any() else region
+    before, now = former[core], latest[core]
     # A cell without a measurement now and then says nothing.
     same = (np.abs(before - now) < SAME_HEIGHT).sum() >= STILL * (before > 0.0).sum()
-    around = ndimage.binary_dilation(track.region, AROUND, iterations=3) & (track.heights == 0.0)
-    around &= ~ndimage.binary_dilation(track.region, AROUND)
-    return bool(same and (heights[around] > 0.0).sum() <= INVADED * around.sum())
+    around = ndimage.binary_dilation(region, AROUND, iterations=INVADED_CELLS) & (former == 0.0)
+    around &= ~ndimage.binary_dilation(region, AROUND)
+    return bool(same and (latest[around] > 0.0).sum() <= INVADED * around.sum())
 
 
 def _match(
@@ -111,11 +122,16 @@ def _match(
     seen = [Track(piece, heights) for piece in pieces]
     cost = np.array([[_cost(track, piece) for piece in seen] for track in known.values()])
     chosen = {list(known)[row]: column for row, column in zip(*linear_sum_assignment(cost), strict=True)}
+    chosen = {n: column for n, column in chosen.items() if seen[column].area >= REMNANT * known[n].area}
     groups: dict[int, list[int]] = {column: [number] for number, column in chosen.items()}
     for number in known:
         if number not in chosen:  # fewer pieces than objects: it must be in contact with another
-            row = list(known).index(number)
-            groups[int(cost[row].argmin())].append(number)
+            if not groups:
+                break
+            column = min(groups, key=cost[list(known).index(number)].__getitem__)
+            others = sum(known[other].area for other in groups[column])
+            if seen[column].area >= others + SHARED * known[number].area:  # if not, it has left the table
+                groups[column].append(number)
     found: dict[int, Mask] = {}
     for column, numbers in groups.items():
         found |= _divide(pieces[column], {number: known[number] for number in numbers}, heights)
@@ -130,7 +146,8 @@ def _match(
 
 def _cost(track: Track, piece: Track) -> float:
     distance = float(np.linalg.norm(track.center - piece.center)) * CELL
-    return min(distance, FARTHEST) + float(np.abs(track.features() - piece.features()).sum())
+    fragment = PENALTY if piece.area < FRAGMENT * track.area else 0.0
+    return min(distance, FARTHEST) + fragment + float(np.abs(track.features() - piece.features()).sum())
 
 
 def _divide(piece: Mask, tracks: dict[int, Track], heights: NDArray[np.float32]) -> dict[int, Mask]:

@@ -138,6 +138,22 @@ def test_an_object_is_known_again_where_it_was_pushed_and_when_it_comes_back_to_
     np.testing.assert_allclose([center(pushed, pixels)[:2] for pixels in back], second, atol=0.002)
 
 
+def test_what_has_left_the_table_is_not_looked_for_in_what_another_has_become() -> None:
+    before = table(CAMERA, (0.6, 0.1, 0.04, 0.03), (0.6, 0.25, 0.03, 0.05))
+    segmenter = ClusterSegmenter()
+    segmenter.start(before, pixel(before, 0.6, 0.1))
+    after = table(CAMERA, (0.6, 0.3, 0.03, 0.05))
+    gone, moved = segmenter.follow(after)
+    assert len(gone[0]) == 0
+    np.testing.assert_allclose(center(after, moved)[:2], (0.6, 0.3), atol=0.004)
+
+
+def test_a_handle_beside_a_body_is_part_of_it_and_a_like_thing_alone_is_an_object() -> None:
+    body, handle = (0.6, 0.1, 0.04, 0.04), (0.6, 0.156, 0.03, 0.01)
+    together, apart = table(CAMERA, body, handle), table(CAMERA, body, (0.6, 0.3, 0.03, 0.01))
+    assert [len(ClusterSegmenter().start(image, None)) for image in (together, apart)] == [2, 3]  # the target's place
+
+
 def test_objects_pushed_against_each_other_stay_two() -> None:
     apart = table(CAMERA, (0.6, 0.0, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
     touching = table(CAMERA, (0.6, 0.108, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
