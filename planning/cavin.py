@@ -11,21 +11,20 @@ from models.state import State
 from planning.bulk import in_bulk
 from planning.candidates import Search
 from planning.effects import choose_effects
-from planning.inputs import check_horizon, check_positive, check_weight
+from planning.inputs import check_weight
 from planning.levels import EffectLevel, MotionLevel
-from planning.memory import hints
 from planning.motions import Closeness, choose_motions
 from planning.optimisers import make_optimiser
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
 from planning.reachability import Reachability, most_reachable
-from planning.rewards import CumulativeReward, StrideLimits
 from planning.robustness import Robustness
+from planning.searching import SearchingPlanner
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
 
 
-class CavinPlanner:
+class CavinPlanner(SearchingPlanner):
     """First *what* to achieve (effect codes, ranked by reward), then *how* (motion codes, ranked by aim).
 
     model: h, g, f and their priors.
@@ -68,32 +67,21 @@ class CavinPlanner:
         horizon: int = 30,
         motion_horizon: str = "full_horizon",
         *,
-        optimizer: str = "shooting",
-        optimizer_options: Mapping[str, Any] | None = None,
         motion_optimizer: str | None = None,
         motion_optimizer_options: Mapping[str, Any] | None = None,
-        reward_at: str = "path",
-        stride_limits: Sequence[float] | None = None,
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
         robustness: Robustness | None = None,
         reachability: Reachability | None = None,
+        **options: Any,
     ) -> None:
-        check_positive("samples", samples)
-        check_horizon(horizon, model.segment_length)
+        super().__init__(model, reward, samples, horizon, **options)
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        self.effect_optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
-        self.motion_optimiser = self.effect_optimiser
+        self.motion_optimiser = self.optimiser
         if motion_optimizer is not None:
             self.motion_optimiser = make_optimiser(motion_optimizer, motion_optimizer_options, samples=samples)
-        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="segments")
-        self.effect_score = CumulativeReward(limited, reward_at)
-        self.model = model
-        self.reward = reward
-        self.samples = samples
-        self.segments = horizon // model.segment_length  # line 1: K = H / T
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
@@ -112,10 +100,7 @@ class CavinPlanner:
         # Lines 2, 3, 11 and 12 (repeat until the episode is done, execute, t = t + T) are the caller's.
         # Line 4, the new s_t, is what it was given.
         # Lines 5 to 7: choose the effect codes c* and their subgoals.
-        what = Search(
-            EffectLevel(self.model), self.effect_score, state, generators, self.segments, hints(previous, generators)
-        )
-        plans = self.effect_optimiser.optimise(what, self.samples)
+        plans = self.search(EffectLevel(self.model), state, generators, previous)
         chosen = None  # the highest return, as h predicts it
         if self.reachability is not None:
             chosen = most_reachable(self.reachability, plans, self.model, self.reward)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,17 +10,15 @@ import torch
 from models.state import State
 from planning import ranking
 from planning.bulk import in_bulk
-from planning.candidates import Candidates, Search
-from planning.inputs import check_horizon, check_positive
-from planning.memory import hints, remembered
-from planning.optimisers import make_optimiser
+from planning.candidates import Candidates
+from planning.memory import remembered
 from planning.plan import Plan
 from planning.protocol import PlanningModel, RewardFunction
-from planning.rewards import CumulativeReward, StrideLimits
+from planning.searching import SearchingPlanner
 from planning.segments import Level, pushes_of
 
 
-class PushSearch:
+class PushSearch(SearchingPlanner):
     """What CVAE-MPC and MPC share: everything but where pushes come from.
 
     level: makes the pushes of a segment, and predicts them with f. stride_limits: metres per push, as published
@@ -31,35 +29,18 @@ class PushSearch:
 
     has_codes = False  # whether what is searched are motion codes
 
-    def __init__(
-        self,
-        level: Level,
-        model: PlanningModel,
-        reward: RewardFunction,
-        samples: int = 1024,
-        horizon: int = 30,
-        *,
-        optimizer: str = "shooting",
-        optimizer_options: Mapping[str, Any] | None = None,
-        reward_at: str = "path",
-        stride_limits: Sequence[float] | None = None,
-    ) -> None:
-        """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
-        check_positive("samples", samples)
-        check_horizon(horizon, model.segment_length)
-        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
-        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="pushes")
-        self.score = CumulativeReward(limited, reward_at)
-        self.level, self.model = level, model
-        self.samples = samples
-        self.segments = horizon // model.segment_length  # K = H / T
+    strides = "pushes"
+
+    def __init__(self, level: Level, model: PlanningModel, reward: RewardFunction, **options: Any) -> None:
+        """`options`: of `SearchingPlanner`."""
+        super().__init__(model, reward, **options)
+        self.level = level
 
     @in_bulk
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
-        search = Search(self.level, self.score, state, generators, self.segments, hints(previous, generators))
-        return self._best(self.optimiser.optimise(search, self.samples))
+        return self._best(self.search(self.level, state, generators, previous))
 
     def _best(self, candidates: Candidates) -> Plan:
         progress = candidates.standing

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
 from models.state import State
 from planning.bulk import in_bulk
-from planning.candidates import Search
 from planning.effects import choose_effects
 from planning.following import follow
-from planning.inputs import HopelessEnvironmentError, check_horizon, check_positive
+from planning.inputs import HopelessEnvironmentError
 from planning.levels import EffectLevel
-from planning.memory import hints
-from planning.optimisers import make_optimiser
 from planning.plan import Plan
-from planning.protocol import PlanningModel, RewardFunction
-from planning.rewards import CumulativeReward, StrideLimits
+from planning.searching import SearchingPlanner
 
 
-class SectarPlanner:
+class SectarPlanner(SearchingPlanner):
     """Effect codes ranked by reward, as in `CavinPlanner`; the pushes are what g makes of the chosen code alone.
 
     There is no motion code to choose, so lines 8 to 10 of Algorithm 1 come down to a = g(s, c*). f is asked only
@@ -35,36 +31,12 @@ class SectarPlanner:
     lacks = ("motion_prior",)
     usual_model = "single_latent"
 
-    def __init__(
-        self,
-        model: PlanningModel,
-        reward: RewardFunction,
-        samples: int = 1024,
-        horizon: int = 30,
-        *,
-        optimizer: str = "shooting",
-        optimizer_options: Mapping[str, Any] | None = None,
-        reward_at: str = "path",
-        stride_limits: Sequence[float] | None = None,
-    ) -> None:
-        check_positive("samples", samples)
-        check_horizon(horizon, model.segment_length)
-        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
-        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of="segments")
-        self.score = CumulativeReward(limited, reward_at)
-        self.model = model
-        self.samples = samples
-        self.segments = horizon // model.segment_length  # line 1: K = H / T
-
     @in_bulk
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
-        search = Search(
-            EffectLevel(self.model), self.score, state, generators, self.segments, hints(previous, generators)
-        )
-        effects = choose_effects(self.optimiser.optimise(search, self.samples))
+        effects = choose_effects(self.search(EffectLevel(self.model), state, generators, previous))
         # Lines 8 to 10 without motion codes: the pushes of the first segment, all that is executed.
         here = state.expand_plans(1)
         generate: Any = self.model.actions  # of a model whose g reads no motion code

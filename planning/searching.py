@@ -1,0 +1,56 @@
+"""What every planner that searches takes, checked in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+
+from models.state import State
+from planning.candidates import Candidates, Search
+from planning.inputs import check_horizon, check_positive
+from planning.memory import hints
+from planning.optimisers import make_optimiser
+from planning.plan import Plan
+from planning.protocol import PlanningModel, RewardFunction
+from planning.rewards import CumulativeReward, StrideLimits
+from planning.segments import Level
+
+
+class SearchingPlanner:
+    """N = `samples` plans of K = `horizon` / T segments, searched by an optimiser for the highest cumulative reward.
+
+    Algorithm 1, line 1, and the options of the search: see `planning.cavin.CavinPlanner`, which names them all.
+    """
+
+    strides: ClassVar[str] = "segments"  # what `stride_limits` limits, or "pushes"
+
+    def __init__(
+        self,
+        model: PlanningModel,
+        reward: RewardFunction,
+        samples: int = 1024,
+        horizon: int = 30,
+        *,
+        optimizer: str = "shooting",
+        optimizer_options: Mapping[str, Any] | None = None,
+        reward_at: str = "path",
+        stride_limits: Sequence[float] | None = None,
+    ) -> None:
+        """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
+        check_positive("samples", samples)
+        check_horizon(horizon, model.segment_length)
+        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
+        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of=self.strides)
+        self.score = CumulativeReward(limited, reward_at)
+        self.model, self.reward = model, reward
+        self.samples = samples
+        self.segments = horizon // model.segment_length  # line 1: K = H / T
+
+    def search(
+        self, level: Level, state: State, generators: Sequence[torch.Generator], previous: Plan | None
+    ) -> Candidates:
+        """All plans that were considered for the scenes `state: [B]`, with what is left of the `previous` ones."""
+        wanted = Search(level, self.score, state, generators, self.segments, hints(previous, generators))
+        return self.optimiser.optimise(wanted, self.samples)
