@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,8 @@ import pytest
 import torch
 import trimesh
 from hypothesis import settings
+
+from tests.real_assets import REAL_ASSETS
 
 # Other processes may hold the machine up: how long an example takes says nothing.
 settings.register_profile("cavin_pyro", deadline=None)
@@ -24,9 +25,6 @@ def products_round_as_before() -> Iterator[None]:
     precision = torch.get_float32_matmul_precision()
     yield
     torch.set_float32_matmul_precision(precision)
-
-
-REAL_ASSETS = Path(os.environ.get("CAVIN_ASSETS", Path(__file__).resolve().parents[2] / "shared" / "assets"))
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from itertools import combinations, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,9 +22,8 @@ from cavin_pyro.setups import set_up
 from cavin_pyro.worlds import CHOICES
 from envs.layouts import TASK_NAMES
 from envs.pushing import PushingEnv
+from tests.real_assets import REAL_ASSETS
 
-ROOT = Path(__file__).resolve().parents[2]
-ASSETS = Path(os.environ.get("CAVIN_ASSETS", ROOT.parent / "shared" / "assets"))
 World = dict[str, str]
 
 
@@ -53,12 +51,12 @@ WORLDS = every_world() if os.environ.get("CAVIN_EVERY_WORLD") else covering(ever
 @pytest.fixture(params=WORLDS, ids=lambda world: "-".join(world.values()))
 def env(request: pytest.FixtureRequest, configure: Any) -> Iterator[PushingEnv]:
     words = [f"{word}={value}" for word, value in request.param.items()]
-    assets = [f"env.assets={ASSETS}"] if ASSETS.is_dir() else []
+    assets = [f"env.assets={REAL_ASSETS}"] if REAL_ASSETS.is_dir() else []
     try:
         setup = set_up(configure("planner=random", *words, *assets), render=True)
     except UserError as error:
         if "assets" in str(error) and not assets:
-            pytest.skip(f"no meshes at {ASSETS}, set CAVIN_ASSETS to their folder: {error}")
+            pytest.skip(f"no meshes at {REAL_ASSETS}, set CAVIN_ASSETS to their folder: {error}")
         raise
     yield setup.env
     setup.env.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -26,11 +25,11 @@ from envs.robots.robot import ABOVE_HEIGHT
 from envs.robots.sawyer import sawyer
 from envs.scene import Scene
 from envs.workspace import REACH_HIGH, REACH_LOW
+from tests.real_assets import REAL_ASSETS
 
 ROOT = Path(__file__).parents[2]
-ASSETS = Path(os.environ.get("CAVIN_ASSETS", ROOT.parent / "shared" / "assets"))
 NO_SAWYER = "the Sawyer's URDF lies neither in ../shared/assets nor where CAVIN_ASSETS says"
-with_sawyer = pytest.mark.skipif(not (ASSETS / "sawyer" / "sawyer_stick.urdf").is_file(), reason=NO_SAWYER)
+with_sawyer = pytest.mark.skipif(not (REAL_ASSETS / "sawyer" / "sawyer_stick.urdf").is_file(), reason=NO_SAWYER)
 ARMS = [pytest.param("sawyer", marks=with_sawyer), "panda"]
 EVERY_ROBOT = [*ARMS, "stick"]
 CAMERAS = [Camera(position=(x, y, z)) for x in (0.55, 0.65) for y in (-0.05, 0.05) for z in (0.95, 1.05)]
@@ -39,7 +38,7 @@ CAMERAS = [Camera(position=(x, y, z)) for x in (0.55, 0.65) for y in (-0.05, 0.0
 @pytest.fixture(scope="module")
 def scene_of() -> Callable[[str], Scene]:
     made: dict[str, Scene] = {}
-    yield lambda name: made.setdefault(name, Scene(robot=name, assets=ASSETS))
+    yield lambda name: made.setdefault(name, Scene(robot=name, assets=REAL_ASSETS))
     for scene in made.values():
         scene.close()
 
@@ -117,7 +116,7 @@ def test_the_arm_is_in_the_photograph_of_a_push_and_never_in_the_image_that_is_o
         during.append(drawn(scene))
         photographs.append(scene.photograph(scene.camera))
 
-    scene = Scene(robot=name, assets=ASSETS)
+    scene = Scene(robot=name, assets=REAL_ASSETS)
     scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
     arm, without = scene.robot.arm.body, scene.photograph(scene.camera)
     assert arm not in drawn(scene)
@@ -238,7 +237,7 @@ def test_whatever_stops_a_push_the_robot_goes_up_and_off_stage(verb: str) -> Non
 @settings(max_examples=60)
 @given(st.floats(REACH_LOW[0], REACH_HIGH[0]), st.floats(REACH_LOW[1], REACH_HIGH[1]))
 def test_the_sawyer_reaches_every_place_and_holds_the_stick_upright(x: float, y: float) -> None:
-    inverse = inverse_kinematics(sawyer(ASSETS))
+    inverse = inverse_kinematics(sawyer(REAL_ASSETS))
     for height in (TIP_HEIGHT, ABOVE_HEIGHT):
         angles = inverse.angles(np.array([x, y, height]))
         assert angles is not None
@@ -259,7 +258,7 @@ def test_the_panda_reaches_nine_tenths_of_the_table_and_says_where_it_does_not()
 
 @pytest.mark.parametrize("name", ARMS)
 def test_the_answer_does_not_depend_on_what_was_asked_before(name: str) -> None:
-    description = panda() if name == "panda" else sawyer(ASSETS)
+    description = panda() if name == "panda" else sawyer(REAL_ASSETS)
     places = np.random.default_rng(0).uniform((0.3, -0.4, 0.0), (0.6, 0.4, 0.2), size=(10, 3))
     one, other = (type(inverse_kinematics(description))(description) for _ in range(2))
     forwards = [one.angles(place) for place in places]
@@ -301,14 +300,14 @@ def test_a_urdf_of_something_else_is_refused(tmp_path: Path, capfd: pytest.Captu
 
 @pytest.mark.parametrize("name", ARMS)
 def test_gymnasium_finds_nothing_wrong_with_an_arm(name: str) -> None:
-    env = gymnasium.make("cavin/Crossing-v0", robot=name, assets=str(ASSETS), objects=2, render_mode="rgb_array")
+    env = gymnasium.make("cavin/Crossing-v0", robot=name, assets=str(REAL_ASSETS), objects=2, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.close()
 
 
 def episode(name: str) -> bytes:
     """Everything that fixed actions show."""
-    env, seen = PushingEnv(robot=name, assets=ASSETS, objects=3), b""
+    env, seen = PushingEnv(robot=name, assets=REAL_ASSETS, objects=3), b""
     actions = np.random.default_rng(0).uniform(-0.6, 0.6, size=(3, 4)).astype(np.float32)
     first, _ = env.reset(seed=1)
     for observed in (first, *(env.step(action)[0] for action in actions)):
