@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.dataset import read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.errors import UserError
+from cavin_pyro.holding_out import hold_out
 from models.pointnet import PointNet
 
 BATCH = 4096  # clouds
@@ -57,20 +59,33 @@ def shard_features(folder: Path, number: int, pointnet: PointNet, mark: str) -> 
     return features
 
 
-def sample_clouds(folder: Path, *, count: int, generator: np.random.Generator) -> NDArray[np.float32]:
+def sample_clouds(
+    folder: Path, *, count: int, generator: np.random.Generator, without: Sequence[str] = ()
+) -> NDArray[np.float32]:
     """Draw clouds [count, 256, 3] metres from a dataset, from as many shards as it takes, real objects only.
 
+    Args:
+        without: names of objects that are not to be among them.
+
     Raises:
-        UserError: no dataset, or a corrupt shard.
+        UserError: no dataset, a corrupt shard, an object that the dataset does not know, or too few clouds are left.
     """
+    held_out = hold_out(without, folder, word="without")
     shards = read_metadata(folder)["shards"]
     chosen = generator.permutation(shards)[: max(1, min(shards, 100))]
     each = -(-count // len(chosen))
     drawn = []
     for number in sorted(chosen):
-        arrays = read_shard(shard_path(folder, int(number)), ("clouds", "visible", "length"))
+        arrays = read_shard(shard_path(folder, int(number)), ("clouds", "visible", "length", *held_out.needs))
         steps = np.arange(arrays["visible"].shape[1])
         real = arrays["visible"] & (steps[None, :, None] <= arrays["length"][:, None, None])
+        if held_out.numbers:
+            real &= ~held_out.lying(arrays)[:, None]
         clouds = arrays["clouds"][real]
         drawn.append(clouds[generator.permutation(len(clouds))[:each]].astype(np.float32))
-    return np.concatenate(drawn)[:count]
+    clouds = np.concatenate(drawn)[:count]
+    if len(clouds) < min(count, 2):  # one to learn from and one to validate with
+        raise UserError(
+            f"dataset {folder} has {len(clouds)} clouds without {', '.join(without)}: hold out fewer objects"
+        )
+    return clouds

@@ -33,7 +33,12 @@ def main(config: DictConfig) -> None:
     check_sizes("autoencoder", config.autoencoder)
     torch.manual_seed(config.seed)
     autoencoder = construct(config.autoencoder)
-    clouds = sample_clouds(Path(config.data), count=config.clouds, generator=np.random.default_rng(config.seed))
+    clouds = sample_clouds(
+        Path(config.data),
+        count=config.clouds,
+        generator=np.random.default_rng(config.seed),
+        without=config.without,
+    )
     folder = output_folder(config.output)
     settings = write_config(folder, config)
     losses = pretrain(

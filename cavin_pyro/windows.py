@@ -15,8 +15,8 @@ from torch import Tensor
 from cavin_pyro.dataset import Arrays, iterate_shards, read_metadata
 from cavin_pyro.errors import UserError
 from cavin_pyro.features import fingerprint, shard_features
+from cavin_pyro.holding_out import hold_out
 from cavin_pyro.progress import progress_bar
-from envs.object_asset import plain_name
 from models.pointnet import PointNet
 from models.state import State, Window
 
@@ -110,37 +110,16 @@ def load_windows(
             + ", ".join(f"{folder} has steps={steps}" for folder, steps in lengths.items())
         )
     names: tuple[str, ...] = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")
-    if settings.without:
-        names = (*names, "shape", "scale")
     total = sum(read_metadata(folder)["shards"] for folder in folders)
     with progress_bar("reading", total=total, unit="file") as bar:
         for folder in folders:
-            held_out = _numbers_of(settings.without, folder)
-            for number, arrays in iterate_shards(folder, names, skip_corrupt=skip_corrupt):
+            held_out = hold_out(settings.without, folder, word="windows.without")
+            for number, arrays in iterate_shards(folder, (*names, *held_out.needs), skip_corrupt=skip_corrupt):
                 arrays["features"] = shard_features(folder, number, pointnet, mark)
-                shards.append(_without(arrays, held_out))
+                shards.append(held_out.without(arrays))
                 bar.update()
     episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in shards[0]}
     return _find_windows(episodes, settings, " and ".join(str(folder) for folder in folders))
-
-
-def _numbers_of(names: Sequence[str], folder: Path) -> list[int]:
-    """Under which numbers a dataset knows objects of these names."""
-    known = read_metadata(folder).get("shape_names", []) if names else []
-    for name in names:
-        if name not in map(plain_name, known):
-            valid = ", ".join(dict.fromkeys(map(plain_name, known)))
-            raise UserError(f"unknown object {name!r} in windows.without: {folder} has {valid}")
-    return [number for number, name in enumerate(known) if plain_name(name) in names]
-
-
-def _without(arrays: Arrays, held_out: Sequence[int]) -> Arrays:
-    """The episodes of a shard without certain objects."""
-    if not held_out:
-        return arrays
-    lies_there = arrays["scale"] > 0  # padding has none
-    kept = ~(np.isin(arrays["shape"], held_out) & lies_there).any(axis=-1)
-    return {name: array[kept] for name, array in arrays.items()}
 
 
 def _find_windows(episodes: Arrays, settings: WindowSettings, folder: str) -> WindowTable:

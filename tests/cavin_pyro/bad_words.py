@@ -168,6 +168,8 @@ BAD_WORDS = [
     ("train", "windows.maximum_step=-1", "windows.maximum_step must be at least 0, not -1"),
     ("train", "windows.minimum_move=9", "no training window in which an object moved more than 9 m"),
     ("train", "windows.validation_fraction=0", "no validation window"),
+    ("pretrain", "without=[fork]", "unknown object 'fork' in without: "),
+    ("train", "windows.without=fork", "windows.without must be a list, not fork"),
     ("train", "windows.without=[fork]", "unknown object 'fork' in windows.without: "),
     ("train", "model.segment_length=9", "6 pushes per episode, too few for windows of T=9"),
     ("train", "model.maximum_objects=3", "model.maximum_objects=3, but datasets have room for 5"),

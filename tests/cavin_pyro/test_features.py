@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from cavin_pyro import features
-from cavin_pyro.dataset import read_shard, shard_path
+from cavin_pyro.dataset import read_metadata, read_shard, shard_path
 from cavin_pyro.errors import UserError
 from cavin_pyro.features import cloud_features, fingerprint, sample_clouds, shard_features
+from envs.shapes import BUILTIN_NAMES
 from models.pointnet import PointNet
 
 
@@ -104,3 +106,24 @@ def test_clouds_come_from_all_shards(pushes: Path) -> None:
     for number in range(3):
         clouds = read_shard(shard_path(pushes, number))["clouds"].astype(np.float32).reshape(-1, 256, 3)
         assert sum((clouds == cloud).all(axis=(1, 2)).any() for cloud in drawn) == 10
+
+
+def test_clouds_of_objects_that_are_held_out_are_not_drawn(pushes: Path) -> None:
+    shards = [read_shard(shard_path(pushes, number), ("clouds", "shape", "mask")) for number in range(3)]
+    shape = np.concatenate([arrays["shape"][arrays["mask"]] for arrays in shards])
+    commonest = int(np.bincount(shape).argmax())
+    name = read_metadata(pushes)["shape_names"][commonest]
+    clouds = np.concatenate([arrays["clouds"].astype(np.float32).swapaxes(1, 2)[arrays["mask"]] for arrays in shards])
+
+    def shapes_of(drawn: NDArray[np.float32]) -> set[int]:
+        return {int(shape[(clouds == cloud).all(axis=(-1, -2)).any(axis=-1)][0]) for cloud in drawn}
+
+    assert commonest in shapes_of(sample_clouds(pushes, count=60, generator=np.random.default_rng(0)))
+    others = sample_clouds(pushes, count=60, generator=np.random.default_rng(0), without=[name])
+    assert len(others) == 60
+    assert commonest not in shapes_of(others)
+
+
+def test_holding_out_everything_leaves_nothing_to_learn_from(pushes: Path) -> None:
+    with pytest.raises(UserError, match=r"has 0 clouds without sugar_box, .*: hold out fewer objects"):
+        sample_clouds(pushes, count=5, generator=np.random.default_rng(0), without=BUILTIN_NAMES)
