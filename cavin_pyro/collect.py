@@ -9,10 +9,15 @@ from cavin_pyro.command import command
 
 @command("collect")
 def main(config: DictConfig) -> None:
-    """Collect random pushes by the heuristic policy into a dataset folder; resumes what was interrupted."""
+    """Collect random pushes by the heuristic policy into a dataset folder, and draw what they came to.
+
+    Resumes what was interrupted.
+    """
     from cavin_pyro.collection import CollectionSettings, collect, repair
+    from cavin_pyro.data_summary import summarise_data
     from cavin_pyro.errors import UserError, at_least, check_seed, fraction
-    from cavin_pyro.files import output_folder
+    from cavin_pyro.figures_data import draw_data
+    from cavin_pyro.files import output_folder, write_json
     from cavin_pyro.worlds import check_world, object_ranges
     from envs.workspace import MAXIMUM_OBJECTS
 
@@ -48,6 +53,9 @@ def main(config: DictConfig) -> None:
     if config.repair:
         print(f"{repair(settings, folder)} files collected again")
     metadata = collect(settings, folder, transitions=config.transitions, workers=config.workers)
+    summary = summarise_data(folder)
+    write_json(folder / "statistics.json", summary.figures())
+    draw_data(folder / "statistics.png", summary)
     print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
 
 

@@ -23,8 +23,9 @@ from envs.shapes import BUILTIN_NAMES
 
 
 def data_of(folder: Path) -> dict[str, bytes]:
-    """What must not depend on the machine: all that collection writes but the record of how long each took."""
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file() and path.name != "timing.csv"}
+    """What must not depend on the machine: the data, without the record of how long each took and the summary."""
+    apart = ("timing.csv", "statistics.json", "statistics.png")
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file() and path.name not in apart}
 
 
 def test_a_run_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace, tmp_path: Path) -> None:
