@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from cavin_pyro.collection import CollectionSettings, collect
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -35,10 +37,25 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
 
 
 def test_collection_tells_where_its_time_goes() -> None:
-    printed = run("collection", "12")
+    printed = run("collection", "--transitions", "12", "--camera", "kinect2")
     shares = [float(share) for share in re.findall(r"([\d.]+) %", printed)]
     # Physics, rendering, segmentation, points, writing, rest.
     assert len(shares) == 6 and sum(shares) == pytest.approx(100, abs=0.5)
+
+
+def test_a_dataset_tells_where_the_time_went_that_it_took(tmp_path: Path) -> None:
+    collect(CollectionSettings(steps=2, episodes_per_shard=2), tmp_path, transitions=6, workers=1)
+    (tmp_path / "timing.csv").write_text(
+        "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
+        "0,4,9.0,9.0,0.0,0.0,0.0\n"
+        "0,4,0.4,0.2,0.1,0.05,0.01\n"  # collected again
+        "1,4,0.4,0.2,0.1,0.05,0.01\n"
+    )
+    lines = run("collection", "--data", str(tmp_path)).splitlines()
+    assert lines[0] == "8 transitions in 2 files"
+    assert lines[1].startswith("100.00 ms of CPU time and ")
+    shares = [line.split()[-2] for line in lines[2:-1]]
+    assert shares == ["50.0", "25.0", "12.5", "2.5", "10.0"]
 
 
 def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
