@@ -24,8 +24,9 @@ from scipy.stats import binomtest, bootstrap
 from cavin_pyro.collection import crowd
 from cavin_pyro.progress import progress_bar
 from envs.objects import WHOLE_TABLE, ObjectRanges
+from envs.observation import MINIMUM_PIXELS, Observation
 from envs.policy import HeuristicPushingPolicy
-from envs.scene import MINIMUM_PIXELS, Observation, Scene
+from envs.scene import Scene
 from envs.segmentation import ClusterSegmenter, Pixels
 from envs.sensors import DepthImage
 

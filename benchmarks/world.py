@@ -28,11 +28,12 @@ from numpy.typing import NDArray
 from cavin_pyro.progress import progress_bar
 from envs.layouts import TASK_NAMES
 from envs.objects import ObjectRanges
+from envs.observation import Observation
 from envs.physics import TIME_STEP
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import ObservationDict, PushingEnv
 from envs.robots import ROBOTS
-from envs.scene import FALLEN, Observation, Scene
+from envs.scene import FALLEN, Scene
 from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, normalised_push
 
 EPISODE = 20  # pushes after which a scene is drawn anew, if it has not ended before

@@ -18,9 +18,10 @@ from cavin_pyro.errors import UserError, user_input
 from cavin_pyro.progress import progress_bar
 from envs.object_sets import load_object_set
 from envs.objects import WHOLE_TABLE, Area, ObjectRanges
+from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
-from envs.scene import Observation, PushReport, Scene
+from envs.scene import PushReport, Scene
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
 CROWD_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are drawn from this range

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.observation import Observation
 from envs.robots import STICK_RADIUS
-from envs.scene import Observation
 from envs.workspace import normalised_push, push_endpoints
 
 CANDIDATES = 2048  # pushes drawn at once

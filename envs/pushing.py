@@ -17,9 +17,10 @@ from envs.markings import tile_groups
 from envs.object_asset import plain_name
 from envs.object_sets import load_object_set
 from envs.objects import Area, ObjectRanges
+from envs.observation import Observation
 from envs.random_layouts import possible_layouts
 from envs.randomness import layout_stream, next_scene_stream
-from envs.scene import Observation, Scene
+from envs.scene import Scene
 from envs.sensors import DepthSensor
 from envs.tasks import GOAL_REWARD, TIME_REWARD, VIOLATION_REWARD, Outcome, TaskReward
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center

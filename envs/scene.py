@@ -16,18 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.camera import Camera, sample_cloud
+from envs.camera import Camera
 from envs.markings import LEVEL, TileGroup, paint_tiles
 from envs.object_sets import BuiltinObjects, ObjectSet
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
+from envs.observation import MINIMUM_PIXELS, LastSeen, Observation
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_draw_streams, sensor_stream
 from envs.robots import TIP_HEIGHT, Stopped, push, robot_maker, settle
 from envs.segmentation import Pixels, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
+from envs.workspace import MAXIMUM_OBJECTS, push_endpoints
 
-MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
 MOVED = 0.005  # metres; less motion than this counts as none
 TURNED = 0.1  # radians
 FRAME_STEPS = 10  # physics steps between two frames of a film
@@ -40,22 +40,6 @@ FrameHook = Callable[[], None]
 
 # The target is orange; obstacles are cool colours.
 COLORS = ((0.93, 0.42, 0.10), *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in (0.58, 0.45, 0.72, 0.33)))
-
-
-@dataclass(frozen=True)
-class Observation:
-    """What the camera tells of the table, padded to `MAXIMUM_OBJECTS` (M) objects.
-
-    Attributes:
-        clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of each cloud.
-        mask: [M] bool, True for objects seen at least once.
-        visible: [M] bool, True for objects in this image; an object hidden in it keeps the cloud last seen.
-    """
-
-    clouds: NDArray[np.float32]
-    centers: NDArray[np.float32]
-    mask: NDArray[np.bool_]
-    visible: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -160,10 +144,8 @@ class Scene:
         self.bodies = [self._add(one, color) for one, color in zip(objects, COLORS, strict=False)]
         self.robot = self._make_robot(self.world)
         settle(self.world, self.robot, self.bodies, limit=720)
-        self._points = point_generator
         self.sensor.reset(sensor_stream(point_generator))
-        self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
-        self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
+        self._last_seen = LastSeen(point_generator)
         self.seconds["physics"] += time.process_time() - began
         return self._observe(first=True)
 
@@ -218,18 +200,11 @@ class Scene:
         else:
             found = self.segmenter.follow(image)
         segmented = time.process_time()
-        visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
-        for slot, (rows, columns) in enumerate(found):
-            if len(rows) >= MINIMUM_PIXELS:
-                points = image.camera.points(image.depth, rows, columns)
-                self._clouds[slot] = sample_cloud(points, POINTS_PER_OBJECT, self._points)
-                visible[slot] = True
-        self._mask |= visible
-        centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
+        observation = self._last_seen.update(image, found)
         self.seconds["rendering"] += rendered - began
         self.seconds["segmentation"] += segmented - rendered
         self.seconds["points"] += time.process_time() - segmented
-        return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
+        return observation
 
     def look(self) -> DepthImage:
         """Take a depth image, and leave the clouds of the last observation as they are; `truth` then tells of it."""

@@ -17,7 +17,8 @@ from torch import Tensor
 from cavin_pyro.collection import CollectionSettings, crowd
 from cavin_pyro.criticism.section import Subject
 from cavin_pyro.episodes import observed_state
-from envs.scene import Observation, Scene
+from envs.observation import Observation
+from envs.scene import Scene
 from envs.workspace import REACH_HIGH, REACH_LOW
 from models.state import State
 from planning.ranking import squared_distance

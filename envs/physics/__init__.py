@@ -3,7 +3,8 @@
 from envs.physics.arm import Arm, ArmDescription
 from envs.physics.bullet import PYBULLET_DATA
 from envs.physics.kinematics import Kinematics
-from envs.physics.world import TIME_STEP, PhysicsWorld, Poses, Rendering, Visual
+from envs.physics.visuals import Poses, Visual
+from envs.physics.world import TIME_STEP, PhysicsWorld
 
 __all__ = [
     "PYBULLET_DATA",
@@ -13,6 +14,5 @@ __all__ = [
     "Kinematics",
     "PhysicsWorld",
     "Poses",
-    "Rendering",
     "Visual",
 ]

@@ -6,16 +6,16 @@ velocity are set before every step, so that contacts are solved as with an arm t
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera import FAR, NEAR, Camera
+from envs.camera import Camera
 from envs.physics.bullet import BulletClient, connect, pybullet
+from envs.physics.rendering import render
+from envs.physics.visuals import Poses, Visual, link_poses, visuals
 from envs.sensors.sensor import Rendering
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
@@ -32,40 +32,6 @@ TOOL_MASS = 100.0  # kilograms; so heavy that no contact changes its velocity wi
 ROLLING_FRICTION = 0.003  # metres; stops cans and cups that lie on their side, as a cloth does
 SPINNING_FRICTION = 0.003  # metres
 ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Where bodies are, in truth.
-
-    Attributes:
-        positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
-    """
-
-    positions: NDArray[np.float64]
-    orientations: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Visual:
-    """One shape of a body as it is seen, for those who draw the world themselves.
-
-    Attributes:
-        body, link: numbers; link -1 is the body's base. kind: mesh, box, cylinder, sphere or capsule.
-        sizes: a mesh's factors on (x, y, z); a box's sides; a cylinder's or capsule's length and radius; a sphere's
-            radius; metres. mesh: the file, of a mesh only.
-        position: [3] metres and orientation: [4] unit quaternion (x, y, z, w), in the link's frame.
-        color: red, green, blue, opacity in [0, 1].
-    """
-
-    body: int
-    link: int
-    kind: str
-    sizes: tuple[float, ...]
-    mesh: Path | None
-    position: tuple[float, ...]
-    orientation: tuple[float, ...]
-    color: tuple[float, ...]
 
 
 class PhysicsWorld:
@@ -211,38 +177,11 @@ class PhysicsWorld:
 
     def visuals(self) -> list[Visual]:
         """What every body in the world looks like."""
-        kinds = {
-            pybullet.GEOM_MESH: "mesh",
-            pybullet.GEOM_BOX: "box",
-            pybullet.GEOM_CYLINDER: "cylinder",
-            pybullet.GEOM_SPHERE: "sphere",
-            pybullet.GEOM_CAPSULE: "capsule",
-        }
-        bullet = self._bullet
-        shapes = [
-            shape
-            for index in range(bullet.getNumBodies())
-            for shape in bullet.getVisualShapeData(bullet.getBodyUniqueId(index))
-        ]
-        return [
-            Visual(
-                body, link, kinds[kind], sizes, Path(os.fsdecode(mesh)) if mesh else None, position, orientation, color
-            )
-            for body, link, kind, sizes, mesh, position, orientation, color in (shape[:8] for shape in shapes)
-            if kind in kinds
-        ]
+        return visuals(self._bullet)
 
     def link_poses(self, links: Sequence[tuple[int, int]]) -> Poses:
         """True poses of the frames that visuals lie in, for (body, link) pairs; link -1 is a body's base."""
-        bullet, found = self._bullet, []
-        for body, link in links:
-            if link >= 0:
-                found.append(bullet.getLinkState(body, link, computeForwardKinematics=1)[4:6])
-                continue
-            # Bullet tells where the base's centre of mass is.
-            inertial = bullet.invertTransform(*bullet.getDynamicsInfo(body, -1)[3:5])
-            found.append(bullet.multiplyTransforms(*bullet.getBasePositionAndOrientation(body), *inertial))
-        return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
+        return link_poses(self._bullet, links)
 
     def fastest(self, bodies: Sequence[int]) -> float:
         """Largest speed among the bodies, in metres per second; a turn of 1 rad/s counts as 0.05 m/s."""
@@ -253,38 +192,17 @@ class PhysicsWorld:
         return max(speeds)
 
     def render(self, camera: Camera, *, table: bool = True) -> Rendering:
-        """Depth, body numbers and colour as the camera sees them, by PyBullet's software renderer.
+        """Depth, body numbers and colour as the camera sees them.
 
         Args:
             table: whether it is drawn. It fills most of an image and takes four fifths of the renderer's time.
         """
         if not table:
             self._show_table(0.0)
-        position, axes = np.array(camera.position), camera.axes
-        # An intrinsic matrix written as the frustum that OpenGL's conventions want, column by column.
-        along_row, along_column, column, row = camera.intrinsics
-        width, height = camera.width, camera.height
-        frustum = np.zeros((4, 4))
-        frustum[0, 0], frustum[1, 1] = 2 * along_row / width, 2 * along_column / height
-        frustum[0, 2], frustum[1, 2] = 1 - 2 * column / width, 2 * row / height - 1
-        frustum[2, 2], frustum[2, 3] = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
-        frustum[3, 2] = -1.0
-        image = self._bullet.getCameraImage(
-            width,
-            height,
-            viewMatrix=pybullet.computeViewMatrix(position, position + position[2] * axes[2], -axes[1]),
-            projectionMatrix=frustum.T.ravel().tolist(),
-            renderer=pybullet.ER_TINY_RENDERER,
-            shadow=0,
-            lightDirection=(0.4, 0.3, 1.0),
-        )
-        buffer = np.asarray(image[3], dtype=np.float64).reshape(height, width)
-        depth = FAR * NEAR / (FAR - (FAR - NEAR) * buffer)
-        bodies = np.asarray(image[4], dtype=np.int64).reshape(height, width)
-        color = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[..., :3]
+        rendering = render(self._bullet, camera)
         if not table:
             self._show_table(1.0)
-        return Rendering(depth, bodies, color)
+        return rendering
 
     def _show_table(self, opacity: float) -> None:
         """The renderer leaves out what has no opacity; nothing else about a body changes."""

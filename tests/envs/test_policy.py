@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from envs import policy
 from envs.objects import Area, ObjectRanges
+from envs.observation import Observation
 from envs.policy import NEAR, NOISE, SPREAD, START_CLEARANCE, HeuristicPushingPolicy
 from envs.robots import STICK_RADIUS
-from envs.scene import Observation, Scene
+from envs.scene import Scene
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -15,9 +15,10 @@ from gymnasium.utils.env_checker import check_env
 
 from envs.layouts import TASK_NAMES, Layout, load_layout
 from envs.objects import ObjectParameters, ObjectRanges
+from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import EPISODE_STEPS, PushingEnv
-from envs.scene import Observation, PushReport
+from envs.scene import PushReport
 from envs.tasks import TaskReward
 from envs.workspace import normalised_push, tile_center
 

@@ -1,0 +1,57 @@
+"""From an image's segmented pixels to what a program knows of the table: one cloud of points per object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.camera import sample_cloud
+from envs.segmentation import Pixels
+from envs.sensors import DepthImage
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+
+MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the camera tells of the table, padded to `MAXIMUM_OBJECTS` (M) objects.
+
+    Attributes:
+        clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of each cloud.
+        mask: [M] bool, True for objects seen at least once.
+        visible: [M] bool, True for objects in this image; an object hidden in it keeps the cloud last seen.
+    """
+
+    clouds: NDArray[np.float32]
+    centers: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
+
+
+class LastSeen:
+    """An episode's objects as the camera saw them last.
+
+    Args:
+        generator: draws each cloud's points from its pixels.
+    """
+
+    def __init__(self, generator: np.random.Generator) -> None:
+        self._generator = generator
+        self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
+        self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
+
+    def update(self, image: DepthImage, found: Sequence[Pixels]) -> Observation:
+        """Take in one more image and the pixels that each object has in it; the first is the target."""
+        visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
+        for slot, (rows, columns) in enumerate(found):
+            if len(rows) >= MINIMUM_PIXELS:
+                points = image.camera.points(image.depth, rows, columns)
+                self._clouds[slot] = sample_cloud(points, POINTS_PER_OBJECT, self._generator)
+                visible[slot] = True
+        self._mask |= visible
+        centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
+        return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
