@@ -9,7 +9,6 @@ import colorsys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +16,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from envs.camera import Camera
+from envs.filming import FrameHook, film
 from envs.markings import LEVEL, TileGroup, paint_tiles
 from envs.object_sets import BuiltinObjects, ObjectSet
 from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
 from envs.observation import MINIMUM_PIXELS, LastSeen, Observation
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_draw_streams, sensor_stream
-from envs.robots import TIP_HEIGHT, Stopped, push, robot_maker, settle
+from envs.robots import Stopped, push, robot_maker, settle
 from envs.segmentation import Pixels, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.workspace import MAXIMUM_OBJECTS, push_endpoints
 
 MOVED = 0.005  # metres; less motion than this counts as none
 TURNED = 0.1  # radians
-FRAME_STEPS = 10  # physics steps between two frames of a film
-TRAVEL_FRAME_STEPS = 40  # the same while the tool is in the air; an arm travels four fifths of the time
 FALLEN = -0.02  # metres; an object whose centre is lower has left the table
 DRAWS = 50  # scenes drawn before giving up on an acceptable one
-
-FrameHook = Callable[[], None]
-"""Called a few times during a push, for whoever films it."""
 
 # The target is orange; obstacles are cool colours.
 COLORS = ((0.93, 0.42, 0.10), *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in (0.58, 0.45, 0.72, 0.33)))
@@ -161,7 +156,7 @@ class Scene:
         began = time.process_time()
         before = self.ground_truth()
         start, end = push_endpoints(action)
-        self.world.on_step = self._film()
+        self.world.on_step = None if self.on_frame is None else film(self.robot, self.on_frame)
         try:
             ended = push(self.robot, start, end)
         finally:
@@ -264,21 +259,6 @@ class Scene:
             orientation=one.orientation,
             color=color,
         )
-
-    def _film(self) -> Callable[[], None] | None:
-        """What the world calls after each step of a push: every `FRAME_STEPS`th, from the first on, is a frame."""
-        if self.on_frame is None:
-            return None
-        on_frame, steps = self.on_frame, count()
-
-        def film() -> None:
-            number = next(steps)
-            if number % FRAME_STEPS == 0:
-                low = self.robot.tip()[2] < 2 * TIP_HEIGHT
-                if low or number % TRAVEL_FRAME_STEPS == 0:
-                    on_frame()
-
-        return film
 
     def _any_fallen(self) -> bool:
         return bool((self.ground_truth().positions[:, 2] < FALLEN).any())

@@ -1,0 +1,28 @@
+"""When to take the frames of a push's film."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+
+from envs.robots import TIP_HEIGHT, Robot
+
+FRAME_STEPS = 10  # physics steps between two frames of a film
+TRAVEL_FRAME_STEPS = 40  # the same while the tool is in the air; an arm travels four fifths of the time
+
+FrameHook = Callable[[], None]
+"""Called a few times during a push, for whoever films it."""
+
+
+def film(robot: Robot, on_frame: FrameHook) -> Callable[[], None]:
+    """What the world calls after each step of a push; the first step and every `FRAME_STEPS`th from it is a frame."""
+    steps = count()
+
+    def after_step() -> None:
+        number = next(steps)
+        if number % FRAME_STEPS == 0:
+            low = robot.tip()[2] < 2 * TIP_HEIGHT
+            if low or number % TRAVEL_FRAME_STEPS == 0:
+                on_frame()
+
+    return after_step
