@@ -58,6 +58,16 @@ def test_a_dataset_tells_where_the_time_went_that_it_took(tmp_path: Path) -> Non
     assert shares == ["50.0", "25.0", "12.5", "2.5", "10.0"]
 
 
+def test_segmentation_is_judged_in_scenes_and_over_whole_episodes(tmp_path: Path) -> None:
+    few = ["--scenes", "2", "--episodes", "1", "--crowds", "1", "--log", str(tmp_path / "log.jsonl")]
+    run("segmentation", *few, "--tasks", "0")
+    printed = run("segmentation", *few, "--tasks", "1")  # goes on after what is in the log
+    assert re.search(r"right number of objects: [\d.]+ % .*, \d of 2\n", printed)
+    assert re.search(r"identities kept over the whole episode: [\d.]+ % .*, [01] of 1\n", printed)
+    kinds = [json.loads(line)["kind"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert kinds == ["scene", "scene", "episode", "crowd", "task"]
+
+
 def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     words = ["--adversarial", "0.8", "--log", str(tmp_path / "world.jsonl")]
     run("world", "--resets", "2", "--pushes", "10", *words)
