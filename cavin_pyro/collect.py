@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from omegaconf import DictConfig
 
 from cavin_pyro.command import command
@@ -13,12 +15,12 @@ def main(config: DictConfig) -> None:
 
     Resumes what was interrupted.
     """
-    from cavin_pyro.collection import CollectionSettings, collect, repair
+    from cavin_pyro.collection import collect, repair
     from cavin_pyro.data_summary import summarise_data
     from cavin_pyro.errors import UserError, at_least, check_seed, fraction
     from cavin_pyro.figures_data import draw_data
     from cavin_pyro.files import output_folder, write_json
-    from cavin_pyro.worlds import check_world, object_ranges
+    from cavin_pyro.worlds import collecting_world
     from envs.workspace import MAXIMUM_OBJECTS
 
     for name in ("transitions", "workers", "steps", "hold", "minimum_objects", "episodes_per_shard"):
@@ -30,12 +32,8 @@ def main(config: DictConfig) -> None:
             f"not {config.maximum_objects}"
         )
     fraction("perturbed", config.perturbed)
-    check_world(config.env)
-    if config.env.robot != "stick":
-        raise UserError(
-            f"data are collected with env.robot=stick, not {config.env.robot}: it pushes alike in less time"
-        )
-    settings = CollectionSettings(
+    settings = replace(
+        collecting_world(config.env),
         seed=config.seed,
         steps=config.steps,
         hold=config.hold,
@@ -43,11 +41,6 @@ def main(config: DictConfig) -> None:
         minimum_objects=config.minimum_objects,
         maximum_objects=config.maximum_objects,
         episodes_per_shard=config.episodes_per_shard,
-        ranges=object_ranges(config.env),
-        object_set=config.env.objects,
-        assets=config.env.assets,
-        camera=config.env.camera,
-        segmentation=config.env.segmentation,
     )
     folder = output_folder(config.output)
     if config.repair:

@@ -154,16 +154,30 @@ def _record_push(
     arrays["target"][step], arrays["angle"][step] = policy.intent.target, policy.intent.angle
 
 
-@cache
-def _scene(object_set: str, assets: str | None, camera: str, segmentation: str) -> Scene:
-    """One per worker process."""
+def open_scene(settings: CollectionSettings) -> Scene:
+    """The world in which episodes of these settings are collected.
+
+    Raises:
+        UserError: it has no such part, or a part lacks its files.
+    """
     with user_input():
-        return Scene(object_set=load_object_set(object_set, assets), camera=camera, segmentation=segmentation)
+        return Scene(
+            object_set=load_object_set(settings.object_set, settings.assets),
+            camera=settings.camera,
+            segmentation=settings.segmentation,
+        )
+
+
+@cache
+def _scene(**parts: Any) -> Scene:
+    """One per worker process."""
+    return open_scene(CollectionSettings(**parts))
 
 
 def _collect_shard(job: tuple[CollectionSettings, int]) -> tuple[Arrays, dict[str, float]]:
     settings, shard = job
-    scene = _scene(settings.object_set, settings.assets, settings.camera, settings.segmentation)
+    parts = ("object_set", "assets", "camera", "segmentation")
+    scene = _scene(**{name: getattr(settings, name) for name in parts})
     began = time.process_time()
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     first = shard * settings.episodes_per_shard

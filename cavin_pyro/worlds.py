@@ -6,6 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from cavin_pyro.collection import CollectionSettings
 from cavin_pyro.errors import UserError, one_of, user_input
 from envs.object_asset import plain_name
 from envs.object_sets import OBJECT_SETS, chosen, load_object_set
@@ -62,6 +63,24 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
         if not isinstance(ranges[word], int | float) or not ranges[word] >= 0:
             raise UserError(f"env.ranges.{word} must be at least 0 metres, not {ranges[word]}")
     return ObjectRanges(**ranges)
+
+
+def collecting_world(env: DictConfig) -> CollectionSettings:
+    """How episodes are collected in the world of `env.*`, with the usual numbers.
+
+    Raises:
+        UserError: as `check_world` and `object_ranges`, or another robot than the stick.
+    """
+    check_world(env)
+    if env.robot != "stick":
+        raise UserError(f"random pushes are made with env.robot=stick, not {env.robot}: it pushes alike in less time")
+    return CollectionSettings(
+        ranges=object_ranges(env),
+        object_set=env.objects,
+        assets=env.assets,
+        camera=env.camera,
+        segmentation=env.segmentation,
+    )
 
 
 def _pair(word: str, value: Any) -> tuple[float, float]:

@@ -39,7 +39,9 @@ def assess_growth(subject: Subject, *, episodes: int = 40, segments: int = 10) -
     """Errors after 1 to `segments` segments in `episodes` new episodes, simulated here."""
     T = subject.validation.segment_length
     known = getattr(subject.model, "maximum_objects", subject.validation.states.objects)
-    recording = record(subject.pointnet, episodes=episodes, steps=segments * T, objects=known, seed=subject.seed)
+    recording = record(
+        subject.pointnet, subject.world, episodes=episodes, steps=segments * T, objects=known, seed=subject.seed
+    )
     with seeded(subject.seed):
         errors = errors_over_segments(subject.model, subject.guide, recording, T)
     results = {name: [_summary(column) for column in values.unbind(-1)] for name, values in errors.items()}

@@ -14,9 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cavin_pyro.collection import CollectionSettings, crowd
+from cavin_pyro.collection import crowd, open_scene
 from cavin_pyro.criticism.section import Subject
 from cavin_pyro.episodes import observed_state
+from envs.objects import ObjectRanges
 from envs.observation import Observation
 from envs.scene import Scene
 from envs.workspace import REACH_HIGH, REACH_LOW
@@ -69,10 +70,10 @@ def ways(codes: tuple[str, ...]) -> list[tuple[str, str]]:
     return [(effect, motion) for effect in (DRAWN, CHOSEN) for motion in motions]
 
 
-def draw_scene(scene: Scene, seed: int, number: int, objects: int) -> Observation:
+def draw_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, objects: int) -> Observation:
     """Scene `number` with so many objects, drawn as in collection; equal numbers give equal scenes."""
     generator = np.random.default_rng([seed, number])
-    return scene.draw([crowd(generator)] * objects, CollectionSettings().ranges, generator)
+    return scene.draw([crowd(generator)] * objects, ranges, generator)
 
 
 def pursue(subject: Subject, *, scenes: int, objects: int, samples: int) -> Iterator[list[Pursuit]]:
@@ -81,7 +82,7 @@ def pursue(subject: Subject, *, scenes: int, objects: int, samples: int) -> Iter
     Args:
         samples: N, the candidates of those codes that are chosen.
     """
-    scene = Scene()
+    scene = open_scene(subject.world)
     try:
         for number in range(scenes):
             yield [_pursuit(subject, scene, number, way, objects, samples) for way in ways(subject.codes)]
@@ -90,7 +91,7 @@ def pursue(subject: Subject, *, scenes: int, objects: int, samples: int) -> Iter
 
 
 def _pursuit(subject: Subject, scene: Scene, number: int, way: tuple[str, str], objects: int, samples: int) -> Pursuit:
-    seen = draw_scene(scene, subject.seed, number, objects)
+    seen = draw_scene(scene, subject.world.ranges, subject.seed, number, objects)
     state = observed_state({"centers": seen.centers, "clouds": seen.clouds, "mask": seen.mask}, subject.pointnet)
     goal = _goal(seen.centers[0], np.random.default_rng([subject.seed, number, 1]))
     choice = choose(subject, state, torch.from_numpy(goal), way, [subject.seed, number], samples)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cavin_pyro.collection import CollectionSettings, collect_episode
+from cavin_pyro.collection import CollectionSettings, collect_episode, open_scene
 from cavin_pyro.features import cloud_features
-from envs.scene import Scene
 from models.pointnet import PointNet
 from models.state import State
 
@@ -26,10 +26,12 @@ class Recording(NamedTuple):
     seen: Tensor  # [E, S + 1, M] bool: the episode goes on, and the object is in view
 
 
-def record(pointnet: PointNet, *, episodes: int, steps: int, objects: int, seed: int) -> Recording:
+def record(
+    pointnet: PointNet, world: CollectionSettings, *, episodes: int, steps: int, objects: int, seed: int
+) -> Recording:
     """Simulate `episodes` of up to `steps` pushes with at most `objects` objects, by the policy that collects data."""
-    settings = CollectionSettings(seed=SEED + seed, steps=steps, maximum_objects=objects)
-    with closing(Scene()) as scene:
+    settings = replace(world, seed=SEED + seed, steps=steps, maximum_objects=objects)
+    with closing(open_scene(settings)) as scene:
         rows = [collect_episode(scene, settings, number) for number in range(episodes)]
     arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     made = np.arange(steps + 1) <= arrays["length"][:, None]  # [E, S + 1]

@@ -9,6 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from pyro.nn import PyroModule
 
+from cavin_pyro.collection import CollectionSettings
 from models.pointnet import PointNet
 from models.state import Window
 
@@ -21,7 +22,7 @@ class Subject:
         model, guide: trained, in evaluation mode, without gradients. pointnet: makes the features of new clouds.
         training: windows `[B]` that training saw. validation: windows `[B]` of episodes that were held out. In
             both every window counts for all terms (`sequence_mask` is set everywhere).
-        seed: of everything random.
+        seed: of everything random. world: in which new episodes are made.
     """
 
     model: PyroModule
@@ -30,6 +31,7 @@ class Subject:
     training: Window
     validation: Window
     seed: int = 0
+    world: CollectionSettings = field(default_factory=CollectionSettings)
 
     @property
     def codes(self) -> tuple[str, ...]:

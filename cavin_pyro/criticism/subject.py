@@ -22,12 +22,13 @@ from cavin_pyro.errors import UserError
 from cavin_pyro.provenance import provenance
 from cavin_pyro.settings import window_settings
 from cavin_pyro.windows import WindowSettings, WindowTable, load_windows
+from cavin_pyro.worlds import collecting_world
 from envs.workspace import MAXIMUM_OBJECTS
 from models.state import Window
 
 
 def load_subject(config: DictConfig) -> tuple[Subject, dict[str, Any]]:
-    """Read what the words `checkpoint`, `trust`, `data`, `windows` and `seed` of `check` name.
+    """Read what the words `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
     Windows are chosen and held out with the checkpoint's own settings and seed, so that the held-out episodes are
     those that its training held out.
@@ -36,8 +37,9 @@ def load_subject(config: DictConfig) -> tuple[Subject, dict[str, Any]]:
         The subject, and `about` for the report (see `cavin_pyro.criticism.report`).
 
     Raises:
-        UserError: a checkpoint without model, guide or window settings, or data that cannot be used.
+        UserError: a checkpoint without model, guide or window settings, or data or a world that cannot be used.
     """
+    world = collecting_world(config.env)
     path = Path(config.checkpoint or default_checkpoint())
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
@@ -51,7 +53,7 @@ def load_subject(config: DictConfig) -> tuple[Subject, dict[str, Any]]:
         draw_windows(table, getattr(table, name), config.windows, seed=[config.seed, number])
         for number, name in enumerate(("training", "validation"))
     )
-    subject = Subject(model, guide, pointnet, training=training, validation=validation, seed=config.seed)
+    subject = Subject(model, guide, pointnet, training, validation, seed=config.seed, world=world)
     own_prior = (checkpoint.config["model"].get("prior") or {}).get("_target_")
     about = {
         "checkpoint": str(path),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,11 +13,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Independent, Normal
 
+from cavin_pyro.collection import CollectionSettings
 from cavin_pyro.criticism.consistency import assess_consistency
 from cavin_pyro.criticism.consistency_measures import measure
 from cavin_pyro.criticism.pursuit import Choice, Pursuit, choose, draw_scene, pursue, ways
 from cavin_pyro.criticism.section import Subject
 from cavin_pyro.errors import UserError
+from envs.objects import ObjectRanges
 from envs.policy import HeuristicPushingPolicy
 from envs.scene import Scene
 from models.pointnet import PointNet
@@ -47,7 +50,7 @@ class Oracle:
         self.wish, self.pushes, self.paths = wish, [], []
         scene = Scene()
         for number in range(SCENES):
-            seen = draw_scene(scene, SEED, number, OBJECTS)
+            seen = draw_scene(scene, CollectionSettings().ranges, SEED, number, OBJECTS)
             policy = HeuristicPushingPolicy(np.random.default_rng(number), hold=3, perturbed=0.0)
             path, pushes = [seen.centers[:OBJECTS]], []
             for _ in range(3):
@@ -218,6 +221,9 @@ def test_a_scene_depends_on_its_seed_and_number_alone(small: SimpleNamespace) ->
         return [(one.before.tolist(), one.choice.actions.tolist(), one.reached.tolist()) for one in pursuits]
 
     assert told(both[0]) == told(again[0]) != told(other[0])
+    boxes = CollectionSettings(ranges=ObjectRanges(names=("sugar_box",), clearance=0.12))
+    (elsewhere,) = pursue(replace(subject, world=boxes), scenes=1, objects=2, samples=2)
+    assert told(elsewhere) != told(both[0])
     assert told(both[0]) != told(both[1])
 
 

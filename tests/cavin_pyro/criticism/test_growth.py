@@ -9,6 +9,7 @@ from pyro import distributions
 from pyro.nn import PyroModule
 from torch import Tensor
 
+from cavin_pyro.collection import CollectionSettings
 from cavin_pyro.criticism.growth import assess_growth, errors_over_segments
 from cavin_pyro.criticism.recordings import Recording, record
 from cavin_pyro.criticism.section import Subject
@@ -78,17 +79,27 @@ def test_an_object_out_of_view_does_not_count() -> None:
 
 
 def test_new_episodes_are_sound_and_the_same_for_the_same_seed() -> None:
-    first, again = (record(PointNet(), episodes=2, steps=4, objects=2, seed=seed) for seed in (7, 7))
+    first, again = (
+        record(PointNet(), CollectionSettings(), episodes=2, steps=4, objects=2, seed=seed) for seed in (7, 7)
+    )
     assert first.states.centers.shape == (2, 5, 2, 3)
     assert first.seen[:, 0].equal(first.states.mask[:, 0])
     assert torch.equal(first.states.centers, again.states.centers)
     assert torch.equal(first.actions, again.actions)
 
 
+def test_new_episodes_are_of_the_world_that_is_asked_for() -> None:
+    numbers = {"episodes": 1, "steps": 2, "objects": 2, "seed": 7}
+    usual = record(PointNet(), CollectionSettings(), **numbers)
+    kinect = record(PointNet(), CollectionSettings(camera="kinect2"), **numbers)
+    difference = (usual.states.centers[0, 0] - kinect.states.centers[0, 0]).norm(dim=-1)[usual.states.mask[0, 0]]
+    assert (difference > 0.0).all() and (difference < 0.02).all()  # metres; the same scene, seen by another camera
+
+
 def test_the_section_of_a_cascade() -> None:
     model = CascadedModel(effect_dimension=2, motion_dimension=2, width=8, maximum_objects=2)
     guide = CascadedGuide(model, width=8)
-    some = record(pointnet := PointNet(), episodes=1, steps=3, objects=2, seed=0)
+    some = record(pointnet := PointNet(), CollectionSettings(), episodes=1, steps=3, objects=2, seed=0)
     everywhere = torch.ones(1, 3, dtype=torch.bool)
     window = Window(some.states, some.actions, everywhere, everywhere[:, 0])
     subject = Subject(model, guide, pointnet, training=window, validation=window, seed=1)
