@@ -115,7 +115,9 @@ class Kinect2:
             mixed = edge & (fate >= EDGE_LOSS) & (fate < EDGE_LOSS + EDGE_MIXING)
             # What has an edge for its surroundings has no angle of its own: the smaller one is that of its surface.
             value = seen + noise[rows, columns] * axial_noise(seen, np.where(edge, 0.0, incidence))
-            value = np.where(mixed, lowest + share * (highest - lowest), value)
+            # Where there is nothing behind, no light comes back from there and the front is all that is measured.
+            behind = np.where(highest > RANGE[1], lowest, highest)
+            value = np.where(mixed, lowest + share * (behind - lowest), value)
             value[(edge & (fate < EDGE_LOSS)) | (~edge & (incidence > GRAZING))] = 0.0
             measured[rows, columns] = value
         measured[generator.random(depth.shape, dtype=np.float32) < LOSS] = 0.0

@@ -99,6 +99,17 @@ def test_measurements_are_missing_and_mixed_at_the_edges_of_objects(scene: Scene
     assert (image.depth[can & ~outline] == 0).mean() < 0.2
 
 
+def test_nothing_is_mixed_with_what_is_not_there(scene: Scene, put: Callable) -> None:
+    """Beyond the table's edge there is no floor in the simulator, and an object's points end where it ends."""
+    scene.reset([put("sugar_box", 0.25, 0.0), put("mug", 0.94, 0.3)], np.random.default_rng(0))
+    sensor = Kinect2()
+    for seed in range(10):
+        sensor.reset(np.random.default_rng(seed))
+        image, bodies = sensor.look(scene.world.render)
+        rows, columns = np.nonzero(np.isin(bodies, scene.bodies) & (image.depth > 0.0))
+        assert image.camera.points(image.depth, rows, columns)[:, 2].min() > -0.02  # metres
+
+
 def test_the_kinect_stands_elsewhere_in_every_episode_and_is_believed_to_stand_near_there() -> None:
     sensor, actual = Kinect2(), []
     for seed in range(50):
