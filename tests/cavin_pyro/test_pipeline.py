@@ -83,6 +83,7 @@ def test_collected_data_depend_on_the_seed_and_not_on_the_workers(
         for folder in (chain.folder / "pushes", pushes)
     )
     del here["timing.csv"], there["timing.csv"]
+    assert {here.pop(name)[:1] for name in ("statistics.json", "statistics.png")} == {b"{", b"\x89"}
     assert here == there
     metadata = read_metadata(pushes)
     assert len(here) == metadata["shards"] + 1
