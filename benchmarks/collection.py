@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cavin_pyro.collection import CollectionSettings, collect_episode
+from cavin_pyro.collection import CollectionSettings, collect_episode, open_scene
 from cavin_pyro.dataset import shard_path, write_shard
-from envs.object_sets import OBJECT_SETS, load_object_set
-from envs.scene import Scene
+from envs.object_sets import OBJECT_SETS
 from envs.sensors import CAMERAS
 
 
@@ -27,7 +26,7 @@ def main() -> None:
     parser.add_argument("--transitions", type=int, default=1000)
     parser.add_argument("--objects", default="builtin", choices=list(OBJECT_SETS))
     parser.add_argument("--camera", default="ideal", choices=list(CAMERAS))
-    parser.add_argument("--assets", type=Path, help="folder of meshes, for the sets that need one")
+    parser.add_argument("--assets", help="folder of meshes, for the sets that need one")
     parser.add_argument("--data", type=Path, help="folder of a dataset that is there already")
     words = parser.parse_args()
     if words.data:
@@ -38,8 +37,8 @@ def main() -> None:
 
 def measure(words: argparse.Namespace) -> None:
     """Collect some transitions and report."""
-    settings = CollectionSettings(seed=1, object_set=words.objects, camera=words.camera)
-    scene = Scene(object_set=load_object_set(words.objects, words.assets), camera=words.camera)
+    settings = CollectionSettings(seed=1, object_set=words.objects, assets=words.assets, camera=words.camera)
+    scene = open_scene(settings)
     collect_episode(scene, settings, 10**6)  # meshes are written and libraries loaded
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     made, episode, shard, size, writing = 0, 0, 0, 0, 0.0
