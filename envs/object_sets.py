@@ -1,4 +1,4 @@
-"""Which objects there are to push: the ten builtin shapes, real scans from a folder, or both together."""
+"""Which objects there are to push: ten builtin shapes, real scans from a folder, both together, or random shapes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Protocol
 
 from envs.object_asset import ObjectAsset, plain_name
+from envs.random_shapes import RANDOM_NAMES, random_shape
 from envs.scans import ScannedObjects
-from envs.shapes import BUILTIN_NAMES, builtin_shape, write_mesh
+from envs.shapes import BUILTIN_NAMES, Shape, builtin_shape, write_mesh
 
 
 class ObjectSet(Protocol):
@@ -37,9 +38,17 @@ class BuiltinObjects:
 
     def asset(self, name: str) -> ObjectAsset:
         """See `ObjectSet`."""
-        shape = builtin_shape(name)
-        mesh = write_mesh(shape, _mesh_folder())
-        return ObjectAsset(name, shape.mass, shape.radius, collision=mesh, visual=mesh)
+        return _asset(builtin_shape(name))
+
+
+class RandomObjects:
+    """The hundred shapes of `envs.random_shapes`, written in the same way."""
+
+    names = RANDOM_NAMES
+
+    def asset(self, name: str) -> ObjectAsset:
+        """See `ObjectSet`."""
+        return _asset(random_shape(name))
 
 
 class MixedObjects:
@@ -64,6 +73,7 @@ OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
     "builtin": lambda assets: BuiltinObjects(),
     "ycb": ScannedObjects,
     "mixed": lambda assets: MixedObjects(BuiltinObjects(), ScannedObjects(assets)),
+    "random": lambda assets: RandomObjects(),
 }
 """What makes the object set of each name, given the folder of assets (None where there is none)."""
 
@@ -93,6 +103,11 @@ def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
             raise ValueError(f"unknown object {name!r}: choose from {', '.join(valid)}")
         found += meant
     return tuple(found)
+
+
+def _asset(shape: Shape) -> ObjectAsset:
+    mesh = write_mesh(shape, _mesh_folder())
+    return ObjectAsset(shape.name, shape.mass, shape.radius, collision=mesh, visual=mesh)
 
 
 @cache

@@ -7,6 +7,7 @@ Sizes and masses: YCB Object and Model Set (Calli et al. 2015).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -15,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+
+from envs.object_asset import plain_name
 
 SIDES = 16  # flat faces around a can; the largest gap to the circle is 2 % of its radius
 STAVES = 10  # flat faces around a hollow vessel, each of them a convex part that costs time in every step
@@ -26,7 +29,7 @@ class Shape:
     """A rigid object made of convex parts, its origin at the centre of volume.
 
     Attributes:
-        name: the YCB object's name.
+        name: the YCB object's name, or its set's and its own.
         parts: convex meshes in metres, z up in the pose in which the object is sold.
         mass: kilograms.
     """
@@ -130,7 +133,11 @@ def builtin_shape(name: str) -> Shape:
     if name not in _RECIPES:
         raise ValueError(f"unknown object {name!r}: choose from {', '.join(BUILTIN_NAMES)}")
     build, mass = _RECIPES[name]
-    parts = build()
+    return shape_of(name, build(), mass)
+
+
+def shape_of(name: str, parts: Sequence[trimesh.Trimesh], mass: float) -> Shape:
+    """Convex parts (metres) as one object, moved so that their common centre of volume is the origin."""
     volumes = np.array([part.volume for part in parts])
     centroid = (volumes[:, None] * np.array([part.center_mass for part in parts])).sum(axis=0) / volumes.sum()
     for part in parts:
@@ -143,7 +150,7 @@ def write_mesh(shape: Shape, folder: Path) -> Path:
 
     Every triangle keeps corners of its own, so that a renderer shades it flat; a file already there is kept.
     """
-    path = folder / f"{shape.name}.obj"
+    path = folder / f"{plain_name(shape.name)}.obj"
     if not path.exists():
         parts = [part.copy() for part in shape.parts]
         for part in parts:
