@@ -60,32 +60,35 @@ def shard_features(folder: Path, number: int, pointnet: PointNet, mark: str) -> 
 
 
 def sample_clouds(
-    folder: Path, *, count: int, generator: np.random.Generator, without: Sequence[str] = ()
+    folders: Sequence[Path], *, count: int, generator: np.random.Generator, without: Sequence[str] = ()
 ) -> NDArray[np.float32]:
-    """Draw clouds [count, 256, 3] metres from a dataset, from as many shards as it takes, real objects only.
+    """Draw clouds [count, 256, 3] metres from datasets, from as many shards as it takes, real objects only.
 
     Args:
         without: names of objects that are not to be among them.
 
     Raises:
-        UserError: no dataset, a corrupt shard, an object that the dataset does not know, or too few clouds are left.
+        UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
     """
-    held_out = hold_out(without, folder, word="without")
-    shards = read_metadata(folder)["shards"]
-    chosen = generator.permutation(shards)[: max(1, min(shards, 100))]
+    held_out = hold_out(without, folders, word="without")
+    shards = [
+        (folder, number, held)
+        for folder, held in zip(folders, held_out, strict=True)
+        for number in range(read_metadata(folder)["shards"])
+    ]
+    chosen = generator.permutation(len(shards))[: max(1, min(len(shards), 100))]
     each = -(-count // len(chosen))
     drawn = []
-    for number in sorted(chosen):
-        arrays = read_shard(shard_path(folder, int(number)), ("clouds", "visible", "length", *held_out.needs))
+    for folder, number, held in [shards[index] for index in sorted(chosen)]:
+        arrays = read_shard(shard_path(folder, number), ("clouds", "visible", "length", *held.needs))
         steps = np.arange(arrays["visible"].shape[1])
         real = arrays["visible"] & (steps[None, :, None] <= arrays["length"][:, None, None])
-        if held_out.numbers:
-            real &= ~held_out.lying(arrays)[:, None]
+        if held.numbers:
+            real &= ~held.lying(arrays)[:, None]
         clouds = arrays["clouds"][real]
         drawn.append(clouds[generator.permutation(len(clouds))[:each]].astype(np.float32))
     clouds = np.concatenate(drawn)[:count]
     if len(clouds) < min(count, 2):  # one to learn from and one to validate with
-        raise UserError(
-            f"dataset {folder} has {len(clouds)} clouds without {', '.join(without)}: hold out fewer objects"
-        )
+        where = " and ".join(map(str, folders))
+        raise UserError(f"{where}: {len(clouds)} clouds without {', '.join(without)}: hold out fewer objects")
     return clouds

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.dataset import Arrays, read_metadata
 from cavin_pyro.errors import UserError
-from envs.object_asset import plain_name
+from envs.object_asset import listed, plain_name
 
 
 @dataclass(frozen=True)
@@ -42,15 +42,16 @@ class HeldOut:
         return {name: array[kept] for name, array in arrays.items()}
 
 
-def hold_out(names: Sequence[str], folder: Path, *, word: str) -> HeldOut:
-    """What a dataset knows under these names; `word` is where they were given.
+def hold_out(names: Sequence[str], folders: Sequence[Path], *, word: str) -> list[HeldOut]:
+    """What each dataset knows under these names; `word` is where they were given.
 
     Raises:
-        UserError: no dataset, or it has no object of such a name.
+        UserError: no dataset, or none has an object of such a name.
     """
-    known = read_metadata(folder).get("shape_names", []) if names else []
+    known = [read_metadata(folder).get("shape_names", []) if names else [] for folder in folders]
+    every = dict.fromkeys(plain_name(name) for one in known for name in one)
     for name in names:
-        if name not in map(plain_name, known):
-            valid = ", ".join(dict.fromkeys(map(plain_name, known)))
-            raise UserError(f"unknown object {name!r} in {word}: {folder} has {valid}")
-    return HeldOut(tuple(number for number, name in enumerate(known) if plain_name(name) in names))
+        if name not in every:
+            where = " and ".join(map(str, folders))
+            raise UserError(f"unknown object {name!r} in {word}: choose from {listed(every)}, which are in {where}")
+    return [HeldOut(tuple(n for n, name in enumerate(one) if plain_name(name) in names)) for one in known]

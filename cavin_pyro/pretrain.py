@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from omegaconf import DictConfig
 
 from cavin_pyro.command import command
@@ -24,6 +22,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.pretraining import pretrain
     from cavin_pyro.provenance import provenance
     from cavin_pyro.runs import write_config
+    from cavin_pyro.settings import data_folders
 
     for name, minimum in (("clouds", 2), ("steps", 1), ("batch_size", 1)):
         at_least(name, config[name], minimum)
@@ -34,7 +33,7 @@ def main(config: DictConfig) -> None:
     torch.manual_seed(config.seed)
     autoencoder = construct(config.autoencoder)
     clouds = sample_clouds(
-        Path(config.data),
+        data_folders(config),
         count=config.clouds,
         generator=np.random.default_rng(config.seed),
         without=config.without,

@@ -1,6 +1,8 @@
-"""From the words of `train` to checked settings."""
+"""From the words of `train`, and what other commands share with it, to checked settings."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from omegaconf import DictConfig
 
@@ -8,6 +10,11 @@ from cavin_pyro.arithmetic import PRODUCTS
 from cavin_pyro.errors import UserError, at_least, check_seed, fraction, one_of
 from cavin_pyro.training import BATCHES, SCHEDULES, TrainerSettings
 from cavin_pyro.windows import WindowSettings
+
+
+def data_folders(config: DictConfig) -> list[Path]:
+    """The word `data`: a folder, or a list of them."""
+    return [Path(folder) for folder in ([config.data] if isinstance(config.data, str) else config.data)]
 
 
 def trainer_settings(config: DictConfig) -> TrainerSettings:

@@ -39,7 +39,7 @@ def train(config: DictConfig) -> Trainer:
     from cavin_pyro.pairs import check_pair
     from cavin_pyro.provenance import training_provenance
     from cavin_pyro.runs import check_same_run, write_config
-    from cavin_pyro.settings import trainer_settings, window_settings
+    from cavin_pyro.settings import data_folders, trainer_settings, window_settings
     from cavin_pyro.training import Trainer
     from cavin_pyro.windows import load_windows
     from envs.workspace import MAXIMUM_OBJECTS
@@ -53,7 +53,7 @@ def train(config: DictConfig) -> Trainer:
     source = Path(config.pointnet or default_checkpoint())
     pointnet = load_pointnet(source)
     check_fit(model, pointnet, MAXIMUM_OBJECTS)
-    data = [Path(folder) for folder in ([config.data] if isinstance(config.data, str) else config.data)]
+    data = data_folders(config)
     windows = load_windows(data, pointnet, window, skip_corrupt=config.skip_corrupt)
     check_pair(model, guide, windows.batch(windows.training[:2]))
     print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")

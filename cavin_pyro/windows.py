@@ -111,9 +111,9 @@ def load_windows(
         )
     names: tuple[str, ...] = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")
     total = sum(read_metadata(folder)["shards"] for folder in folders)
+    without = hold_out(settings.without, folders, word="windows.without")
     with progress_bar("reading", total=total, unit="file") as bar:
-        for folder in folders:
-            held_out = hold_out(settings.without, folder, word="windows.without")
+        for folder, held_out in zip(folders, without, strict=True):
             for number, arrays in iterate_shards(folder, (*names, *held_out.needs), skip_corrupt=skip_corrupt):
                 arrays["features"] = shard_features(folder, number, pointnet, mark)
                 shards.append(held_out.without(arrays))

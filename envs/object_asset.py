@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,3 +39,9 @@ class ObjectAsset:
 def plain_name(name: str) -> str:
     """An object's name without its set's: `mug` for `ycb/mug`."""
     return name.rpartition("/")[2]
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a message of one line: all of them, or the ends of a long list."""
+    every = list(names)
+    return ", ".join(every if len(every) <= 40 else [*every[:2], "...", every[-1]])

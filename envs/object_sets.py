@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Protocol
 
-from envs.object_asset import ObjectAsset, plain_name
+from envs.object_asset import ObjectAsset, listed, plain_name
 from envs.random_shapes import RANDOM_NAMES, random_shape
 from envs.scans import ScannedObjects
 from envs.shapes import BUILTIN_NAMES, Shape, builtin_shape, write_mesh
@@ -65,7 +65,7 @@ class MixedObjects:
     def asset(self, name: str) -> ObjectAsset:
         """See `ObjectSet`."""
         if name not in self._sets:
-            raise ValueError(f"unknown object {name!r}: choose from {', '.join(self.names)}")
+            raise ValueError(f"unknown object {name!r}: choose from {listed(self.names)}")
         return self._sets[name].asset(name)
 
 
@@ -100,7 +100,7 @@ def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
         meant = [one for one in objects.names if name in (one, plain_name(one))]
         if not meant:
             valid = dict.fromkeys(plain_name(one) for one in objects.names)
-            raise ValueError(f"unknown object {name!r}: choose from {', '.join(valid)}")
+            raise ValueError(f"unknown object {name!r}: choose from {listed(valid)}")
         found += meant
     return tuple(found)
 

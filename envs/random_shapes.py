@@ -7,12 +7,13 @@ ones (Tobin et al. 2018, "Domain Randomization and Generative Models for Robotic
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from envs.object_asset import listed
 from envs.shapes import SIDES, Shape, shape_of
 
 RANDOM = "random"  # what stands before the names of these objects
@@ -34,7 +35,7 @@ def random_shape(name: str) -> Shape:
         ValueError: the name is not one of `RANDOM_NAMES`.
     """
     if name not in RANDOM_NAMES:
-        raise ValueError(f"unknown object {name!r}: choose from {RANDOM_NAMES[0]} to {RANDOM_NAMES[-1]}")
+        raise ValueError(f"unknown object {name!r}: choose from {listed(RANDOM_NAMES)}")
     generator = np.random.default_rng(RANDOM_NAMES.index(name))
     while True:
         parts = [_part(generator)]
@@ -43,14 +44,14 @@ def random_shape(name: str) -> Shape:
             part.apply_translation(faces[generator.integers(len(faces))])
             parts.append(part)
         volume = sum(part.volume for part in parts)
-        shape = shape_of(name, parts, mass=float(volume * np.exp(generator.uniform(*np.log(DENSITY)))))
+        shape = shape_of(name, parts, mass=float(volume * _between(DENSITY, generator)))
         if RADIUS[0] <= shape.radius <= RADIUS[1]:
             return shape
 
 
 def _part(generator: np.random.Generator) -> trimesh.Trimesh:
     """A convex mesh around the origin, turned at random."""
-    sides: NDArray[np.float64] = np.exp(generator.uniform(*np.log(SIDE), size=3))
+    sides = _between(SIDE, generator, size=3)
     kind = int(generator.integers(3))
     if kind == 0:
         part = trimesh.creation.box(sides)
@@ -63,3 +64,8 @@ def _part(generator: np.random.Generator) -> trimesh.Trimesh:
     turn[:3, :3] = Rotation.random(random_state=generator).as_matrix()
     part.apply_transform(turn)
     return part
+
+
+def _between(bounds: tuple[float, float], generator: np.random.Generator, size: int | None = None) -> Any:
+    """Numbers whose logarithm is uniform."""
+    return np.exp(generator.uniform(np.log(bounds[0]), np.log(bounds[1]), size))

@@ -20,7 +20,7 @@ from cavin_pyro.criticism.section import Subject
 from cavin_pyro.dataset import content_mark, read_metadata
 from cavin_pyro.errors import UserError
 from cavin_pyro.provenance import provenance
-from cavin_pyro.settings import window_settings
+from cavin_pyro.settings import data_folders, window_settings
 from cavin_pyro.windows import WindowSettings, WindowTable, load_windows
 from cavin_pyro.worlds import collecting_world
 from envs.workspace import MAXIMUM_OBJECTS
@@ -46,7 +46,7 @@ def load_subject(config: DictConfig) -> tuple[Subject, dict[str, Any]]:
     pointnet = pointnet_of(checkpoint, path)
     check_fit(model, pointnet, MAXIMUM_OBJECTS)
     settings = trained_windows(checkpoint, path)
-    folders = [Path(folder) for folder in ([config.data] if isinstance(config.data, str) else config.data)]
+    folders = data_folders(config)
     data = [compare_data(folder, checkpoint.provenance) for folder in folders]
     table = load_windows(folders, pointnet, settings)
     training, validation = (

@@ -31,7 +31,7 @@ BAD_WORDS = [
     ("check", "env.camera=eye", "unknown env.camera 'eye': choose from ideal, kinect2"),
     ("plan", "env.ranges.names=[fork]", "unknown object 'fork' in env.ranges.names: choose from sugar_box"),
     ("plan", "products=float16", "unknown products 'float16': choose from float32, bfloat16"),
-    ("plan", "env.objects=toys", "unknown env.objects 'toys': choose from builtin, ycb, mixed"),
+    ("plan", "env.objects=toys", "unknown env.objects 'toys': choose from builtin, ycb, mixed, random"),
     ("plan", "env.objects=ycb", "give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to DIR"),
     ("collect", "env.objects=mixed env.assets=nowhere", "no objects in nowhere/ycb: meta.json cannot be read"),
     ("plan", "env/ranges=wild", "unknown env/ranges 'wild': choose from paper, published"),

@@ -92,17 +92,17 @@ def test_a_corrupt_shard_has_no_features(own_pushes: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, 10, 40])
 def test_clouds_for_pretraining_are_real_ones_in_the_number_wanted(count: int, pushes: Path) -> None:
-    drawn = sample_clouds(pushes, count=count, generator=np.random.default_rng(0))
+    drawn = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
     assert drawn.shape == (count, 256, 3)
     assert drawn.dtype == np.float32
     np.testing.assert_allclose(drawn.mean(axis=1), 0.0, atol=1e-3)  # metres from their centres
     assert (np.ptp(drawn, axis=1).max(axis=-1) > 0.01).all()  # padding would be a single point
-    again = sample_clouds(pushes, count=count, generator=np.random.default_rng(0))
+    again = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
     np.testing.assert_array_equal(drawn, again)
 
 
 def test_clouds_come_from_all_shards(pushes: Path) -> None:
-    drawn = sample_clouds(pushes, count=30, generator=np.random.default_rng(0))
+    drawn = sample_clouds([pushes], count=30, generator=np.random.default_rng(0))
     for number in range(3):
         clouds = read_shard(shard_path(pushes, number))["clouds"].astype(np.float32).reshape(-1, 256, 3)
         assert sum((clouds == cloud).all(axis=(1, 2)).any() for cloud in drawn) == 10
@@ -118,12 +118,12 @@ def test_clouds_of_objects_that_are_held_out_are_not_drawn(pushes: Path) -> None
     def shapes_of(drawn: NDArray[np.float32]) -> set[int]:
         return {int(shape[(clouds == cloud).all(axis=(-1, -2)).any(axis=-1)][0]) for cloud in drawn}
 
-    assert commonest in shapes_of(sample_clouds(pushes, count=60, generator=np.random.default_rng(0)))
-    others = sample_clouds(pushes, count=60, generator=np.random.default_rng(0), without=[name])
+    assert commonest in shapes_of(sample_clouds([pushes], count=60, generator=np.random.default_rng(0)))
+    others = sample_clouds([pushes], count=60, generator=np.random.default_rng(0), without=[name])
     assert len(others) == 60
     assert commonest not in shapes_of(others)
 
 
 def test_holding_out_everything_leaves_nothing_to_learn_from(pushes: Path) -> None:
-    with pytest.raises(UserError, match=r"has 0 clouds without sugar_box, .*: hold out fewer objects"):
-        sample_clouds(pushes, count=5, generator=np.random.default_rng(0), without=BUILTIN_NAMES)
+    with pytest.raises(UserError, match=r"pushes: 0 clouds without sugar_box, .*: hold out fewer objects"):
+        sample_clouds([pushes], count=5, generator=np.random.default_rng(0), without=BUILTIN_NAMES)

@@ -95,7 +95,7 @@ def test_what_is_held_out_is_never_drawn_and_all_else_is(tiny_assets: Path) -> N
 
 
 def test_an_unknown_set_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"^unknown object set 'toys': choose from builtin, ycb, mixed$"):
+    with pytest.raises(ValueError, match=r"^unknown object set 'toys': choose from builtin, ycb, mixed, random$"):
         load_object_set("toys")
 
 
