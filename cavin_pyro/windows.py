@@ -118,7 +118,7 @@ def load_windows(
                 arrays["features"] = shard_features(folder, number, pointnet, mark)
                 shards.append(held_out.without(arrays))
                 bar.update()
-    episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in shards[0]}
+    episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in (*names, "features")}
     return _find_windows(episodes, settings, " and ".join(str(folder) for folder in folders))
 
 
