@@ -297,7 +297,7 @@ def test_a_dataset_that_does_not_know_what_is_held_out_counts_whole(tmp_path: Pa
     arrays["shape"] = np.repeat(np.arange(60) % 2, OBJECTS).reshape(60, OBJECTS)
     arrays["scale"] = np.ones((60, OBJECTS), np.float32)
     first, second = write(tmp_path / "first", arrays), write(tmp_path / "second", other)
-    write_metadata(second, {"settings": {"steps": 5}, "shards": 1, "shape_names": ["box"]})
+    write_metadata(second, {"settings": {"steps": STEPS}, "shards": 1, "episodes": 5, "transitions": 0})
     held_out = replace(EVERY, without=("mug",))
     alone, together = load_windows([first], PointNet(), held_out), load_windows([first, second], PointNet(), held_out)
     assert len(together.starts) == len(alone.starts) + 3 * 5
