@@ -108,6 +108,12 @@ def test_clouds_come_from_all_shards(pushes: Path) -> None:
         assert sum((clouds == cloud).all(axis=(1, 2)).any() for cloud in drawn) == 10
 
 
+def test_clouds_come_from_all_datasets(pushes: Path, own_pushes: Path) -> None:
+    (own_pushes / "episodes-00000.h5").unlink()
+    with pytest.raises(UserError, match=r"episodes-00000\.h5"):  # it would have been read
+        sample_clouds([pushes, own_pushes], count=30, generator=np.random.default_rng(0))
+
+
 def test_clouds_of_objects_that_are_held_out_are_not_drawn(pushes: Path) -> None:
     shards = [read_shard(shard_path(pushes, number), ("clouds", "shape", "mask")) for number in range(3)]
     shape = np.concatenate([arrays["shape"][arrays["mask"]] for arrays in shards])
