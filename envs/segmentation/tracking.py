@@ -7,7 +7,7 @@ no longer stand where they did, by how far they would have moved and how much th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from envs.segmentation.height_map import CELL, HeightMap, Mask
 from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_owner
-from envs.segmentation.splitting import HEIGHT_WEIGHT, Points, split_by_shapes
+from envs.segmentation.registration import Pose, Shape, explain, shape_of
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
 INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
@@ -26,6 +26,8 @@ FARTHEST = 0.5  # metres; no object goes farther between two images
 REMNANT = 0.1  # of an object's former area; less is not the object but what another one left over
 FRAGMENT, PENALTY = 0.4, 0.15  # a piece of less than this share is worth these metres less: a handle, say
 SHARED = 0.3  # of its own area by which a piece must exceed another object's for an object to hide in it too
+ALIKE = 0.65
+ALONE = 2
 REACH = 0.03  # metres from a moved object's region within which a smaller one is taken for its other half
 
 
@@ -39,11 +41,7 @@ class Track:
 
     region: Mask
     heights: NDArray[np.float32]
-
-    @property
-    def points(self) -> Points:
-        """Its cells as points, as `split_by_shapes` wants them, [C, 3]."""
-        return as_points(self.region, self.heights)
+    shape: Shape | None = None
 
     @property
     def center(self) -> NDArray[np.float64]:
@@ -61,14 +59,8 @@ class Track:
         return np.array([np.sqrt(self.region.sum()) * CELL, float(high)])
 
 
-def as_points(region: Mask, heights: NDArray[np.float32]) -> Points:
-    """Cells of a region as points (x, y, `HEIGHT_WEIGHT` times the height) [C, 3], metres."""
-    cells = np.argwhere(region)
-    return np.column_stack((cells * CELL, HEIGHT_WEIGHT * heights[region]))
-
-
-def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Mask | None]:
-    """For each track its region on the new map; None for what is not seen, or has never been."""
+def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Track | None]:
+    """Each track as the new map shows it; None for what is not seen, or has never been."""
     new = heights.heights
     found: list[Mask | None] = [None] * len(tracks)
     taken = np.zeros(new.shape, np.bool_)
@@ -83,8 +75,14 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Ma
     labels, count = ndimage.label(free, AROUND)
     pieces = [labels == 1 + number for number in range(count)]
     pieces = [piece for piece in pieces if piece.sum() * CELL**2 >= MINIMUM_AREA]
-    for number, region in _match(moved, tracks, pieces, new).items():
-        found[number] = region
+    poses: dict[int, Pose] = {}
+    if moved and pieces:
+        near = ndimage.binary_dilation(taken, AROUND, iterations=3)
+        matched = None if any((piece & near).any() for piece in pieces) else _match_apart(moved, tracks, pieces, new)
+        if matched is None:
+            matched, poses = _match_together(moved, tracks, pieces, found, heights)
+        for number, region in matched.items():
+            found[number] = region
     present = [number for number, region in enumerate(found) if region is not None]
     if present:  # seams and specks go to whom they touch
         regions = [found[number] for number in present]
@@ -92,7 +90,26 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Ma
         near = ndimage.binary_dilation(np.any(regions, axis=0), AROUND, iterations=2) & heights.occupied  # type: ignore[arg-type]
         for index, number in enumerate(present):
             found[number] = near & (owner == index)
-    return found
+    return _remembered(tracks, found, poses, new)
+
+
+def _remembered(tracks, found, poses, new) -> list[Track | None]:
+    """New tracks; the shape of an object that touches another stays the one that it had when it stood alone."""
+    result: list[Track | None] = []
+    for number, region in enumerate(found):
+        if region is None or not region.any():
+            result.append(None)
+            continue
+        others = np.any([other for n, other in enumerate(found) if n != number and other is not None] or [np.zeros_like(region)], axis=0)
+        box = box_around(region, ALONE + 1)
+        alone = not (ndimage.binary_dilation(region[box], AROUND, iterations=ALONE) & others[box]).any()
+        track = tracks[number]
+        if alone:
+            shape = shape_of(region, new)
+        else:
+            shape = replace(track.shape, pose=poses.get(number, track.shape.pose))
+        result.append(Track(region, new, shape))
+    return result
 
 
 def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
@@ -112,36 +129,67 @@ def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
     return bool(same and (latest[around] > 0.0).sum() <= INVADED * around.sum())
 
 
-def _match(
-    moved: list[int], tracks: Sequence[Track | None], pieces: list[Mask], heights: NDArray[np.float32]
-) -> dict[int, Mask]:
-    """Regions of the moved objects among the pieces that nobody else has claimed."""
-    known = {number: track for number in moved if (track := tracks[number]) is not None}
-    if not known or not pieces:
-        return {}
+def _match_apart(moved, tracks, pieces, heights) -> dict[int, Mask] | None:
+    """Moved objects among pieces that are one object each; None if some are not."""
+    if len(pieces) != len(moved):
+        return None
+    known = {number: tracks[number] for number in moved}
     seen = [Track(piece, heights) for piece in pieces]
     cost = np.array([[_cost(track, piece) for piece in seen] for track in known.values()])
-    chosen = {list(known)[row]: column for row, column in zip(*linear_sum_assignment(cost), strict=True)}
-    chosen = {n: column for n, column in chosen.items() if seen[column].area >= REMNANT * known[n].area}
-    groups: dict[int, list[int]] = {column: [number] for number, column in chosen.items()}
-    for number in known:
-        if number not in chosen:  # fewer pieces than objects: it must be in contact with another
-            if not groups:
-                break
-            column = min(groups, key=cost[list(known).index(number)].__getitem__)
-            others = sum(known[other].area for other in groups[column])
-            if seen[column].area >= others + SHARED * known[number].area:  # if not, it has left the table
-                groups[column].append(number)
-    found: dict[int, Mask] = {}
-    for column, numbers in groups.items():
-        found |= _divide(pieces[column], {number: known[number] for number in numbers}, heights)
-    for column, piece in enumerate(pieces):  # more pieces than objects: parts of what is partly hidden
-        if column not in groups and found:
-            distance = {n: ndimage.distance_transform_cdt(~region)[piece].min() for n, region in found.items()}
-            nearest = min(distance, key=distance.__getitem__)
-            if distance[nearest] * CELL <= REACH:
-                found[nearest] = found[nearest] | piece
-    return found
+    chosen = {moved[row]: column for row, column in zip(*linear_sum_assignment(cost), strict=True)}
+    for number, column in chosen.items():
+        ratio = seen[column].area / known[number].area
+        if ratio < REMNANT or (len(moved) > 1 and not ALIKE < ratio < 1.0 / ALIKE):
+            return None
+    return {number: pieces[column] for number, column in chosen.items()}
+
+
+def _match_together(moved, tracks, pieces, found, heights):
+    whole = ndimage.binary_closing(heights.occupied, AROUND) | heights.occupied
+    labels, count = ndimage.label(whole, AROUND)
+    touched = np.zeros(count + 1, np.bool_)
+    for piece in pieces:
+        touched[labels[piece]] = True
+    touched[0] = False
+    still = [n for n, region in enumerate(found) if region is not None and touched[labels[region]].any()]
+    for number in still:
+        touched[labels[found[number]]] = True
+    touched[0] = False
+    concerned = touched[labels] & heights.occupied
+    # Still objects' cells that lie in components of which only a fringe belongs to them
+    box = box_around(concerned, 0)
+    origin = np.array([box[0].start, box[1].start])
+    numbers = [*still, *moved]
+    shapes = [_shifted(tracks[n].shape, -origin) for n in numbers]
+    explained = explain(np.where(concerned, heights.heights, 0.0)[box], shapes, list(range(len(still))))
+    owners = explained.owners()
+    result, poses = {}, {}
+    for index, number in enumerate(numbers):
+        own = owners == index
+        if own.sum() * CELL**2 >= MINIMUM_AREA:
+            result[number] = np.zeros(heights.heights.shape, np.bool_)
+            result[number][box] = own
+            pose = explained.poses[index]
+            poses[number] = replace(pose, row=pose.row + int(origin[0]), column=pose.column + int(origin[1]))
+    # What no shape explains may be an object that shows another side now.
+    absent = [n for n in moved if n not in result]
+    if absent:
+        left = concerned.copy()
+        for region in result.values():
+            left &= ~ndimage.binary_dilation(region, AROUND)
+        labels, count = ndimage.label(left, AROUND)
+        rest = [labels == 1 + number for number in range(count)]
+        rest = [Track(piece, heights.heights) for piece in rest if piece.sum() * CELL**2 >= MINIMUM_AREA]
+        if rest:
+            cost = np.array([[_cost(tracks[n], piece) for piece in rest] for n in absent])
+            for row, column in zip(*linear_sum_assignment(cost), strict=True):
+                if rest[column].area >= SHARED * tracks[absent[row]].area:
+                    result[absent[row]] = rest[column].region
+    return result, poses
+
+
+def _shifted(shape: Shape, by) -> Shape:
+    return replace(shape, pose=replace(shape.pose, row=shape.pose.row + int(by[0]), column=shape.pose.column + int(by[1])))
 
 
 def _cost(track: Track, piece: Track) -> float:
@@ -150,18 +198,3 @@ def _cost(track: Track, piece: Track) -> float:
     return min(distance, FARTHEST) + fragment + float(np.abs(track.features() - piece.features()).sum())
 
 
-def _divide(piece: Mask, tracks: dict[int, Track], heights: NDArray[np.float32]) -> dict[int, Mask]:
-    """Divide one piece among the objects that it must be."""
-    numbers = list(tracks)
-    if len(numbers) == 1:
-        return {numbers[0]: piece}
-    points = as_points(piece, heights)
-    split = split_by_shapes(points, [track.points for track in tracks.values()])
-    cells = np.argwhere(piece)
-    found = {}
-    for index, number in enumerate(numbers):
-        own = cells[split.owners == index]
-        if len(own) * CELL**2 >= MINIMUM_AREA:
-            found[number] = np.zeros_like(piece)
-            found[number][tuple(own.T)] = True
-    return found
