@@ -12,8 +12,8 @@ from scipy import ndimage
 
 from envs.segmentation.height_map import HeightMap, Mask, cells_of, map_heights
 from envs.segmentation.regions import AROUND, box_around, find_regions, split_at_necks
-from envs.segmentation.registration import shape_of
 from envs.segmentation.segmenter import Pixels
+from envs.segmentation.shapes import shape_of
 from envs.segmentation.tracking import Track, follow_tracks
 from envs.sensors.sensor import DepthImage
 from envs.workspace import MAXIMUM_OBJECTS

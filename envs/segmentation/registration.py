@@ -1,251 +1,198 @@
 """Telling apart objects that touch, by the shapes that they had when they stood alone.
 
 Analysis by synthesis: the shapes are laid over the map of heights so that together they explain as much of it as they
-can, and nothing that is not there, without overlapping. One shape after the other is laid where it explains the most
-of what the others leave over (block coordinate descent; each step searches all places and turns), beginning in
-several orders; then all are moved and turned a little, as long as that helps.
+can, and nothing that is not there, without overlapping. One after the other is laid where it explains most of what
+the others leave over, in several orders; then each is taken up and laid anew until nothing improves (block coordinate
+descent, each step a search of all places and turns). Costs are in cells.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.segmentation.height_map import CELL, Mask
+from envs.segmentation.height_map import CELL
+from envs.segmentation.shapes import Pose, Shape
 
-TOLERANCE, CAP = 0.004, 0.02  # metres of height by which a cell may differ at no cost, and from which it costs 1
-EMPTY, OVERLAP = 0.7, 0.7  # what a cell of a shape costs where nothing stands, and where another shape lies
+LEVEL = 0.004  # metres; heights are compared in steps of this
+TOLERANCE, CAP = 0.004, 0.02  # metres of height by which a cell may differ at no cost, and where the cost is highest
+MISFIT = 0.7  # highest cost of a cell on which a shape lies; a cell on which none lies costs 1
+EMPTY, OVERLAP = 0.7, 0.7  # cost of a shape's cell where nothing stands, and of one where another shape lies already
 PRESENT = 0.2  # of its cells that a shape must save, or it is not there
-PER_METRE, PER_RADIAN = 1.0, 0.05  # of its cells that moving and turning a shape costs
-TURNS = np.radians(np.arange(-96, 97, 12))  # radians that are searched
+PER_METRE, PER_RADIAN = 1.0, 0.05  # of its cells, the cost of moving and turning a shape
+TURNS = np.radians(np.arange(-96, 97, 12))  # radians, searched
 STRIDE = 2  # cells between the places that are searched
 SAMPLE = 80  # cells, about, by which a shape is judged in the search
-ORDERS = 4  # orders of the shapes, at most, to begin with
-SWEEPS = 3
+REFINED = 3  # best finds of a search that are refined
+COARSE, FINE = (1.0, 0.1), (0.5, 0.05)  # steps of refining: cells and radians
+ORDERS, SWEEPS = 4, 3  # at most
+IMPROVEMENT = 0.5  # cells that laying a shape anew must save
+POOR = 0.6  # of a shape's cells; where one saves less, objects taken to stand still may not do so
+
+Table = NDArray[np.float32]
+"""What laying a shape saves on each cell, by the level of the shape's height there: [1 + occupied cells, levels]."""
 
 
-@dataclass(frozen=True)
-class Pose:
-    """Where a shape's middle lies on the map (row, column), in cells, and how far it is turned, radians."""
-
-    row: float
-    column: float
-    turn: float
-
-
-@dataclass(frozen=True)
-class Shape:
-    """An object's heights when it stood alone, and where it was last.
-
-    Attributes:
-        patch: [h, w] metres above the table; 0 where it is not. middle: [2] cells in the patch. pose: see `Pose`.
-    """
-
-    patch: NDArray[np.float32]
-    middle: tuple[float, float]
-    pose: Pose
-
-    @property
-    def area(self) -> int:
-        """In cells."""
-        return int((self.patch > 0.0).sum())
-
-
-def shape_of(region: Mask, heights: NDArray[np.float32]) -> Shape:
-    """The shape of a region of the map that is not empty."""
-    rows, columns = np.nonzero(region)
-    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    patch = np.where(region[box], heights[box], 0.0).astype(np.float32)
-    # The cell nearest to the middle, so that it lies on the object, however bent that is.
-    at = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
-    row, column = int(rows[at]), int(columns[at])
-    return Shape(patch, (row - int(rows.min()), column - int(columns.min())), Pose(row, column, 0.0))
-
-
-def turned(shape: Shape, turn: float, row: float = 0.0, column: float = 0.0) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """The cells [C, 2] that a turned shape covers when its middle is at (row, column), and its heights there [C]."""
-    high, wide = shape.patch.shape
-    corners = np.array([(0, 0), (0, wide - 1), (high - 1, 0), (high - 1, wide - 1)]) - shape.middle
-    cosine, sine = np.cos(turn), np.sin(turn)
-    moved = corners @ np.array([[cosine, sine], [-sine, cosine]]) + (row, column)
-    low, top = np.floor(moved.min(axis=0)).astype(int), np.ceil(moved.max(axis=0)).astype(int)
-    rows, columns = np.arange(low[0], top[0] + 1), np.arange(low[1], top[1] + 1)
-    down, right = (rows - row)[:, None], (columns - column)[None]
-    source_rows = np.rint(cosine * down + sine * right + shape.middle[0]).astype(np.intp)
-    source_columns = np.rint(cosine * right - sine * down + shape.middle[1]).astype(np.intp)
-    inside = (source_rows >= 0) & (source_rows < high) & (source_columns >= 0) & (source_columns < wide)
-    heights = np.zeros(inside.shape, np.float32)
-    heights[inside] = shape.patch[source_rows[inside], source_columns[inside]]
-    covered = np.nonzero(heights)
-    return np.stack((rows[covered[0]], columns[covered[1]]), axis=-1), heights[covered]
-
-
-class Explanation:
-    """Which shapes lie where on a map, and how well they explain it.
+class Layout:
+    """Shapes on a map.
 
     Args:
-        heights: [I, J] the map; 0 where nothing is to be explained.
+        heights: [I, J] the map, metres; 0 where nothing is to be explained.
+        shapes: none is on the map to begin with.
     """
 
     def __init__(self, heights: NDArray[np.float32], shapes: Sequence[Shape]) -> None:
-        self.heights, self.shapes = heights, shapes
-        self.poses: dict[int, Pose] = {}
-        # A border, so that shapes may reach beyond the map.
-        self.border = max(int(np.hypot(*shape.patch.shape)) for shape in shapes) + 2
-        self.padded = np.pad(heights, self.border)
-        self.layers: dict[int, tuple[NDArray[np.intp], NDArray[np.float32]]] = {}
+        self.shapes, self.poses = shapes, dict[int, Pose]()
+        self._areas = [shape.area for shape in shapes]
+        self._layers: dict[int, tuple[NDArray[np.intp], NDArray[np.intp]]] = {}
+        self._border = 2 + max(int(np.hypot(*shape.patch.shape)) for shape in shapes)
+        self._occupied = np.argwhere(heights > 0.0)
+        rows = np.zeros(heights.shape, np.intp)  # of the table; 0 where nothing stands
+        rows[heights > 0.0] = 1 + np.arange(len(self._occupied))
+        self._rows = np.pad(rows, self._border)
+        seen = np.concatenate(([0.0], heights[heights > 0.0]))
+        levels = LEVEL * np.arange(1 + _levels(np.array([shape.patch.max() for shape in shapes])).max())
+        difference = np.abs(seen[:, None] - levels) - TOLERANCE
+        self._misfit = (MISFIT * np.clip(difference / (CAP - TOLERANCE), 0.0, 1.0)).astype(np.float32)
 
-    def _layer(self, number: int, pose: Pose) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        cells, heights = turned(self.shapes[number], pose.turn, pose.row, pose.column)
-        inside = np.all((cells + self.border >= 0) & (cells + self.border < self.padded.shape), axis=-1)
-        flat = np.ravel_multi_index(tuple((cells[inside] + self.border).T), self.padded.shape)
-        return flat, heights[inside]
-
-    def place(self, number: int, pose: Pose | None) -> None:
+    def lay(self, number: int, pose: Pose | None) -> None:
+        """Lay a shape at a pose, or take it away."""
         self.poses.pop(number, None)
-        self.layers.pop(number, None)
+        self._layers.pop(number, None)
         if pose is not None:
-            self.poses[number] = pose
-            self.layers[number] = self._layer(number, pose)
+            self.poses[number], self._layers[number] = pose, self._layer(number, pose)
 
-    def residual(self, without: int | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """What each cell costs as the shapes lie, 0 to 1, and whether any lies on it, without one of them; flat."""
-        flat = self.padded.ravel()
-        cost = (flat > 0.0).astype(np.float32)
-        covered = np.zeros(flat.shape, np.bool_)
-        for number, (cells, heights) in self.layers.items():
+    def savings(self, without: int) -> Table:
+        """What laying one more shape saves, as the others lie."""
+        cost, covered = np.ones(len(self._misfit), np.float32), np.zeros(len(self._misfit), np.bool_)
+        for number, (rows, levels) in self._layers.items():
             if number != without:
-                cost[cells] = np.minimum(cost[cells], _differ(flat[cells], heights))
-                covered[cells] = True
-        return cost, covered
+                cost[rows] = np.minimum(cost[rows], self._misfit[rows, levels])
+                covered[rows] = True
+        table = np.maximum(cost[:, None] - self._misfit, 0.0) - OVERLAP * covered[:, None]
+        table[0] = -EMPTY
+        return table.astype(np.float32)
 
-    def prior(self, number: int, rows, columns, turn) -> NDArray[np.float64]:
-        old = self.shapes[number].pose
-        distance = np.hypot(rows - old.row, columns - old.column) * CELL
-        away = np.abs(turn - old.turn)
-        return self.shapes[number].area * (PER_METRE * distance + PER_RADIAN * away)
+    def gain(self, number: int, pose: Pose, table: Table) -> float:
+        """What laying a shape at a pose saves, less what it costs to move there."""
+        return float(table[self._layer(number, pose)].sum() - self._moving(number, pose.row, pose.column, pose.turn))
 
-    def gain(self, number: int, pose: Pose, residual) -> float:
-        """What is saved by laying a shape at a pose."""
-        cost, covered = residual
-        cells, heights = self._layer(number, pose)
-        saved = _saved(self.padded.ravel()[cells], heights, cost[cells], covered[cells]).sum()
-        return float(saved - self.prior(number, pose.row, pose.column, pose.turn))
-
-    def search(self, number: int, residual) -> tuple[float, Pose]:
-        """The pose at which a shape saves the most, and what it saves."""
-        cost, covered = residual
-        shape, flat, width = self.shapes[number], self.padded.ravel(), self.padded.shape[1]
-        uncovered = ~covered.reshape(self.padded.shape)[self.border : -self.border, self.border : -self.border]
-        rows, columns = np.nonzero((self.heights > 0.0) & uncovered)
-        even = (rows % STRIDE == 0) & (columns % STRIDE == 0)
-        rows, columns = rows[even], columns[even]
-        if len(rows) == 0:
-            return -np.inf, shape.pose
-        places = (rows + self.border) * width + columns + self.border
-        best: list[tuple[float, Pose]] = []
-        for turn in TURNS:
-            cells, heights = turned(shape, shape.pose.turn + turn)
+    def search(self, number: int, table: Table) -> tuple[float, Pose]:
+        """The pose, of all, at which a shape saves the most, and how much."""
+        shape, width = self.shapes[number], self._rows.shape[1]
+        uncovered = np.append(False, table[1:].max(axis=1) > 0.0)
+        places = self._occupied[(self._occupied % STRIDE == 0).all(axis=1) & uncovered[1:]]
+        start = (places + self._border) @ (width, 1)
+        flat, found = self._rows.ravel(), [(self.gain(number, shape.pose, table), shape.pose)]
+        for turn in shape.pose.turn + TURNS if len(places) else ():
+            cells, heights = shape.laid(Pose(0.0, 0.0, turn))
             step = max(1, len(cells) // SAMPLE)
-            cells, heights = cells[::step], heights[::step]
-            offsets = cells[:, 0] * width + cells[:, 1]
-            at = places[:, None] + offsets[None]
-            np.clip(at, 0, flat.size - 1, out=at)
-            saved = _saved(flat[at], heights[None], cost[at], covered[at]).sum(axis=1) * (shape.area / len(cells))
-            saved = saved - self.prior(number, rows, columns, shape.pose.turn + turn)
-            for index in np.argsort(saved)[-2:]:
-                best.append((float(saved[index]), Pose(int(rows[index]), int(columns[index]), shape.pose.turn + turn)))
-        best.append((0.0, shape.pose))
-        best.sort(key=lambda one: -one[0])
-        refined = [self.refine(number, pose, residual) for pose in {pose: 0 for _, pose in best[:5]} | {shape.pose: 0}]
-        return max(refined, key=lambda one: one[0])
+            rows = flat[start[:, None] + cells[::step] @ (width, 1)]
+            saved = table[rows, _levels(heights[::step])].sum(axis=1) * (self._areas[number] / rows.shape[1])
+            saved = saved - self._moving(number, places[:, 0], places[:, 1], turn)
+            best = int(saved.argmax())
+            found.append((float(saved[best]), Pose(int(places[best, 0]), int(places[best, 1]), float(turn))))
+        found = [found[0], *sorted(found[1:], key=lambda one: -one[0])[:REFINED]]
+        return max((self.refine(number, pose, table, *COARSE) for _, pose in found), key=lambda one: one[0])
 
-    def refine(self, number: int, pose: Pose, residual) -> tuple[float, Pose]:
-        """Move and turn a shape a little as long as that helps."""
-        gain = self.gain(number, pose, residual)
-        for step, turn in ((1.0, 0.1), (0.5, 0.05)):
-            for _ in range(8):
-                options = [
-                    replace(pose, row=pose.row + step), replace(pose, row=pose.row - step),
-                    replace(pose, column=pose.column + step), replace(pose, column=pose.column - step),
-                    replace(pose, turn=pose.turn + turn), replace(pose, turn=pose.turn - turn),
-                ]
-                found = [(self.gain(number, option, residual), option) for option in options]
-                better, option = max(found, key=lambda one: one[0])
-                if better <= gain:
-                    break
-                gain, pose = better, option
-        return gain, pose
+    def refine(self, number: int, pose: Pose, table: Table, step: float, turn: float) -> tuple[float, Pose]:
+        """Move a shape by `step` cells and turn it by `turn` radians as long as that saves more."""
+        gain = self.gain(number, pose, table)
+        while True:
+            around = [replace(pose, row=pose.row + sign * step) for sign in (1, -1)]
+            around += [replace(pose, column=pose.column + sign * step) for sign in (1, -1)]
+            around += [replace(pose, turn=pose.turn + sign * turn) for sign in (1, -1)]
+            better, other = max(((self.gain(number, one, table), one) for one in around), key=lambda one: one[0])
+            if better <= gain:
+                return gain, pose
+            gain, pose = better, other
 
     def total(self) -> float:
-        cost, _ = self.residual()
-        total = float(cost.sum())
-        count = np.zeros(cost.shape, np.int16)
-        for number, (cells, _) in self.layers.items():
+        """The cost of the map as the shapes lie."""
+        cost, count = np.ones(len(self._misfit)), np.zeros(len(self._misfit))
+        total = 0.0
+        for number, (rows, levels) in self._layers.items():
             pose = self.poses[number]
-            total += float(self.prior(number, pose.row, pose.column, pose.turn))
-            count[cells] += 1
-        total += EMPTY * float((count[self.padded.ravel() == 0.0]).sum())
-        total += OVERLAP * float(np.maximum(count[self.padded.ravel() > 0.0] - 1, 0).sum())
-        total += PRESENT * sum(self.shapes[number].area for number in self.poses)
-        return total
+            cost[rows] = np.minimum(cost[rows], self._misfit[rows, levels])
+            count[rows] += 1
+            total += EMPTY * (rows == 0).sum() + PRESENT * self._areas[number]
+            total += self._moving(number, pose.row, pose.column, pose.turn)
+        return float(total + cost[1:].sum() + OVERLAP * np.maximum(count[1:] - 1, 0).sum())
 
     def owners(self) -> NDArray[np.intp]:
-        """The number of the shape that explains each cell [I, J] best; -1 for cells that no shape explains."""
-        owner = np.full(self.padded.size, -1)
-        least = np.full(self.padded.size, np.inf)
-        flat = self.padded.ravel()
-        for number, (cells, heights) in self.layers.items():
-            differ = np.abs(flat[cells] - heights)
-            better = (flat[cells] > 0.0) & (differ < least[cells])
-            owner[cells[better]], least[cells[better]] = number, differ[better]
-        b = self.border
-        return owner.reshape(self.padded.shape)[b:-b, b:-b]
+        """For each cell [I, J] the shape that lies on it and differs least from it; -1 where none lies."""
+        owner, least = np.full(len(self._misfit), -1), np.full(len(self._misfit), np.inf)
+        for number, (rows, levels) in self._layers.items():
+            better = self._misfit[rows, levels] < least[rows]
+            owner[rows[better]], least[rows[better]] = number, self._misfit[rows, levels][better]
+        owner[0] = -1
+        return owner[self._rows[self._border : -self._border, self._border : -self._border]]
+
+    def _layer(self, number: int, pose: Pose) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Row in the table and level of each cell of a shape."""
+        cells, heights = self.shapes[number].laid(pose)
+        cells = np.clip(cells + self._border, 0, np.array(self._rows.shape) - 1)
+        return self._rows[cells[:, 0], cells[:, 1]], _levels(heights)
+
+    def _moving(self, number: int, row, column, turn):  # type: ignore[no-untyped-def]
+        """What it costs to have moved from where the shape was last."""
+        last = self.shapes[number].pose
+        distance = np.hypot(row - last.row, column - last.column) * CELL
+        return self._areas[number] * (PER_METRE * distance + PER_RADIAN * abs(turn - last.turn))
 
 
-def _differ(seen, heights):
-    return np.clip((np.abs(seen - heights) - TOLERANCE) / (CAP - TOLERANCE), 0.0, 1.0)
+def _levels(heights: NDArray[np.floating]) -> NDArray[np.intp]:
+    return np.rint(heights / LEVEL).astype(np.intp)
 
 
-def _saved(seen, heights, cost, covered):
-    gained = cost - np.minimum(cost, _differ(seen, heights)) - OVERLAP * covered
-    return np.where(seen > 0.0, gained, -EMPTY)
+def explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequence[int]) -> Layout:
+    """Lay shapes over a map [I, J]; those in `still` have hardly moved, unless that leaves another unexplained."""
+    layout = _explain(heights, shapes, still)
+    if still and any(_gain(layout, number) < POOR * shape.area for number, shape in enumerate(shapes)):
+        layout = min(layout, _explain(heights, shapes, ()), key=Layout.total)
+    return layout
 
 
-def explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequence[int]) -> Explanation:
-    """Lay shapes over a map; those in `still` are known to have hardly moved."""
+def _gain(layout: Layout, number: int) -> float:
+    """What a shape saves where it lies; what it must save at least where it is absent."""
+    if number not in layout.poses:
+        return PRESENT * layout.shapes[number].area
+    return layout.gain(number, layout.poses[number], layout.savings(number))
+
+
+def _explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequence[int]) -> Layout:
     movable = [number for number in range(len(shapes)) if number not in still]
-    movable.sort(key=lambda number: -shapes[number].area)
-    orders = list(permutations(movable))
-    if len(orders) > ORDERS:
-        orders = [orders[int(i)] for i in np.linspace(0, len(orders) - 1, ORDERS)]
-    best = None
-    for order in orders:
-        one = Explanation(heights, shapes)
+    orders = list(permutations(sorted(movable, key=lambda number: -shapes[number].area)))
+    begun = []
+    for order in orders[:: -(-len(orders) // ORDERS)]:
+        layout = Layout(heights, shapes)
         for number in still:
-            one.place(number, shapes[number].pose)
+            layout.lay(number, shapes[number].pose)
         for number in order:
-            gain, pose = one.search(number, one.residual(number))
-            one.place(number, pose if gain > PRESENT * shapes[number].area else None)
-        total = one.total()
-        if best is None or total < best[0]:
-            best = total, one
-    total, one = best
+            gain, pose = layout.search(number, layout.savings(number))
+            layout.lay(number, pose if gain > PRESENT * shapes[number].area else None)
+        begun.append(layout)
+    layout = min(begun, key=Layout.total)
     for _ in range(SWEEPS):
-        changed = False
-        for number in range(len(shapes)):
-            residual = one.residual(number)
-            least = PRESENT * shapes[number].area
-            old = one.gain(number, one.poses[number], residual) if number in one.poses else least
-            look = one.refine if number in still else lambda n, pose, r: one.search(n, r)
-            gain, pose = look(number, one.poses.get(number), residual)
-            if max(gain, least) > old + 0.5:
-                one.place(number, pose if gain > least else None)
-                changed = True
-        if not changed:
+        if not any([_lay_anew(layout, number, number in still) for number in range(len(shapes))]):
             break
-    return one
+    for number, pose in list(layout.poses.items()):
+        layout.lay(number, layout.refine(number, pose, layout.savings(number), *FINE)[1])
+    return layout
+
+
+def _lay_anew(layout: Layout, number: int, still: bool) -> bool:
+    """Lay a shape where it saves the most as the others lie; whether that is elsewhere."""
+    table, former, least = layout.savings(number), _gain(layout, number), PRESENT * layout.shapes[number].area
+    if still:
+        gain, pose = layout.refine(number, layout.poses[number], table, *COARSE)
+    else:
+        gain, pose = layout.search(number, table)
+    if max(gain, least) <= former + IMPROVEMENT:
+        return False
+    layout.lay(number, pose if gain > least or still else None)
+    return True

@@ -16,7 +16,8 @@ from scipy.optimize import linear_sum_assignment
 
 from envs.segmentation.height_map import CELL, HeightMap, Mask
 from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_owner
-from envs.segmentation.registration import Pose, Shape, explain, shape_of
+from envs.segmentation.registration import explain
+from envs.segmentation.shapes import Pose, Shape, shape_of
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
 INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
@@ -160,7 +161,7 @@ def _match_together(moved, tracks, pieces, found, heights):
     box = box_around(concerned, 0)
     origin = np.array([box[0].start, box[1].start])
     numbers = [*still, *moved]
-    shapes = [_shifted(tracks[n].shape, -origin) for n in numbers]
+    shapes = [tracks[n].shape.shifted(*(-origin).tolist()) for n in numbers]
     explained = explain(np.where(concerned, heights.heights, 0.0)[box], shapes, list(range(len(still))))
     owners = explained.owners()
     result, poses = {}, {}
@@ -186,10 +187,6 @@ def _match_together(moved, tracks, pieces, found, heights):
                 if rest[column].area >= SHARED * tracks[absent[row]].area:
                     result[absent[row]] = rest[column].region
     return result, poses
-
-
-def _shifted(shape: Shape, by) -> Shape:
-    return replace(shape, pose=replace(shape.pose, row=shape.pose.row + int(by[0]), column=shape.pose.column + int(by[1])))
 
 
 def _cost(track: Track, piece: Track) -> float:
