@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from envs.segmentation.height_map import CELL, HeightMap, Mask
 from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_owner
-from envs.segmentation.registration import explain
+from envs.segmentation.registration import explain, fit
 from envs.segmentation.shapes import Pose, Shape, shape_of
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
@@ -29,6 +29,7 @@ FRAGMENT, PENALTY = 0.4, 0.15  # a piece of less than this share is worth these 
 SHARED = 0.3  # of its own area by which a piece must exceed another object's for an object to hide in it too
 ALIKE = 0.65
 ALONE = 2
+RELEARN = 0.4
 REACH = 0.03  # metres from a moved object's region within which a smaller one is taken for its other half
 
 
@@ -77,11 +78,13 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Tr
     pieces = [labels == 1 + number for number in range(count)]
     pieces = [piece for piece in pieces if piece.sum() * CELL**2 >= MINIMUM_AREA]
     poses: dict[int, Pose] = {}
+    concerned: set[int] = set()
     if moved and pieces:
         near = ndimage.binary_dilation(taken, AROUND, iterations=3)
         matched = None if any((piece & near).any() for piece in pieces) else _match_apart(moved, tracks, pieces, new)
         if matched is None:
             matched, poses = _match_together(moved, tracks, pieces, found, heights)
+            concerned = set(matched)
         for number, region in matched.items():
             found[number] = region
     present = [number for number, region in enumerate(found) if region is not None]
@@ -91,10 +94,10 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Tr
         near = ndimage.binary_dilation(np.any(regions, axis=0), AROUND, iterations=2) & heights.occupied  # type: ignore[arg-type]
         for index, number in enumerate(present):
             found[number] = near & (owner == index)
-    return _remembered(tracks, found, poses, new)
+    return _remembered(tracks, found, poses, concerned, new)
 
 
-def _remembered(tracks, found, poses, new) -> list[Track | None]:
+def _remembered(tracks, found, poses, concerned, new) -> list[Track | None]:
     """New tracks; the shape of an object that touches another stays the one that it had when it stood alone."""
     result: list[Track | None] = []
     for number, region in enumerate(found):
@@ -105,7 +108,7 @@ def _remembered(tracks, found, poses, new) -> list[Track | None]:
         box = box_around(region, ALONE + 1)
         alone = not (ndimage.binary_dilation(region[box], AROUND, iterations=ALONE) & others[box]).any()
         track = tracks[number]
-        if alone:
+        if alone or (number in concerned and number not in poses):
             shape = shape_of(region, new)
         else:
             shape = replace(track.shape, pose=poses.get(number, track.shape.pose))
@@ -171,6 +174,8 @@ def _match_together(moved, tracks, pieces, found, heights):
             result[number] = np.zeros(heights.heights.shape, np.bool_)
             result[number][box] = own
             pose = explained.poses[index]
+            if fit(explained, index) < RELEARN:
+                continue
             poses[number] = replace(pose, row=pose.row + int(origin[0]), column=pose.column + int(origin[1]))
     # What no shape explains may be an object that shows another side now.
     absent = [n for n in moved if n not in result]
