@@ -16,7 +16,9 @@ TOLERANCE, CAP = 0.004, 0.02  # metres of height by which a cell may differ at n
 MISFIT = 0.7  # highest cost of a cell on which a shape lies; a cell on which none lies costs 1
 EMPTY, OVERLAP = 0.7, 0.7  # cost of a shape's cell where nothing stands, and of one where another shape lies already
 PRESENT = 0.2  # of its cells that a shape must save, or it is not there
-PER_METRE, PER_RADIAN = 1.0, 0.05  # of its cells, the cost of moving and turning a shape
+# Of its cells, the cost of moving a shape 0.1 m and of turning it by a radian. The cost grows faster than the distance,
+# so that of alike objects that are pushed in a row none is taken to have passed the others.
+MOVING, TURNING, POWER = 0.1, 0.05, 1.5
 TURNS = np.radians(np.arange(-96, 97, 12))  # radians, searched
 STRIDE = 2  # cells between the places that are searched
 NEAR = 8  # cells around a place that are searched when it is known about
@@ -159,4 +161,4 @@ class Arrangement:
         """What it costs a shape to have moved to places [..., 2] and turned."""
         last = self.shapes[number].pose
         distance = np.hypot(places[..., 0] - last.row, places[..., 1] - last.column) * CELL
-        return self.areas[number] * (PER_METRE * distance + PER_RADIAN * abs(turn - last.turn))
+        return self.areas[number] * (MOVING * (distance / 0.1) ** POWER + TURNING * abs(turn - last.turn))

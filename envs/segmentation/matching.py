@@ -31,13 +31,11 @@ class Match:
     shape: Shape | None
 
 
-def match_apart(
-    moved: Mapping[int, Shape], pieces: Sequence[Mask], heights: NDArray[np.float32]
-) -> dict[int, Match] | None:
+def match_apart(moved: Mapping[int, Shape], pieces: Sequence[Mask], heights: HeightMap) -> dict[int, Match] | None:
     """The piece of each moved object by its number; None if pieces are not one object each."""
     if len(pieces) != len(moved):
         return None
-    seen = [shape_of(piece, heights) for piece in pieces]
+    seen = [shape_of(piece, heights.filled) for piece in pieces]
     chosen = _assign(list(moved.values()), seen)
     for shape, column in zip(moved.values(), chosen, strict=True):
         ratio = seen[column].area / shape.area
@@ -61,11 +59,11 @@ def match_together(
         touched[labels[standing[number].region]] = True
     touched[0] = False
     shapes |= moved
-    concerned = touched[labels] & heights.occupied
+    concerned = touched[labels] & (heights.filled > 0.0)
     box = box_around(concerned, 0)
     row, column = box[0].start, box[1].start
     arrangement = explain(
-        np.where(concerned, heights.heights, 0.0)[box], [one.shifted(-row, -column) for one in shapes.values()], still
+        np.where(concerned, heights.filled, 0.0)[box], [one.shifted(-row, -column) for one in shapes.values()], still
     )
     owners = np.full(concerned.shape, -1)
     owners[box] = arrangement.owners()
@@ -88,7 +86,7 @@ def _left_over(
     labels, count = ndimage.label(concerned & ~ndimage.binary_dilation(explained, AROUND), AROUND)
     pieces = [labels == 1 + number for number in range(count)]
     pieces = [piece for piece in pieces if piece.sum() * CELL**2 >= MINIMUM_AREA]
-    seen = [shape_of(piece, heights.heights) for piece in pieces]
+    seen = [shape_of(piece, heights.filled) for piece in pieces]
     matched = zip(absent.items(), _assign(list(absent.values()), seen), strict=True)
     return {
         number: Match(pieces[column], None)

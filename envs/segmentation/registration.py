@@ -8,7 +8,7 @@ descent, each step a search of all places and turns), and two that may have been
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, permutations
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from envs.segmentation.arrangement import FINE, PRESENT, Arrangement
 from envs.segmentation.shapes import Shape
 
-ORDERS, SWEEPS = 4, 3  # at most
+ORDERS, SWEEPS = 6, 3  # at most
 IMPROVEMENT = 0.5  # cells, at least, that another arrangement must save
 GOOD = 0.75  # of a shape's cells; one that saves so much is not looked for elsewhere
 POOR = 0.6  # of a shape's cells; where one saves less, objects taken to stand still may not do so
@@ -40,14 +40,16 @@ def _arrange(arrangement: Arrangement, still: Sequence[int]) -> None:
     """Lay all shapes as well as possible; those in `still` are moved a little at most."""
     shapes = arrangement.shapes
     movable = [number for number in range(len(shapes)) if number not in still]
-    orders = list(permutations(sorted(movable, key=lambda number: -shapes[number].area)))
+    movable.sort(key=lambda number: -shapes[number].area)
     begun = []
-    for order in orders[:: -(-len(orders) // ORDERS)]:
-        arrangement.set_out({number: shapes[number].pose for number in still})
+    for start, order in _starts(arrangement, movable):
+        arrangement.set_out({number: shapes[number].pose for number in (*still, *start)})
         for number in order:
             gain, pose = arrangement.search(number, arrangement.savings(number))
             arrangement.lay(number, pose if gain > PRESENT * shapes[number].area else None)
         begun.append((arrangement.total(), dict(arrangement.poses)))
+        if all(arrangement.saved(number) > GOOD * shape.area for number, shape in enumerate(shapes)):
+            break
     arrangement.set_out(min(begun, key=lambda one: one[0])[1])
     for _ in range(SWEEPS):
         improved = [_lay_anew(arrangement, number, number in still) for number in range(len(shapes))]
@@ -57,6 +59,18 @@ def _arrange(arrangement: Arrangement, still: Sequence[int]) -> None:
                 break
     for number, pose in list(arrangement.poses.items()):
         arrangement.lay(number, arrangement.refine(number, pose, arrangement.savings(number), FINE)[1])
+
+
+def _starts(arrangement: Arrangement, movable: Sequence[int]) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
+    """Which shapes to leave where they were last, and in which order to lay the others; the best guess comes first."""
+    arrangement.set_out({number: shape.pose for number, shape in enumerate(arrangement.shapes)})
+    areas = arrangement.areas
+    stay = [number for number in movable if arrangement.saved(number) >= POOR * areas[number]]
+    if stay:
+        yield stay, [number for number in movable if number not in stay]
+    orders = list(permutations(movable))
+    for order in orders[:: -(-len(orders) // ORDERS)]:
+        yield (), order
 
 
 def _lay_anew(arrangement: Arrangement, number: int, still: bool) -> bool:

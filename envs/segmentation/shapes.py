@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from envs.segmentation.height_map import Mask
+from envs.segmentation.regions import AROUND
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,13 @@ class Shape:
 
 
 def shape_of(region: Mask, heights: NDArray[np.float32]) -> Shape:
-    """The shape of a region [I, J], not empty, of a map [I, J]."""
+    """The shape of a region [I, J], not empty, of a map of heights [I, J], with its little gaps closed."""
     rows, columns = np.nonzero(region)
     first = int(rows.min()), int(columns.min())
     box = slice(first[0], int(rows.max()) + 1), slice(first[1], int(columns.max()) + 1)
     # The cell nearest to the mean lies on the object, however bent that is.
     middle = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
     row, column = int(rows[middle]), int(columns[middle])
-    patch = np.where(region[box], heights[box], 0.0).astype(np.float32)
+    closed = ndimage.binary_closing(np.pad(region[box], 1), AROUND)[1:-1, 1:-1]
+    patch = np.where(closed, heights[box], 0.0).astype(np.float32)
     return Shape(patch, (row - first[0], column - first[1]), Pose(row, column))

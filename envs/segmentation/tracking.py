@@ -19,6 +19,7 @@ from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_
 from envs.segmentation.shapes import Shape, shape_of
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
+CORE = 0.25  # of an object's cells must be left without its edge, if its edge is not to be looked at
 INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
 INVADED_CELLS = 3  # how wide around it
 SAME_HEIGHT = 0.008  # metres
@@ -42,7 +43,7 @@ class Track:
 
 def begin_track(region: Mask, heights: HeightMap) -> Track:
     """A new object, whose region must not be empty."""
-    return Track(region, heights.heights, shape_of(region, heights.heights))
+    return Track(region, heights.heights, shape_of(region, heights.filled))
 
 
 def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Track | None]:
@@ -59,7 +60,7 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Tr
     found = standing
     if moved and pieces:
         near = ndimage.binary_dilation(taken, AROUND, iterations=TOUCHING)
-        apart = None if (near & np.any(pieces, axis=0)).any() else match_apart(moved, pieces, heights.heights)
+        apart = None if (near & np.any(pieces, axis=0)).any() else match_apart(moved, pieces, heights)
         found = standing | (match_together(moved, standing, pieces, heights) if apart is None else apart)
     regions = _with_seams({number: match.region for number, match in found.items()}, heights)
     return [
@@ -106,7 +107,8 @@ def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
     box = box_around(track.region, INVADED_CELLS + 1)
     region, former, latest = track.region[box], track.heights[box], heights[box]
     core = ndimage.binary_erosion(region, AROUND)
-    core = core if core.any() else region
+    measured = former > 0.0
+    core = core if (core & measured).sum() >= CORE * (region & measured).sum() else region
     before, now = former[core], latest[core]
     # A cell without a measurement now and then says nothing.
     same = (np.abs(before - now) < SAME_HEIGHT).sum() >= STILL * (before > 0.0).sum()
