@@ -13,7 +13,7 @@ from scipy import ndimage
 from envs.segmentation.height_map import HeightMap, Mask, cells_of, map_heights
 from envs.segmentation.regions import AROUND, box_around, find_regions, split_at_necks
 from envs.segmentation.segmenter import Pixels
-from envs.segmentation.tracking import Track, follow_tracks
+from envs.segmentation.tracking import Track, begin_track, follow_tracks
 from envs.sensors.sensor import DepthImage
 from envs.workspace import MAXIMUM_OBJECTS
 
@@ -39,7 +39,7 @@ class ClusterSegmenter:
         first = _confirmed(regions, image, target)
         others = [region for number, region in enumerate(regions) if number != first]
         kept = [None if first is None else regions[first], *others][:MAXIMUM_OBJECTS]
-        self._tracks = [None if region is None else Track(region, heights.heights) for region in kept]
+        self._tracks = [None if region is None else begin_track(region, heights) for region in kept]
         return pixels_of(kept, heights)
 
     def follow(self, image: DepthImage) -> list[Pixels]:
@@ -49,11 +49,11 @@ class ClusterSegmenter:
             ValueError: the image shows no table.
         """
         heights = map_heights(image)
-        regions = follow_tracks(self._tracks, heights)
-        for number, region in enumerate(regions):
-            if region is not None:
-                self._tracks[number] = Track(region, heights.heights)
-        return pixels_of(regions, heights)
+        found = follow_tracks(self._tracks, heights)
+        for number, track in enumerate(found):
+            if track is not None:
+                self._tracks[number] = track
+        return pixels_of([None if track is None else track.region for track in found], heights)
 
 
 def _confirmed(regions: list[Mask], image: DepthImage, target: tuple[int, int] | None) -> int | None:

@@ -7,9 +7,11 @@ on the table.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from envs.camera import RAY_COLUMN, RAY_ROW
 from envs.segmentation.segmenter import Pixels
@@ -47,6 +49,11 @@ class HeightMap:
     def occupied(self) -> Mask:
         """Cells on which something stands, [I, J]."""
         return self.heights > 0.0
+
+    @cached_property
+    def filled(self) -> NDArray[np.float32]:
+        """The same heights, and on cells without any, in gaps up to two cells wide, about what is around them."""
+        return np.where(self.occupied, self.heights, ndimage.grey_closing(self.heights, (3, 3))).astype(np.float32)
 
 
 def map_heights(image: DepthImage) -> HeightMap:

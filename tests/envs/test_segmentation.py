@@ -6,6 +6,7 @@ import inspect
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ from envs.scene import Scene
 from envs.segmentation import SEGMENTERS, ClusterSegmenter, MaskSegmenter, segmenter_of
 from envs.segmentation.height_map import CELL, ORIGIN, fit_table
 from envs.segmentation.regions import split_at_necks
-from envs.segmentation.splitting import split_by_shapes
+from envs.segmentation.registration import explain
+from envs.segmentation.shapes import Pose, shape_of
 from envs.sensors import CAMERAS, DepthImage
 
 ROOT = Path(__file__).parents[2]
@@ -176,16 +178,104 @@ def test_objects_that_touch_with_a_corner_come_apart_and_a_bent_one_does_not() -
     assert len(split_at_necks(bent)) == 1
 
 
+def test_three_in_a_row_that_touch_and_are_pushed_on_keep_their_places_until_they_part() -> None:
+    sizes, row = ((0.03, 0.03), (0.05, 0.03), (0.04, 0.02)), np.array([-0.062, 0.0, 0.052])
+    apart = table(CAMERA, *[(0.6, y, *size) for y, size in zip((-0.2, 0.0, 0.2), sizes, strict=True)])
+    segmenter = ClusterSegmenter()
+    first = [center(apart, pixels)[1] for pixels in segmenter.start(apart, pixel(apart, 0.6, 0.0))]
+    order = np.argsort(first)
+    for x in (0.0, 0.03, 0.06):
+        pushed = table(CAMERA, *[(0.6 + x, y + x / 3, *size) for y, size in zip(row, sizes, strict=True)])
+        ys = np.array([center(pushed, pixels)[1] for pixels in segmenter.follow(pushed)])
+        np.testing.assert_allclose(ys[order], row + x / 3, atol=0.008)
+    ys = np.array([center(apart, pixels)[1] for pixels in segmenter.follow(apart)])
+    np.testing.assert_allclose(ys, first, atol=0.004)
+
+
+def test_a_bent_object_that_lies_around_another_is_told_from_it() -> None:
+    def bent(x: float, y: float) -> list[tuple[float, float, float, float]]:
+        return [(x, y, 0.015, 0.07), (x + 0.05, y - 0.055, 0.05, 0.015), (x + 0.05, y + 0.055, 0.05, 0.015)]
+
+    apart = table(CAMERA, *bent(0.4, 0.0), (0.65, 0.0, 0.025, 0.025))
+    within = table(CAMERA, *bent(0.4, 0.0), (0.442, 0.01, 0.025, 0.025))
+    segmenter = ClusterSegmenter()
+    segmenter.start(apart, pixel(apart, 0.65, 0.0))
+    square, _ = segmenter.follow(within)
+    np.testing.assert_allclose(center(within, square)[:2], (0.442, 0.01), atol=0.008)
+
+
+def test_the_shape_from_when_an_object_stood_alone_is_remembered_while_it_touches_another() -> None:
+    apart = table(CAMERA, (0.6, 0.0, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
+    touching = table(CAMERA, (0.6, 0.11, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
+    segmenter = ClusterSegmenter()
+    segmenter.start(apart, pixel(apart, 0.6, 0.0))
+    before = [track.shape for track in segmenter._tracks]
+    segmenter.follow(touching)
+    after = [track.shape for track in segmenter._tracks]
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one.patch, other.patch)
+    moved = np.subtract((after[0].pose.row, after[0].pose.column), (before[0].pose.row, before[0].pose.column)) * CELL
+    np.testing.assert_allclose(moved, (0.0, 0.11), atol=0.006)
+    segmenter.follow(apart)
+    assert segmenter._tracks[0].shape is not after[0]
+
+
+def boxes_on_map(*boxes: tuple[float, float, float, float, float, float]) -> list[np.ndarray]:
+    """Maps of heights, each of one box (row, column, turn, half height, half width in cells, metres high)."""
+    rows, columns = np.indices((80, 80))
+    maps = []
+    for row, column, turn, high, wide, tall in boxes:
+        down = np.cos(turn) * (rows - row) + np.sin(turn) * (columns - column)
+        right = np.cos(turn) * (columns - column) - np.sin(turn) * (rows - row)
+        maps.append(np.where((np.abs(down) <= high) & (np.abs(right) <= wide), tall, 0.0).astype(np.float32))
+    return maps
+
+
+SIDES = ((6.0, 9.0, 0.045), (5.0, 5.0, 0.07), (4.0, 10.0, 0.02))  # cells, metres
+
+
 @settings(deadline=None, max_examples=10)
-@given(st.floats(-0.4, 0.4), st.floats(-0.03, 0.03), st.floats(-0.03, 0.03))
-def test_cells_go_to_the_shape_that_they_come_from(turn: float, x: float, y: float) -> None:
-    grid = np.stack(np.meshgrid(np.arange(0, 0.06, CELL), np.arange(0, 0.08, CELL)), axis=-1).reshape(-1, 2)
-    shapes = [np.column_stack((grid + offset, np.full(len(grid), high))) for offset, high in ((0.0, 0.02), (0.1, 0.03))]
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    cells = np.concatenate(shapes)
-    cells = np.column_stack((cells[:, :2] @ rotation.T + (x, y), cells[:, 2]))
-    owners = split_by_shapes(cells, shapes).owners
-    assert (owners[: len(grid)] == 0).mean() > 0.95 and (owners[len(grid) :] == 1).mean() > 0.95
+@given(st.floats(-0.3, 0.3), st.integers(-6, 6), st.integers(-6, 6), st.permutations(range(3)))
+def test_cells_go_to_the_shape_that_they_come_from(turn: float, down: int, right: int, order: list[int]) -> None:
+    before = [one[0] for one in (boxes_on_map((20 * n + 20, 40, 0.0, *sides)) for n, sides in enumerate(SIDES))]
+    shapes = [shape_of(one > 0, one) for one in before]
+    places = np.cumsum([0.0, *[SIDES[a][0] + SIDES[b][0] + 1 for a, b in pairwise(order)]])
+    after = np.zeros((3, 80, 80), np.float32)
+    for n, place in zip(order, places, strict=True):  # in a row, each against the next, all turned
+        along = place - places.mean()
+        (after[n],) = boxes_on_map(
+            (40 + down + along * np.cos(turn), 40 + right + along * np.sin(turn), turn, *SIDES[n])
+        )
+    owners = explain(after.max(axis=0), shapes, ()).owners()
+    for n in range(3):
+        assert (owners[after[n] > 0] == n).mean() > 0.85
+
+
+def test_a_shape_that_is_not_on_the_map_is_not_laid_there() -> None:
+    maps = boxes_on_map((20, 40, 0.0, *SIDES[0]), (45, 40, 0.0, *SIDES[1]))
+    shapes = [shape_of(one > 0, one) for one in maps]
+    assert set(explain(maps[0], shapes, ()).poses) == {0}
+    assert set(explain(maps[0] + maps[1], shapes, ()).poses) == {0, 1}
+
+
+def test_an_object_taken_to_stand_still_may_turn_out_to_have_moved_on() -> None:
+    low, high = (30, 40, 0.0, 6.0, 8.0, 0.04), (43, 40, 0.0, 6.0, 5.0, 0.04)
+    shapes = [shape_of(one > 0, one) for one in boxes_on_map(low, high)]
+    pushed = boxes_on_map((43, 40, *low[2:]), (56, 40, *high[2:]))  # the first stands where the second stood
+    owners = explain(np.maximum(*pushed), shapes, still=[1]).owners()
+    for n in range(2):
+        assert (owners[pushed[n] > 0] == n).mean() > 0.85
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(-3.1, 3.1), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
+def test_a_shape_covers_as_many_cells_wherever_it_is_laid(turn: float, row: float, column: float) -> None:
+    (one,) = boxes_on_map((40, 40, 0.0, *SIDES[0]))
+    shape = shape_of(one > 0, one)
+    cells, heights = shape.laid(Pose(row, column, turn))
+    assert len(np.unique(cells, axis=0)) == len(cells) == pytest.approx(shape.area, rel=0.1)
+    np.testing.assert_allclose(cells.mean(axis=0), (row, column), atol=1.0)
+    assert set(heights) == {np.float32(SIDES[0][2])}
 
 
 def test_the_map_covers_the_table() -> None:

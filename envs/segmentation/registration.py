@@ -1,0 +1,103 @@
+"""Telling apart objects that touch, by the shapes that they had when they stood alone.
+
+Analysis by synthesis: the shapes are laid over the map of heights so that together they explain as much of it as they
+can, and nothing that is not there, without overlapping. One after the other is laid where it explains most of what
+the others leave over, in several orders; then each is taken up and laid anew until nothing improves (block coordinate
+descent, each step a search of all places and turns), and two that may have been taken for each other are exchanged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations, permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.segmentation.arrangement import FINE, PRESENT, Arrangement
+from envs.segmentation.shapes import Shape
+
+ORDERS, SWEEPS = 6, 3  # at most
+IMPROVEMENT = 0.5  # cells, at least, that another arrangement must save
+GOOD = 0.75  # of a shape's cells; one that saves so much is not looked for elsewhere
+POOR = 0.6  # of a shape's cells; where one saves less, objects taken to stand still may not do so
+EXCHANGED = 0.4  # ratio of the areas, at least, of two shapes that may have been taken for each other
+
+
+def explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequence[int]) -> Arrangement:
+    """Lay shapes over a map [I, J]; those in `still` have hardly moved, unless that leaves another unexplained."""
+    arrangement = Arrangement(heights, shapes)
+    _arrange(arrangement, still)
+    if still and any(arrangement.saved(number) < POOR * shape.area for number, shape in enumerate(shapes)):
+        poses, total = dict(arrangement.poses), arrangement.total()
+        _arrange(arrangement, ())
+        if arrangement.total() > total:
+            arrangement.set_out(poses)
+    return arrangement
+
+
+def _arrange(arrangement: Arrangement, still: Sequence[int]) -> None:
+    """Lay all shapes as well as possible; those in `still` are moved a little at most."""
+    shapes = arrangement.shapes
+    movable = [number for number in range(len(shapes)) if number not in still]
+    movable.sort(key=lambda number: -shapes[number].area)
+    begun = []
+    for start, order in _starts(arrangement, movable):
+        arrangement.set_out({number: shapes[number].pose for number in (*still, *start)})
+        for number in order:
+            gain, pose = arrangement.search(number, arrangement.savings(number))
+            arrangement.lay(number, pose if gain > PRESENT * shapes[number].area else None)
+        begun.append((arrangement.total(), dict(arrangement.poses)))
+        if all(arrangement.saved(number) > GOOD * shape.area for number, shape in enumerate(shapes)):
+            break
+    arrangement.set_out(min(begun, key=lambda one: one[0])[1])
+    for _ in range(SWEEPS):
+        improved = [_lay_anew(arrangement, number, number in still) for number in range(len(shapes))]
+        if not any(improved):
+            exchanged = [_exchange(arrangement, *pair) for pair in combinations(movable, 2)]
+            if not any(exchanged):
+                break
+    for number, pose in list(arrangement.poses.items()):
+        arrangement.lay(number, arrangement.refine(number, pose, arrangement.savings(number), FINE)[1])
+
+
+def _starts(arrangement: Arrangement, movable: Sequence[int]) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
+    """Which shapes to leave where they were last, and in which order to lay the others; the best guess comes first."""
+    arrangement.set_out({number: shape.pose for number, shape in enumerate(arrangement.shapes)})
+    areas = arrangement.areas
+    stay = [number for number in movable if arrangement.saved(number) >= POOR * areas[number]]
+    if stay:
+        yield stay, [number for number in movable if number not in stay]
+    orders = list(permutations(movable))
+    for order in orders[:: -(-len(orders) // ORDERS)]:
+        yield (), order
+
+
+def _lay_anew(arrangement: Arrangement, number: int, still: bool) -> bool:
+    """Lay a shape where it saves the most as the others lie; whether that is elsewhere."""
+    table, former = arrangement.savings(number), arrangement.saved(number)
+    least = PRESENT * arrangement.areas[number]
+    if still or former > GOOD * arrangement.areas[number]:
+        gain, pose = arrangement.refine(number, arrangement.poses[number], table)
+    else:
+        gain, pose = arrangement.search(number, table)
+    if max(gain, least) <= former + IMPROVEMENT:
+        return False
+    arrangement.lay(number, pose if gain > least or still else None)
+    return True
+
+
+def _exchange(arrangement: Arrangement, one: int, other: int) -> bool:
+    """Lay two shapes each where the other lies, if that is better; whether it is."""
+    poses, total = dict(arrangement.poses), arrangement.total()
+    small, large = sorted(arrangement.areas[number] for number in (one, other))
+    if one not in poses or other not in poses or small < EXCHANGED * large:
+        return False
+    arrangement.lay(one, None)
+    arrangement.lay(other, None)
+    for number, there in ((one, other), (other, one)):
+        arrangement.lay(number, arrangement.search(number, arrangement.savings(number), near=poses[there])[1])
+    if arrangement.total() < total - IMPROVEMENT:
+        return True
+    arrangement.set_out(poses)
+    return False
