@@ -256,7 +256,7 @@ def draw_into(folder: Path) -> Pictures:
 
     def picture(name: str, view: View, found: list[Pixels], colors: list[Any]) -> None:
         image, truth = view
-        figure, panels = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
+        figure, panels = pyplot.subplots(1, 3, figsize=(15, 4.8), layout="constrained")
         panels[0].imshow(np.where(image.depth > 0, image.depth, np.nan), cmap="viridis_r", vmin=0.8, vmax=1.1)
         labels = np.full((2, *image.depth.shape), np.nan)
         for number, mask in enumerate(truth):
