@@ -1,13 +1,19 @@
-"""The checkpoint that plan and evaluate load unless told otherwise."""
+"""The checkpoint that plan and evaluate load unless told otherwise, and the one for the Kinect beside it."""
 
 from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
 
 from cavin_pyro.building import build_guide, build_model, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
 
+SHIPPED = [default_checkpoint(), default_checkpoint().with_name("kinect.safetensors")]
 
-def test_the_shipped_checkpoint_is_small_and_builds_with_its_own_configuration() -> None:
-    path = default_checkpoint()
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_checkpoint_is_small_and_builds_with_its_own_configuration(path: Path) -> None:
     assert path.stat().st_size <= 3_000_000
     checkpoint = load_checkpoint(path)
     model = build_model(checkpoint.config)
@@ -17,8 +23,9 @@ def test_the_shipped_checkpoint_is_small_and_builds_with_its_own_configuration()
     assert not any(parameter.requires_grad for parameter in pointnet_of(checkpoint, path).parameters())
 
 
-def test_the_shipped_checkpoint_tells_where_it_comes_from() -> None:
-    provenance = load_checkpoint(default_checkpoint()).provenance
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_checkpoint_tells_where_it_comes_from(path: Path) -> None:
+    provenance = load_checkpoint(path).provenance
     assert sum(data["transitions"] for data in provenance["data"]) >= 100_000
     assert {"command", "date", "packages", "pointnet", "revision", "step", "metrics"} <= set(provenance)
     assert provenance["command"].startswith("python -m cavin_pyro.train ")
