@@ -21,7 +21,7 @@ OUTCOMES = ("success", "violation", "fall", "timeout")
 
 @dataclass(frozen=True)
 class Decision:
-    """One plan, and what it was made from.
+    """One plan, and what it was made from. Of its pushes T are made, or fewer (`run_episode`).
 
     Attributes:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
@@ -75,8 +75,9 @@ class Episode:
         return sum(push.reward for push in self.pushes)
 
     def reached(self, decision: Decision) -> NDArray[np.float32]:
-        """Where the objects were seen after each push of a decision: [n, M, 3] metres, n = T or fewer at the end."""
-        pushes = self.pushes[decision.step : decision.step + decision.plan.actions.shape[1]]
+        """Where the objects were seen after each push of a decision: [n, M, 3] metres, n <= T."""
+        later = [other.step for other in self.decisions if other.step > decision.step]
+        pushes = self.pushes[decision.step : min(later, default=len(self.pushes))]
         return np.array([push.centers for push in pushes], dtype=np.float32).reshape(-1, *decision.centers.shape)
 
 
@@ -100,6 +101,7 @@ def run_episode(
     pointnet: PointNet,
     *,
     seed: int,
+    pushes_per_plan: int | None = None,
     photograph: bool = False,
     on_decision: Callable[[Decision], None] | None = None,
     on_observation: Callable[[ObservationDict], None] | None = None,
@@ -108,6 +110,7 @@ def run_episode(
 
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
+        pushes_per_plan: made before the next plan; None makes all T (paper, Algorithm 1, line 11).
         photograph: keep a picture with every decision.
         on_decision: called after every plan, before its pushes.
         on_observation: called with the first observation and with that after every push.
@@ -135,7 +138,7 @@ def run_episode(
         if on_decision is not None:
             on_decision(decision)
         actions = plan.actions[0].numpy()
-        for number, action in enumerate(actions):
+        for number, action in enumerate(actions[:pushes_per_plan]):
             action = np.clip(action, -1.0, 1.0).astype(np.float32)
             observation, reward, terminated, truncated, info = env.step(action)
             if on_observation is not None:

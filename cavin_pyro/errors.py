@@ -32,14 +32,23 @@ def at_least(name: str, value: float, minimum: float) -> None:
         raise UserError(f"{name} must be at least {minimum:g}, not {value}")
 
 
+def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:
+    """Check a count from the command line.
+
+    Raises:
+        UserError: the value is not a whole number from the minimum to the maximum.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
+        raise UserError(f"{name} must be a whole number from {minimum} to {maximum}, not {value}")
+
+
 def check_seed(seed: int) -> None:
     """Check a seed, which every generator of random numbers in use must take.
 
     Raises:
         UserError: the seed is no whole number from 0 on, or needs more than 32 bits.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise UserError(f"seed must be a whole number from 0 to {2**32 - 1}, not {seed}")
+    whole_number("seed", seed, 0, 2**32 - 1)
 
 
 def fraction(name: str, value: float) -> None:

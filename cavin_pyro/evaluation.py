@@ -83,7 +83,9 @@ def _begin(config: DictConfig) -> None:
 
 def _episode(seed: int) -> Row:
     assert _setup is not None
-    return episode_row(run_episode(_setup.env, _setup.planner, _setup.pointnet, seed=seed))
+    return episode_row(
+        run_episode(_setup.env, _setup.planner, _setup.pointnet, seed=seed, pushes_per_plan=_setup.pushes_per_plan)
+    )
 
 
 def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:

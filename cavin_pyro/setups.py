@@ -15,7 +15,7 @@ from cavin_pyro.arithmetic import PRODUCTS, keep_freed_memory, set_products
 from cavin_pyro.building import build_model, class_of, construct, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
 from cavin_pyro.episode_reward import EpisodeReward
-from cavin_pyro.errors import UserError, at_least, check_seed, one_of, user_input
+from cavin_pyro.errors import UserError, at_least, check_seed, one_of, user_input, whole_number
 from cavin_pyro.worlds import check_world, object_ranges
 from envs.layouts import Layout
 from envs.pushing import PushingEnv
@@ -32,6 +32,7 @@ class Setup:
     env: PushingEnv
     planner: Planner
     pointnet: PointNet
+    pushes_per_plan: int | None  # as of `cavin_pyro.episodes.run_episode`
 
     @property
     def layout(self) -> Layout:
@@ -48,8 +49,7 @@ def check_words(config: DictConfig) -> None:
     check_seed(config.seed)
     at_least("maximum_steps", config.maximum_steps, 1)
     one_of("products", config.products, PRODUCTS)
-    if type(config.objects) is not int or not 1 <= config.objects <= MAXIMUM_OBJECTS:
-        raise UserError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {config.objects}")
+    whole_number("objects", config.objects, 1, MAXIMUM_OBJECTS)
     check_world(config.env)
 
 
@@ -84,6 +84,8 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
         with user_input():
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
         planner, pointnet = _planner(config, reward)
+        if config.pushes_per_plan is not None:
+            whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
         with user_input():  # tells at once whether every layout has room for the objects
             for number in range(len(env.layouts)):
                 env.reset(seed=config.seed, options={"layout": number})
@@ -92,7 +94,7 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
     except BaseException:
         env.close()
         raise
-    return Setup(env, planner, pointnet)
+    return Setup(env, planner, pointnet, config.pushes_per_plan)
 
 
 def _planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, PointNet]:

@@ -59,6 +59,7 @@ def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool, viewer: 
             setup.planner,
             setup.pointnet,
             seed=seed,
+            pushes_per_plan=setup.pushes_per_plan,
             photograph=True,
             on_decision=partial(tell, "set_decision"),
             on_observation=partial(tell, "set_observation"),

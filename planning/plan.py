@@ -18,7 +18,7 @@ class Plan(NamedTuple):
     its pushes, and no codes, states or candidates.
     """
 
-    actions: Tensor  # [B, T, 4] the first segment, to be executed before planning anew
+    actions: Tensor  # [B, T, 4] the first segment; all of it, or its first pushes, are executed before planning anew
     planned_actions: Tensor  # [B, S T, 4] a*, of which `actions` is the beginning
     effect_codes: Tensor  # [B, K, C] c*
     motion_codes: Tensor  # [B, S, Z] z*

@@ -75,8 +75,13 @@ class RewardFunction(Protocol):
 class Planner(Protocol):
     """Anything that turns observed states into pushes."""
 
+    @property
+    def segment_length(self) -> int:
+        """T, the number of pushes in a plan's `actions`."""
+
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for the scenes `state: [B]`, each with its own source of randomness.
 
-        `previous`: the plans whose `actions` have just been executed, for optimisers that go on from them.
+        `previous`: the plans whose `actions`, or the first of them, have just been executed, for optimisers that go on
+        from them.
         """

@@ -48,6 +48,11 @@ class SearchingPlanner:
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1: K = H / T
 
+    @property
+    def segment_length(self) -> int:
+        """T, the number of pushes in a plan's `actions`."""
+        return self.model.segment_length
+
     def search(
         self, level: Level, state: State, generators: Sequence[torch.Generator], previous: Plan | None
     ) -> Candidates:

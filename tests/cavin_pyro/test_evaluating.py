@@ -26,6 +26,14 @@ def env() -> Any:
     env.close()
 
 
+class Still(RandomPlanner):
+    """Random pushes shorter than a millimetre at the edge of the reachable box, which move nothing."""
+
+    def plan(self, state: Any, generators: Any, previous: Any = None) -> Plan:
+        plan = super().plan(state, generators)
+        return plan._replace(actions=plan.actions * 1e-3 + torch.tensor([-0.99, -0.99, 0.0, 0.0]))
+
+
 def fast(*words: str) -> list[str]:
     return ["planner.samples=8", "planner.horizon=6", *words]
 
@@ -54,6 +62,19 @@ def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) 
         np.testing.assert_array_equal(push.action, planned)
     assert episode.outcome in OUTCOMES
     assert episode.total_reward == sum(push.reward for push in episode.pushes)
+
+
+@pytest.mark.parametrize(("pushes_per_plan", "steps"), [(None, [0, 3]), (3, [0, 3]), (2, [0, 2]), (1, [0, 1, 2, 3])])
+def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
+    env: PushingEnv, pushes_per_plan: int | None, steps: list[int]
+) -> None:
+    episode = run_episode(env, Still(3), PointNet(), seed=0, pushes_per_plan=pushes_per_plan)
+    assert [decision.step for decision in episode.decisions] == steps
+    assert len(episode.pushes) == 4
+    for decision, end in zip(episode.decisions, [*steps[1:], 4], strict=True):
+        made = episode.pushes[decision.step : end]
+        np.testing.assert_array_equal([push.action for push in made], decision.plan.actions[0, : len(made)])
+        np.testing.assert_array_equal(episode.reached(decision), [push.centers for push in made])
 
 
 def test_the_planner_sees_the_cameras_points_without_needless_padding(env: PushingEnv) -> None:

@@ -28,7 +28,10 @@ goal: [[3, 3]]
 target_start: [[1, 1]]
 obstacle_start: [[3, 1], [4, 5], [0, 5]]
 """
-EPISODE = "checkpoint=run/checkpoint.safetensors planner.samples=8 planner.horizon=6 maximum_steps=4 objects=2"
+EPISODE = (
+    "checkpoint=run/checkpoint.safetensors planner.samples=8 planner.horizon=6 maximum_steps=4 objects=2 "
+    "pushes_per_plan=3"
+)
 LINES = {
     "collect": "transitions=60 steps=6 episodes_per_shard=4 workers=2 seed=3 output=pushes",
     "pretrain": "data=pushes steps=3 clouds=40 batch_size=8 output=features",
