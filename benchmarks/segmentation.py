@@ -27,7 +27,6 @@ from scipy.stats import binomtest, bootstrap
 
 from cavin_pyro.collection import crowd
 from cavin_pyro.command import compose
-from cavin_pyro.episodes import run_episode
 from cavin_pyro.progress import progress_bar
 from cavin_pyro.setups import Setup, set_up
 from envs.layouts import TASK_NAMES
@@ -200,7 +199,7 @@ def one_task(_: Scene, number: int, picture: Pictures) -> dict[str, Any]:
         scene.segmenter = Watched(scene.segmenter, scene, picture)
     watched = scene.segmenter
     watched.name = f"{task} {number}"
-    outcome = run_episode(one.env, one.planner, one.pointnet, seed=number).outcome
+    outcome = one.run_episode(number).outcome
     return {"task": task, "objects": objects, "kept": watched.kept, "images": watched.images, "outcome": outcome}
 
 

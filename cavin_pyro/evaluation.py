@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from cavin_pyro.episodes import Episode, run_episode
+from cavin_pyro.episodes import Episode
 from cavin_pyro.files import replacing
 from cavin_pyro.progress import progress_bar
 from cavin_pyro.setups import Setup, set_up
@@ -83,9 +83,7 @@ def _begin(config: DictConfig) -> None:
 
 def _episode(seed: int) -> Row:
     assert _setup is not None
-    return episode_row(
-        run_episode(_setup.env, _setup.planner, _setup.pointnet, seed=seed, pushes_per_plan=_setup.pushes_per_plan)
-    )
+    return episode_row(_setup.run_episode(seed))
 
 
 def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:

@@ -15,6 +15,7 @@ from cavin_pyro.arithmetic import PRODUCTS, keep_freed_memory, set_products
 from cavin_pyro.building import build_model, class_of, construct, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
 from cavin_pyro.episode_reward import EpisodeReward
+from cavin_pyro.episodes import Episode, run_episode
 from cavin_pyro.errors import UserError, at_least, check_seed, one_of, user_input, whole_number
 from cavin_pyro.worlds import check_world, object_ranges
 from envs.layouts import Layout
@@ -38,6 +39,12 @@ class Setup:
     def layout(self) -> Layout:
         """Of the episode that the environment is in."""
         return self.env.layout
+
+    def run_episode(self, seed: int, **options: Any) -> Episode:
+        """As `cavin_pyro.episodes.run_episode`, whose other options these are."""
+        return run_episode(
+            self.env, self.planner, self.pointnet, seed=seed, pushes_per_plan=self.pushes_per_plan, **options
+        )
 
 
 def check_words(config: DictConfig) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from cavin_pyro.episodes import Decision, Episode, run_episode
+from cavin_pyro.episodes import Decision, Episode
 from cavin_pyro.evaluation import episode_row
 from cavin_pyro.figures_plan import draw_plan
 from cavin_pyro.files import replacing
@@ -54,12 +54,8 @@ def show_episode(setup: Setup, folder: Path, *, seed: int, video: bool, viewer: 
                 getattr(onlooker, what)(*about)
 
         env.scene.on_frame = partial(tell, "add_frame")
-        episode = run_episode(
-            env,
-            setup.planner,
-            setup.pointnet,
-            seed=seed,
-            pushes_per_plan=setup.pushes_per_plan,
+        episode = setup.run_episode(
+            seed,
             photograph=True,
             on_decision=partial(tell, "set_decision"),
             on_observation=partial(tell, "set_observation"),
