@@ -97,7 +97,7 @@ def return_scale(returns: NDArray[np.float32]) -> Normalize | None:
 
 
 def _error(decision: Decision, reached: NDArray[np.float32] | None) -> str:
-    """How far f was off at the end of the segment: the largest distance over the objects."""
+    """How far f was off after the last push that was made: the largest distance over the objects."""
     predicted = decision.plan.predicted_centers[0].numpy()
     if reached is None or len(reached) == 0 or len(predicted) < len(reached):
         return ""

@@ -1,4 +1,4 @@
-"""The checkpoint that plan and evaluate load unless told otherwise, and the one for the Kinect beside it."""
+"""The checkpoint that plan and evaluate load unless told otherwise, and the others beside it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from cavin_pyro.building import build_guide, build_model, pointnet_of
 from cavin_pyro.checkpoint import default_checkpoint, load_checkpoint
 
-SHIPPED = [default_checkpoint(), default_checkpoint().with_name("kinect.safetensors")]
+SHIPPED = sorted(default_checkpoint().parent.glob("*.safetensors"))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
