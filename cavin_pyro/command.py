@@ -32,7 +32,7 @@ BAD_INPUT = 2  # exit status
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", list: "a list", dict: "a section"}
 _OF_ANY_KIND = {"layout"}  # a number or a path
-_CAN_BE_LEFT_OUT = {"robustness"}  # sections that null switches off
+_CAN_BE_LEFT_OUT = {"robustness", "pushes_per_plan"}  # which null switches off
 
 Body = Callable[[DictConfig], None]
 

@@ -30,7 +30,7 @@ obstacle_start: [[3, 1], [4, 5], [0, 5]]
 """
 EPISODE = (
     "checkpoint=run/checkpoint.safetensors planner.samples=8 planner.horizon=6 maximum_steps=4 objects=2 "
-    "pushes_per_plan=3"
+    "pushes_per_plan=null"
 )
 LINES = {
     "collect": "transitions=60 steps=6 episodes_per_shard=4 workers=2 seed=3 output=pushes",
