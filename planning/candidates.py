@@ -25,6 +25,7 @@ class Search:
     state: State
     generators: Sequence[torch.Generator]
     segments: int
+    remember: bool = False  # whether plans have to be made from noise, which the next search can be given
     hints: Tensor | None = None  # [B, h, K, D] noise of plans that may be good, for optimisers with a memory
 
     @property

@@ -11,6 +11,7 @@ from models.state import State
 from planning.bulk import in_bulk
 from planning.candidates import Search
 from planning.effects import choose_effects
+from planning.idle import idle_last
 from planning.inputs import check_weight
 from planning.levels import EffectLevel, MotionLevel
 from planning.motions import Closeness, choose_motions
@@ -49,11 +50,14 @@ class CavinPlanner(SearchingPlanner):
         paper's text.
     robustness: our addition to line 10, how the best motions are tried again with displaced pushes; None to take
         the best at its word, as in the paper.
+    idle_distance: metres; our addition to line 10: of the executed segment, pushes that f predicts to move no object
+        as far come last. 0 leaves g's order, as in the paper.
+    memory: our addition to line 5: what is left of the last plan is among the candidates (`planning.memory`).
     reachability: our addition to line 7, how the best effects are scored again by what motions do for them; None to
         take h at its word, as in the paper.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
-    `reward_at`, limits out of order, and a `feature_weight` that is negative or not finite.
+    `reward_at`, limits out of order, and a `feature_weight` or an `idle_distance` that is negative or not finite.
     """
 
     needs = ("effect_prior", "motion_prior", "subgoal", "actions", "next_state")
@@ -72,6 +76,7 @@ class CavinPlanner(SearchingPlanner):
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
         robustness: Robustness | None = None,
+        idle_distance: float = 0.0,
         reachability: Reachability | None = None,
         **options: Any,
     ) -> None:
@@ -79,6 +84,7 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
+        check_weight("idle_distance", idle_distance)
         self.motion_optimiser = self.optimiser
         if motion_optimizer is not None:
             self.motion_optimiser = make_optimiser(motion_optimizer, motion_optimizer_options, samples=samples)
@@ -86,6 +92,7 @@ class CavinPlanner(SearchingPlanner):
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
         self.robustness = robustness
+        self.idle_distance = idle_distance
         self.reachability = reachability
 
     @in_bulk
@@ -93,7 +100,7 @@ class CavinPlanner(SearchingPlanner):
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
 
-        `previous`: the last plans of the same episodes, of which one segment has been executed, for optimisers with a
+        `previous`: the last plans of the same episodes, whose first pushes have been executed, for a planner with a
         memory. An environment's plan depends on its own state, generator and last plan only. For errors see
         `planning.bulk.in_bulk`.
         """
@@ -112,8 +119,9 @@ class CavinPlanner(SearchingPlanner):
         how = Search(MotionLevel(self.model, effects.codes), closeness, state, generators, self.motion_segments)
         sequences = self.motion_optimiser.optimise(how, self.samples)
         motions = choose_motions(sequences, self.model, closeness, self.robustness)
+        motions = idle_last(motions, state, self.segment_length, self.idle_distance)
         return Plan(
-            actions=motions.actions[:, : self.model.segment_length],
+            actions=motions.actions[:, : self.segment_length],
             planned_actions=motions.actions,
             effect_codes=effects.codes,
             motion_codes=motions.codes,

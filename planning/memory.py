@@ -20,9 +20,17 @@ def remembered(candidates: Candidates, chosen: Tensor) -> Tensor:
 
 
 def hints(previous: Plan | None, generators: Sequence[torch.Generator]) -> Tensor | None:
-    """What is left of a plan whose first segment has been executed, with a fresh last one: `[B, 1, K, D]`, or None."""
+    """What may be left of the last plan, some or all of whose first segment was executed: `[B, 1 + K, K, D]`, or None.
+
+    First the plan as it was, for whoever has made one push of many. Then the plan without its first segment, without
+    its second, and so on, each with one fresh segment at the end: what a plan that succeeds does not need, it loses
+    in this way, one segment at a time.
+    """
     if previous is None or previous.noise.shape[1] == 0:
         return None
-    noise = previous.noise
-    fresh = noise_each((1, noise.shape[-1]), generators)
-    return torch.cat([noise[:, 1:], fresh], 1).unsqueeze(1)
+    segments = previous.noise.shape[1]
+    fresh = noise_each((1, previous.noise.shape[-1]), generators)
+    longer = torch.cat([previous.noise, fresh], 1)  # of these K + 1 segments one is left out, the fresh one first
+    return torch.stack(
+        [torch.cat([longer[:, :out], longer[:, out + 1 :]], 1) for out in (segments, *range(segments))], 1
+    )

@@ -77,8 +77,9 @@ def code_of(prior: Distribution, noise: Tensor) -> Tensor:
             code = transform(code)
         return code
     raise ValueError(
-        f"codes of a prior of type {type(prior).__name__} cannot be searched: it is neither normal nor a transformed "
-        "normal, and has no method from_noise; take the optimizer shooting"
+        f"codes of a prior of type {type(prior).__name__} can be drawn, but neither searched nor remembered: it is "
+        "neither normal nor a transformed normal, and has no method from_noise; take the optimizer shooting, and "
+        "memory=false"
     )
 
 

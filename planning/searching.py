@@ -37,6 +37,7 @@ class SearchingPlanner:
         optimizer_options: Mapping[str, Any] | None = None,
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
+        memory: bool = False,
     ) -> None:
         """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
         check_positive("samples", samples)
@@ -45,6 +46,7 @@ class SearchingPlanner:
         limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of=self.strides)
         self.score = CumulativeReward(limited, reward_at)
         self.model, self.reward = model, reward
+        self.memory = memory
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1: K = H / T
 
@@ -56,6 +58,10 @@ class SearchingPlanner:
     def search(
         self, level: Level, state: State, generators: Sequence[torch.Generator], previous: Plan | None
     ) -> Candidates:
-        """All plans that were considered for the scenes `state: [B]`, with what is left of the `previous` ones."""
-        wanted = Search(level, self.score, state, generators, self.segments, hints(previous, generators))
+        """All plans that were considered for the scenes `state: [B]`, with what is left of the `previous` ones.
+
+        Raises ValueError for a memory of codes whose prior is not made of noise (`planning.sampling.code_of`).
+        """
+        left = hints(previous, generators) if self.memory else None
+        wanted = Search(level, self.score, state, generators, self.segments, self.memory, left)
         return self.optimiser.optimise(wanted, self.samples)

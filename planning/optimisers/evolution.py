@@ -59,7 +59,9 @@ class Evolution:
         noise = search.noise(begin)
         heirs = min(begin, math.ceil(self.memory * begin))
         if heirs and search.hints is not None:
-            noise[:, :heirs] = torch.cat([search.hints, self._children(search, search.hints, heirs)], 1)[:, :heirs]
+            # In the last places: of equals, such as all that do not reach the goal, a new plan wins.
+            known = torch.cat([search.hints, self._children(search, search.hints, heirs)], 1)
+            noise[:, begin - heirs :] = known[:, :heirs]
         considered = [search.evaluate(noise, replacement=self.replacement)]
         tried = Tried(considered[0].noise, considered[0].returns)
         for number in range(self.generations):

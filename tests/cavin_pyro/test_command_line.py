@@ -191,6 +191,9 @@ def test_what_we_added_to_the_papers_planner_can_be_left_out(
     words = [
         "planner.robustness=null",
         "planner.avoid_failures=false",
+        "planner.memory=false",
+        "planner.idle_distance=0",
+        "pushes_per_plan=null",
         "margin=0",
         "planner.samples=8",
         "planner.horizon=3",

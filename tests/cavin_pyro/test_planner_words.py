@@ -79,6 +79,7 @@ def test_every_planner_plans_with_every_optimiser(
         ("cavin", "planner.stride_limits=[0.1,0.3]"),
         ("cavin", "planner.optimizer_options={replacement:false}"),
         ("cavin", "planner.motion_optimizer=cem"),
+        ("cavin", "planner.memory=false"),
         ("cavin", "products=float32"),
         ("cavin_evolution", "planner.optimizer_options={generations:1}"),
         ("cavin", "planner.reachability={_target_:planning.Reachability}"),
