@@ -18,13 +18,16 @@ from planning.sampling import noise_each
 
 @dataclass(frozen=True)
 class Robustness:
-    """How the best motions are tried again with displaced pushes.
+    """How the best motions are tried again with displaced pushes, and with outcomes that f did not expect.
 
     The best of a thousand motions is often one about which f errs: a push that just meets the object according
-    to f, and just misses it on the table. Displacing its start tells the two apart.
+    to f, and just misses it on the table. Displacing its start tells the two apart. And the farther f sends an object,
+    the farther it errs: a long push past a forbidden place fails more often than a short one.
 
     finalists: motions that are tried again, the best by line 10. draws: times that each is tried.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
+    outcome_noise: standard deviation, in x and in y, of where a push leaves an object, per metre that f predicts it to
+        move. A try fails by where the objects might be, while its distance to the subgoal is f's.
     failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal.
 
     Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
@@ -33,12 +36,14 @@ class Robustness:
     finalists: int = 128
     draws: int = 16
     start_noise: float = 0.03
+    outcome_noise: float = 0.5
     failure_cost: float = 0.3
 
     def __post_init__(self) -> None:
         check_positive("finalists", self.finalists)
         check_positive("draws", self.draws)
         check_weight("start_noise", self.start_noise)
+        check_weight("outcome_noise", self.outcome_noise)
         check_weight("failure_cost", self.failure_cost)
 
 
@@ -71,7 +76,21 @@ def try_again(
     plans = state.expand_plans(pushes.shape[1])
     before, mask = plans.centers, plans.mask
     here, path = follow(model, state.expand_plans(1), pushes)
-    progress = returns.advance(returns.start(before), reward, before, path, mask)
+    possible = outcomes(before, path, robustness.outcome_noise, generators)
+    progress = returns.advance(returns.start(before), reward, before, possible, mask)
     distance = ranking.squared_distance(here, goal, feature_weight=feature_weight)
     cost = (distance + robustness.failure_cost * progress.failed).unflatten(1, (count, robustness.draws)).mean(-1)
     return best.indices, torch.where(torch.isfinite(best.values) & torch.isfinite(cost), cost, torch.inf)
+
+
+def outcomes(start: Tensor, path: Tensor, noise: float, generators: Sequence[torch.Generator]) -> Tensor:
+    """Where objects might be after every push instead of on f's `path: [B, n, T, M, 3]` from `start: [B, n, M, 3]`.
+
+    See `Robustness.outcome_noise`, here `noise`. Pushes err independently; heights stay.
+    """
+    if noise == 0.0:
+        return path
+    before = torch.cat([start.unsqueeze(-3), path[..., :-1, :, :]], -3)
+    strides = (path - before)[..., :2].norm(dim=-1, keepdim=True)
+    on_the_table = path[..., :2] + noise * strides * noise_each((*path.shape[1:-1], 2), generators)
+    return torch.cat([on_the_table, path[..., 2:]], -1)

@@ -11,6 +11,7 @@ from torch.distributions import Distribution, Normal
 
 from models.state import State
 from planning import CavinPlanner, Robustness
+from planning.robustness import outcomes
 
 SAMPLES = 64
 
@@ -107,6 +108,38 @@ def test_a_predicted_failure_costs(toy: SimpleNamespace) -> None:
     assert motion(1.0) == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize(("noise", "distance"), [(0.0, 0.1), (0.3, 0.01)])
+def test_the_farther_f_sends_objects_past_a_forbidden_place_the_more_it_is_distrusted(
+    noise: float, distance: float, toy: SimpleNamespace
+) -> None:
+    class Strides(Grazing):
+        """Narrow motions move objects by the 0.1 m that the subgoal wants, wide ones by 0.01 m; both work anywhere."""
+
+        def next_state(self, state: State, action: Tensor) -> State:
+            return moved(state, torch.where(action[..., 3:] > 0, 0.1, 0.01))
+
+        def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
+            pushes = super().actions(state, effect_code, motion_code)
+            pushes[..., 2:3] = torch.where(pushes[..., 3:] > 0, 0.1, 0.01)
+            return pushes
+
+    robustness = Robustness(finalists=SAMPLES, start_noise=0.0, outcome_noise=noise, failure_cost=1.0)
+    reward = toy.GoalDisc(goal=(0.1, 0.0), forbidden_below=-0.02)
+    planner = CavinPlanner(Strides(), reward, samples=SAMPLES, horizon=1, robustness=robustness)
+    assert planner.plan(scenes(1), toy.generators(0)).actions[0, 0, 2] == pytest.approx(distance)
+
+
+def test_what_might_happen_spreads_in_the_table_by_a_share_of_every_stride() -> None:
+    start = torch.zeros(1, 20_000, 2, 3)
+    path = start.unsqueeze(2).repeat(1, 1, 2, 1, 1)
+    path[..., 0, 0] = torch.tensor([0.1, 0.3])  # strides of 0.1 and 0.2 m; the other object stays
+    path[..., 2] = 0.05
+    spread = outcomes(start, path, 0.3, [torch.Generator().manual_seed(0)]) - path
+    expected = torch.tensor([[[0.03, 0.03, 0.0], [0.0, 0.0, 0.0]], [[0.06, 0.06, 0.0], [0.0, 0.0, 0.0]]])
+    torch.testing.assert_close(spread[0].std(0), expected, rtol=0.03, atol=0.0)
+    torch.testing.assert_close(spread[0].mean(0), torch.zeros(2, 2, 3), rtol=0.0, atol=2e-3)
+
+
 def test_no_randomness_is_shared_between_environments(toy: SimpleNamespace) -> None:
     planner = CavinPlanner(
         toy.PointMass(), toy.GoalDisc(goal=(0.2, 0.1)), samples=SAMPLES, horizon=6, robustness=Robustness(finalists=8)
@@ -138,6 +171,7 @@ def test_motions_that_are_not_finite_never_win(horizon: str, toy: SimpleNamespac
     [
         ({"finalists": 0}, "finalists must be at least 1"),
         ({"draws": 0}, "draws must be at least 1"),
+        ({"outcome_noise": -0.1}, "outcome_noise must be zero or a positive number"),
         ({"start_noise": -0.1}, "start_noise must be zero or a positive number"),
         ({"failure_cost": float("nan")}, "failure_cost must be zero or a positive number"),
     ],
