@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from models.state import State
+from planning import returns
 from planning.motions import MotionPlan
 
 
@@ -17,8 +18,8 @@ def idle_last(motions: MotionPlan, state: State, segment_length: int, distance: 
     Whoever plans anew after every push would otherwise make an idle one, be where he was, and may choose another.
     """
     pushes, path = motions.actions[:, :segment_length], motions.predicted_centers[:, :segment_length]
-    before = torch.cat([state.centers.unsqueeze(1), path[:, :-1]], 1)
-    strides = torch.where(state.mask.unsqueeze(1), (path - before).norm(dim=-1), 0.0).amax(-1)  # [B, T]
+    moved = (path - returns.before_each(state.centers, path)).norm(dim=-1)
+    strides = torch.where(state.mask.unsqueeze(1), moved, 0.0).amax(-1)  # [B, T]
     order = (strides < distance).int().argsort(dim=-1, stable=True)
     environments = torch.arange(len(pushes), device=pushes.device).unsqueeze(-1)
     return motions._replace(

@@ -49,6 +49,11 @@ def interpolate(start: Tensor, end: Tensor, steps: int) -> Tensor:
     return torch.lerp(start.unsqueeze(-3), end.unsqueeze(-3), fraction[:, None, None])
 
 
+def before_each(start: Tensor, centers: Tensor) -> Tensor:
+    """Where objects are before each of T steps: `start: [..., M, 3]`, after each `centers: [..., T, M, 3]` metres."""
+    return torch.cat([start.unsqueeze(-3), centers[..., :-1, :, :]], dim=-3)
+
+
 def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: Tensor, mask: Tensor) -> Progress:
     """Add the rewards of one segment up to and including the step that ends a plan.
 
@@ -58,7 +63,7 @@ def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: 
     reward that is not finite is a failure of reward -inf, whatever the reward function says of it: no
     comparison holds for NaN, so "no object is in the region" would be a success.
     """
-    previous = torch.cat([start.unsqueeze(-3), centers[..., :-1, :, :]], dim=-3)
+    previous = before_each(start, centers)
     step_mask = mask.unsqueeze(-2).expand(centers.shape[:-1])
     outcome = reward(previous, centers, step_mask)
     sound = torch.isfinite(outcome.reward) & (torch.isfinite(centers).all(-1) | ~step_mask).all(-1)

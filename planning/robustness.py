@@ -90,7 +90,6 @@ def outcomes(start: Tensor, path: Tensor, noise: float, generators: Sequence[tor
     """
     if noise == 0.0:
         return path
-    before = torch.cat([start.unsqueeze(-3), path[..., :-1, :, :]], -3)
-    strides = (path - before)[..., :2].norm(dim=-1, keepdim=True)
+    strides = (path - returns.before_each(start, path))[..., :2].norm(dim=-1, keepdim=True)
     on_the_table = path[..., :2] + noise * strides * noise_each((*path.shape[1:-1], 2), generators)
     return torch.cat([on_the_table, path[..., 2:]], -1)
