@@ -32,6 +32,11 @@ class EpisodeReward:
         """Of the episode."""
         return self._env.layout
 
+    @property
+    def now(self) -> TaskReward:
+        """Of the episode: a pure function of tensors."""
+        return self._rewards[self.layout]
+
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
         """Judge the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool."""
-        return self._rewards[self.layout](previous, centers, mask)
+        return self.now(previous, centers, mask)

@@ -58,6 +58,11 @@ def check_words(config: DictConfig) -> None:
     one_of("products", config.products, PRODUCTS)
     whole_number("objects", config.objects, 1, MAXIMUM_OBJECTS)
     check_world(config.env)
+    if config.layout == "random" and config.planner.get("compile"):
+        raise UserError(
+            "planner.compile=true makes code for one layout, and layout=random has another in every episode: "
+            "take planner.compile=false"
+        )
 
 
 def set_up(config: DictConfig, *, render: bool = False) -> Setup:

@@ -115,6 +115,8 @@ class TaskReward:
         now = depth(after)
         entered = now > 0.0
         near = (now > -self.margin) & ~entered
+        if torch.compiler.is_compiling():  # compiled code has no branches, and a second look costs it little
+            return entered | (near & (now > depth(before)))
         if bool(near.any()):  # the place before counts only there, and few points are there
             closer = now[near] > depth(before[near])
             entered = entered.masked_scatter(near, closer)

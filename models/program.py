@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pyro
+import torch
 from pyro.nn import PyroModule
 from pyro.poutine.runtime import _PYRO_STACK
 
@@ -20,7 +21,8 @@ class Program(PyroModule):
 
     def __getattr__(self, name: str) -> Any:
         network = self.__dict__.get("_modules", {}).get(name)
-        if network is None or isinstance(network, PyroModule) or _parameters_are_awaited():
+        compiling = torch.compiler.is_compiling()  # a planner's functions, to which no handler listens
+        if network is None or (not compiling and (isinstance(network, PyroModule) or _parameters_are_awaited())):
             return super().__getattr__(name)
         return network
 

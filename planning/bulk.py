@@ -10,6 +10,7 @@ import torch
 
 from models.state import State
 from planning import fields
+from planning.engine import Engine
 from planning.inputs import HopelessEnvironmentError, check_scenes
 from planning.plan import Plan
 
@@ -20,9 +21,10 @@ PLANS_ON_ACCELERATOR = 131_072  # samples of all environments of a chunk
 
 
 class Sampling(Protocol):
-    """A planner that considers N = `samples` plans per environment."""
+    """A planner that considers N = `samples` plans per environment; its engine goes from chunk to chunk."""
 
     samples: int
+    engine: Engine
 
 
 PlanMethod = Callable[..., Plan]  # (self, state, generators, previous)
@@ -43,14 +45,16 @@ def in_bulk(plan: PlanMethod) -> PlanMethod:
         size = ENVIRONMENTS_ON_PROCESSOR
         if state.centers.device.type != "cpu":
             size = max(1, PLANS_ON_ACCELERATOR // self.samples)
-        plans = []
-        for start in range(0, max(len(generators), 1), size):
+
+        def plan_of(start: int) -> Plan:
             chunk = slice(start, start + size)
-            last = previous and fields.apply(previous, lambda field: field[chunk])  # noqa: B023
+            last = previous and fields.apply(previous, lambda field: field[chunk])
             try:
-                plans.append(plan(self, state.scene(chunk), generators[chunk], last))
+                return plan(self, state.scene(chunk), generators[chunk], last)
             except HopelessEnvironmentError as error:
                 raise HopelessEnvironmentError(start + error.environment, error.what) from error
+
+        plans = self.engine.each(plan_of, range(0, max(len(generators), 1), size))
         return plans[0] if len(plans) == 1 else fields.join(plans, dimension=0)
 
     return planned

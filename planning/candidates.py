@@ -11,6 +11,7 @@ from torch import Tensor
 
 from models.state import State
 from planning import fields
+from planning.engine import Engine, directly
 from planning.replacement import draw_parents
 from planning.sampling import noise_each
 from planning.segments import Level, Score, Segment, Stretch
@@ -25,8 +26,9 @@ class Search:
     state: State
     generators: Sequence[torch.Generator]
     segments: int
-    remember: bool = False  # whether plans have to be made from noise, which the next search can be given
+    from_noise: bool = False  # whether plans have to be made from noise, for who remembers or compiles
     hints: Tensor | None = None  # [B, h, K, D] noise of plans that may be good, for optimisers with a memory
+    engine: Engine = directly  # calls what extends plans from noise by a segment
 
     @property
     def dimension(self) -> int:
@@ -104,9 +106,8 @@ class Candidates:
         search, before, number = self.search, self.plans, len(self.kept)
         # Until the first segment all plans are in one state, so the model need not read it n times.
         here = before if self.kept else search.state.expand_plans(1)
-        stretch = search.level.extend(number, here, before, noise, search.generators)
-        stretch = _stay(stretch, before, self.standing.active)
-        standing = search.score.advance(self.standing, number, before, stretch)
+        what = search.level, search.score, number, here, before, self.standing, noise
+        stretch, standing = _extended(*what, search.generators) if noise is None else search.engine(_extended, *what)
         own = torch.arange(self.count, device=before.mask.device).expand(before.batch_shape)
         kept = (*self.kept, Segment(noise, stretch, standing))
         return Candidates(search, stretch.states, standing, kept, (*self.rows, own))
@@ -156,9 +157,28 @@ def join(parts: Sequence[Candidates]) -> Candidates:
     return Candidates(parts[0].search, plans, standing, kept, (own,) * len(kept))
 
 
+def _extended(
+    level: Level,
+    score: Score,
+    number: int,
+    here: State,
+    before: State,
+    standing: Any,
+    noise: Tensor | None,
+    generators: Sequence[torch.Generator] = (),
+) -> tuple[Stretch, Any]:
+    """Segment `number` of plans that have come to `before: [B, n]`, and how they stand after it.
+
+    `here`: see `Level.extend`. The `generators` are read where there is no noise.
+    """
+    stretch = level.extend(number, here, before, noise, generators)
+    stretch = _stay(stretch, before, standing.active)
+    return stretch, score.advance(standing, number, before, stretch)
+
+
 def _stay(stretch: Stretch, before: State, active: Tensor) -> Stretch:
     """Keep plans where they are that have ended: not `active: [B, n]`; no copy where all go on."""
-    if bool(active.all()):
+    if not torch.compiler.is_compiling() and bool(active.all()):
         return stretch
     going = active[..., None, None]
     states = State(

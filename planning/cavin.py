@@ -116,7 +116,8 @@ class CavinPlanner(SearchingPlanner):
         closeness = Closeness(
             effects, self.reward, feature_weight=self.feature_weight, avoid_failures=self.avoid_failures
         )
-        how = Search(MotionLevel(self.model, effects.codes), closeness, state, generators, self.motion_segments)
+        level, segments = MotionLevel(self.model, effects.codes), self.motion_segments
+        how = Search(level, closeness, state, generators, segments, self.from_noise, engine=self.engine)
         sequences = self.motion_optimiser.optimise(how, self.samples)
         motions = choose_motions(sequences, self.model, closeness, self.robustness)
         motions = idle_last(motions, state, self.segment_length, self.idle_distance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,14 +15,13 @@ from planning.following import follow
 from planning.proposals import Proposal
 from planning.protocol import PlanningModel
 from planning.sampling import codes_each, dimension_of, noise_each, sample_each
-from planning.segments import Stretch
+from planning.segments import Stretch, of_segment
 
 
-class EffectLevel:
+class EffectLevel(NamedTuple):
     """Effect codes, and the subgoals that h predicts from them (Algorithm 1, lines 5 and 6)."""
 
-    def __init__(self, model: PlanningModel) -> None:
-        self.model = model
+    model: PlanningModel
 
     def dimension(self, state: State) -> int:
         """C; `state: [B]`."""
@@ -36,14 +36,14 @@ class EffectLevel:
         return predicted_effect(self.model, here, plans, code)
 
 
-class MotionLevel:
+class MotionLevel(NamedTuple):
     """Motion codes, the pushes that g makes of them, and where f says that these lead (lines 8 and 9).
 
     effect_codes: `[B, K, C]`, which every plan is paired with; None for a model without effects (CVAE-MPC).
     """
 
-    def __init__(self, model: PlanningModel, effect_codes: Tensor | None) -> None:
-        self.model, self.effect_codes = model, effect_codes
+    model: PlanningModel
+    effect_codes: Tensor | None
 
     def dimension(self, state: State) -> int:
         """Z; `state: [B]`."""
@@ -65,14 +65,14 @@ class MotionLevel:
     def _effects(self, segment: int, count: int) -> list[Tensor]:
         if self.effect_codes is None:
             return []
-        return [self.effect_codes[:, segment].unsqueeze(1).expand(-1, count, -1)]
+        return [of_segment(self.effect_codes, segment).expand(-1, count, -1)]
 
 
-class PushLevel:
+class PushLevel(NamedTuple):
     """Raw pushes, T a segment, and where f says that they lead (MPC, appendix A.2)."""
 
-    def __init__(self, model: PlanningModel, proposal: Proposal) -> None:
-        self.model, self.proposal = model, proposal
+    model: PlanningModel
+    proposal: Proposal
 
     def dimension(self, state: State) -> int:
         """What the proposal takes for T pushes."""

@@ -14,7 +14,7 @@ from planning.effects import EffectPlan
 from planning.protocol import PlanningModel, RewardFunction
 from planning.returns import Progress
 from planning.robustness import Robustness, try_again
-from planning.segments import Stretch, pushes_of
+from planning.segments import Stretch, of_segment, pushes_of
 
 FAILURE = 1e3  # square metres that a predicted failure costs an optimiser: more than any distance on the table
 
@@ -45,18 +45,17 @@ class Aim(NamedTuple):
         return torch.ones_like(self.sound)
 
 
-class Closeness:
+class Closeness(NamedTuple):
     """Scores sequences of motions by how close they lead to the chosen subgoals (line 10).
 
     Segments after the end of the chosen effect plan have nothing to aim at, and do not count. For the options see
     `planning.cavin.CavinPlanner`.
     """
 
-    def __init__(
-        self, effects: EffectPlan, reward: RewardFunction, *, feature_weight: float, avoid_failures: bool
-    ) -> None:
-        self.effects, self.reward = effects, reward
-        self.feature_weight, self.avoid_failures = feature_weight, avoid_failures
+    effects: EffectPlan
+    reward: RewardFunction
+    feature_weight: float
+    avoid_failures: bool
 
     def start(self, plans: State) -> Aim:
         """Of sequences that have not begun, `plans: [B, n]`."""
@@ -67,8 +66,9 @@ class Closeness:
     def advance(self, standing: Aim, segment: int, before: State, stretch: Stretch) -> Aim:
         """After one more segment from `before: [B, n]`."""
         counts = (segment < self.effects.segments).unsqueeze(-1)  # [B, 1]
+        executed = torch.as_tensor(segment == 0, device=counts.device)
         # Line 10: distance to the chosen subgoal, at the end of the segment.
-        goal = self.effects.subgoals.step(slice(segment, segment + 1))  # [B, 1, M, .]
+        goal = self.effects.subgoals.map(lambda field: of_segment(field, segment))  # [B, 1, M, .]
         from_goal = ranking.squared_distance(stretch.states, goal, feature_weight=self.feature_weight)
         distance = standing.distance + torch.where(counts, from_goal, 0.0)
         assert stretch.actions is not None
@@ -77,9 +77,8 @@ class Closeness:
         if self.avoid_failures:
             progress = progress._replace(succeeded=progress.succeeded | ~counts)  # nothing left to fail
             progress = returns.advance(progress, self.reward, before.centers, stretch.path, before.mask)
-            if segment == 0:
-                failed_in_executed = progress.failed
-        first = distance if segment == 0 else standing.first_distance
+            failed_in_executed = torch.where(executed, progress.failed, failed_in_executed)
+        first = torch.where(executed, distance, standing.first_distance)
         return Aim(distance, first, sound, failed_in_executed, progress)
 
 
@@ -115,6 +114,7 @@ def choose_motions(
             candidates.at(0, pushes_of),
             candidates.search.generators,
             feature_weight=score.feature_weight,
+            engine=candidates.search.engine,
         )
         cost = cost + (aim.distance - aim.first_distance).gather(1, numbers)  # later segments, as they were
         chosen = numbers.gather(1, cost.argmin(-1, keepdim=True)).squeeze(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -26,18 +27,22 @@ class Judgement(NamedTuple):
     failure: Tensor
 
 
+@dataclass(frozen=True)
 class CumulativeReward:
     """Scores plans by the reward of all their steps, up to the one that ends a plan.
 
     reward: the task's. at: `path` judges every step of a segment, interpolated ones too (paper); `subgoals` only its
     end, as one step (published code).
+
+    Raises ValueError for an unknown `at`.
     """
 
-    def __init__(self, reward: RewardFunction, at: str = "path") -> None:
-        """Raises ValueError for an unknown `at`."""
-        if at not in REWARD_AT:
-            raise ValueError(f"unknown reward_at '{at}': take {' or '.join(REWARD_AT)}")
-        self.reward, self.at = reward, at
+    reward: RewardFunction
+    at: str = "path"
+
+    def __post_init__(self) -> None:
+        if self.at not in REWARD_AT:
+            raise ValueError(f"unknown reward_at '{self.at}': take {' or '.join(REWARD_AT)}")
 
     def start(self, plans: State) -> Progress:
         """Of plans that have not begun, `plans: [B, n]`."""
@@ -49,20 +54,26 @@ class CumulativeReward:
         return returns.advance(standing, self.reward, before.centers, path, before.mask)
 
 
+@dataclass(frozen=True)
 class StrideLimits:
     """A reward function that ends plans whose strides are implausible (published code; not in the paper).
 
     A stride fails if every object moves less than `shortest`, or any farther than `longest` metres; its reward is
     then -100. `of`: `segments` (published: 0.1 m and 0.3 m from subgoal to subgoal) or `pushes` (0.01 m and 0.15 m).
+
+    Raises ValueError unless the limits are two, in order, not negative.
     """
 
-    def __init__(self, reward: RewardFunction, limits: Sequence[float], *, of: str) -> None:
-        """`limits`: shortest and longest, in metres. Raises ValueError unless they are two, in order, not negative."""
+    reward: RewardFunction
+    limits: Sequence[float]  # shortest and longest, in metres
+    of: str
+
+    def __post_init__(self) -> None:
+        limits = self.limits
         numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
         if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
             raise ValueError(f"stride_limits must be two distances in metres, low then high, not {limits}")
-        self.reward, self.of = reward, of
-        self.shortest, self.longest = limits
+        object.__setattr__(self, "limits", tuple(limits))
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
         """Judge the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
@@ -81,6 +92,7 @@ class StrideLimits:
         )
 
     def _outside(self, before: Tensor, after: Tensor, mask: Tensor) -> Tensor:
+        shortest, longest = self.limits
         strides = (after - before).norm(dim=-1)
-        short = ((strides < self.shortest) | ~mask).all(-1)
-        return short | ((strides > self.longest) & mask).any(-1)
+        short = ((strides < shortest) | ~mask).all(-1)
+        return short | ((strides > longest) & mask).any(-1)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from models.state import State
 from planning import ranking, returns
+from planning.engine import Engine, directly
 from planning.following import follow
 from planning.inputs import check_positive, check_weight
 from planning.protocol import PlanningModel, RewardFunction
@@ -58,6 +59,7 @@ def try_again(
     generators: Sequence[torch.Generator],
     *,
     feature_weight: float,
+    engine: Engine = directly,
 ) -> tuple[Tensor, Tensor]:
     """Finalists and how they did: numbers `[B, R]` int64 and mean costs `[B, R]` in square metres.
 
@@ -73,23 +75,36 @@ def try_again(
     tried[..., :2] += robustness.start_noise * noise_each(tried[..., :2].shape[1:], generators)
     pushes = tried.flatten(1, 2).clamp(-1.0, 1.0)  # [B, R D, T, 4]
 
-    plans = state.expand_plans(pushes.shape[1])
-    before, mask = plans.centers, plans.mask
-    here, path = follow(model, state.expand_plans(1), pushes)
-    possible = outcomes(before, path, robustness.outcome_noise, generators)
-    progress = returns.advance(returns.start(before), reward, before, possible, mask)
-    distance = ranking.squared_distance(here, goal, feature_weight=feature_weight)
-    cost = (distance + robustness.failure_cost * progress.failed).unflatten(1, (count, robustness.draws)).mean(-1)
+    errors = None
+    if robustness.outcome_noise:
+        errors = robustness.outcome_noise * noise_each((*pushes.shape[1:3], state.objects, 2), generators)
+    distance, failed = engine(_attempts, model, reward, state, goal, pushes, errors, feature_weight)
+    cost = (distance + robustness.failure_cost * failed).unflatten(1, (count, robustness.draws)).mean(-1)
     return best.indices, torch.where(torch.isfinite(best.values) & torch.isfinite(cost), cost, torch.inf)
 
 
-def outcomes(start: Tensor, path: Tensor, noise: float, generators: Sequence[torch.Generator]) -> Tensor:
+def _attempts(
+    model: PlanningModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State,
+    pushes: Tensor,
+    errors: Tensor | None,
+    feature_weight: float,
+) -> tuple[Tensor, Tensor]:
+    """What becomes of `pushes: [B, n, T, 4]`: square metres to the `goal`, `[B, n]`, and whether they fail, bool."""
+    plans = state.expand_plans(pushes.shape[1])
+    before, mask = plans.centers, plans.mask
+    here, path = follow(model, state.expand_plans(1), pushes)
+    possible = path if errors is None else outcomes(before, path, errors)
+    progress = returns.advance(returns.start(before), reward, before, possible, mask)
+    return ranking.squared_distance(here, goal, feature_weight=feature_weight), progress.failed
+
+
+def outcomes(start: Tensor, path: Tensor, errors: Tensor) -> Tensor:
     """Where objects might be after every push instead of on f's `path: [B, n, T, M, 3]` from `start: [B, n, M, 3]`.
 
-    See `Robustness.outcome_noise`, here `noise`. Pushes err independently; heights stay.
+    errors: `[B, n, T, M, 2]`, metres in x and in y per metre that f moves an object. Heights stay.
     """
-    if noise == 0.0:
-        return path
     strides = (path - returns.before_each(start, path))[..., :2].norm(dim=-1, keepdim=True)
-    on_the_table = path[..., :2] + noise * strides * noise_each((*path.shape[1:-1], 2), generators)
-    return torch.cat([on_the_table, path[..., 2:]], -1)
+    return torch.cat([path[..., :2] + strides * errors, path[..., 2:]], -1)

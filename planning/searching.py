@@ -9,6 +9,7 @@ import torch
 
 from models.state import State
 from planning.candidates import Candidates, Search
+from planning.engine import Compiled, Engine, directly
 from planning.inputs import check_horizon, check_positive
 from planning.memory import hints
 from planning.optimisers import make_optimiser
@@ -38,14 +39,17 @@ class SearchingPlanner:
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
         memory: bool = False,
+        compile: bool = False,
     ) -> None:
-        """Raises ValueError for counts below 1, a horizon that T does not divide, and unknown names."""
+        """Raises ValueError for counts below 1, a horizon that T does not divide, unknown names, and no compiler."""
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
         self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
-        limited = reward if stride_limits is None else StrideLimits(reward, stride_limits, of=self.strides)
-        self.score = CumulativeReward(limited, reward_at)
-        self.model, self.reward = model, reward
+        self.model, self._reward = model, reward
+        self.reward_at, self.stride_limits = reward_at, stride_limits
+        self.engine: Engine = Compiled() if compile else directly
+        self.from_noise = memory or compile
+        self.score  # noqa: B018 (complains of a name or of limits now, not in the first plan)
         self.memory = memory
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1: K = H / T
@@ -55,6 +59,19 @@ class SearchingPlanner:
         """T, the number of pushes in a plan's `actions`."""
         return self.model.segment_length
 
+    @property
+    def reward(self) -> RewardFunction:
+        """The task's; of a reward that changes from episode to episode, what it is `now`."""
+        return getattr(self._reward, "now", self._reward)
+
+    @property
+    def score(self) -> CumulativeReward:
+        """Of plans in this episode."""
+        reward, limits = self.reward, self.stride_limits
+        return CumulativeReward(
+            reward if limits is None else StrideLimits(reward, limits, of=self.strides), self.reward_at
+        )
+
     def search(
         self, level: Level, state: State, generators: Sequence[torch.Generator], previous: Plan | None
     ) -> Candidates:
@@ -63,5 +80,5 @@ class SearchingPlanner:
         Raises ValueError for a memory of codes whose prior is not made of noise (`planning.sampling.code_of`).
         """
         left = hints(previous, generators) if self.memory else None
-        wanted = Search(level, self.score, state, generators, self.segments, self.memory, left)
+        wanted = Search(level, self.score, state, generators, self.segments, self.from_noise, left, self.engine)
         return self.optimiser.optimise(wanted, self.samples)

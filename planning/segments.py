@@ -70,6 +70,11 @@ class Segment(NamedTuple):
     standing: Any  # afterwards
 
 
+def of_segment(fields: Tensor, number: int | Tensor) -> Tensor:
+    """What `fields: [B, K, ...]` hold of one segment: `[B, 1, ...]`. A number that is a tensor needs no look at it."""
+    return fields.index_select(1, torch.as_tensor(number, device=fields.device).reshape(1))
+
+
 def pushes_of(segment: Segment) -> Tensor:
     """The pushes `[B, R, T, 4]` of a segment of a level that has them."""
     assert segment.stretch.actions is not None

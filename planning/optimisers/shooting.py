@@ -23,7 +23,7 @@ class Shooting:
 
     def optimise(self, search: Search, samples: int) -> Candidates:
         """N = `samples` plans `[B, N]` of all K segments."""
-        if not search.remember:
+        if not search.from_noise:
             return search.draw(samples, replacement=self.replacement)
         noise = search.noise(samples)
         if search.hints is not None:

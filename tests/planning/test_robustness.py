@@ -134,7 +134,8 @@ def test_what_might_happen_spreads_in_the_table_by_a_share_of_every_stride() -> 
     path = start.unsqueeze(2).repeat(1, 1, 2, 1, 1)
     path[..., 0, 0] = torch.tensor([0.1, 0.3])  # strides of 0.1 and 0.2 m; the other object stays
     path[..., 2] = 0.05
-    spread = outcomes(start, path, 0.3, [torch.Generator().manual_seed(0)]) - path
+    errors = 0.3 * torch.randn(*path.shape[:-1], 2, generator=torch.Generator().manual_seed(0))
+    spread = outcomes(start, path, errors) - path
     expected = torch.tensor([[[0.03, 0.03, 0.0], [0.0, 0.0, 0.0]], [[0.06, 0.06, 0.0], [0.0, 0.0, 0.0]]])
     torch.testing.assert_close(spread[0].std(0), expected, rtol=0.03, atol=0.0)
     torch.testing.assert_close(spread[0].mean(0), torch.zeros(2, 2, 3), rtol=0.0, atol=2e-3)
