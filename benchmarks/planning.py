@@ -1,10 +1,11 @@
 """What a plan costs: `python benchmarks/planning.py [--quick]`.
 
-Milliseconds per plan with the shipped checkpoint, the floating-point operations in it, and the share of this machine's
-own rate of matrix products that planning reaches; then the flat problem (30 pushes searched at once, the same dynamics,
-reward and samples) for our MPC and for two public planners, in turn. Crossing, sparse, horizon 30, T = 3. Wall time;
-set OMP_NUM_THREADS for the number of threads. The public planners come with the extra `benchmarks`; `--no-flat` leaves
-them out.
+Milliseconds per plan with the shipped checkpoint, direct and compiled (`planner.compile=true`), the floating-point
+operations in it, and the share of this machine's own rate of float32 matrix products that planning reaches; then the
+flat problem (30 pushes searched at once, the same dynamics, reward and samples) for our MPC and two public planners.
+Medians of wall time, all in turn; crossing, sparse, horizon 30, T = 3. Set OMP_NUM_THREADS for the number of threads.
+Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The public planners
+come with the extra `benchmarks`; `--no-flat` and `--no-compile` leave things out.
 """
 
 from __future__ import annotations
@@ -77,24 +78,25 @@ def operations(action: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def grid(samples: list[int], objects: list[int], batches: list[int], repetitions: int) -> None:
-    rate = matrix_rate()
-    threads = torch.get_num_threads()
-    print(f"{threads} thread(s); matrix products reach {rate / 1e9:.0f} GFLOP/s")
-    print("samples  objects  batch   ms per plan   GFLOP per plan   share of the matrix rate")
+def grid(samples: list[int], objects: list[int], batches: list[int], repetitions: int, ways: list[str]) -> None:
+    print(f"{torch.get_num_threads()} thread(s); ms per plan, and what share that is of the matrix rate")
+    print("samples  objects  batch  GFLOP per plan  matrix GFLOP/s" + "".join(f"  {way:>10}  share" for way in ways))
     for count in samples:
         for number in objects:
-            one = setup(number, count)
+            setups = {way: setup(number, count, f"planner.compile={str(way == 'compiled').lower()}") for way in ways}
             for batch in batches:
-                action = planning(one.planner, scenes(one, batch))
-                work = operations(action) / batch
-                spent = milliseconds({"plan": action}, repetitions)["plan"] / batch
-                share = work / (spent / 1e3) / rate
-                print(
-                    f"{count:7d}  {number:7d}  {batch:5d}   {spent:11.1f}   {work / 1e9:14.2f}   {share:24.2f}",
-                    flush=True,
+                actions = {way: planning(one.planner, scenes(one, batch)) for way, one in setups.items()}
+                work = operations(planning(setups["direct"].planner, scenes(setups["direct"], 1)))
+                rate = matrix_rate()  # anew each time: where cores are shared, it changes by the minute
+                spent = milliseconds(actions, max(2, repetitions // batch))
+                figures = "".join(
+                    f"  {value / batch:10.1f}  {work / (value / batch / 1e3) / rate:5.2f}" for value in spent.values()
                 )
-            one.env.close()
+                print(
+                    f"{count:7d}  {number:7d}  {batch:5d}  {work / 1e9:14.2f}  {rate / 1e9:14.0f}{figures}", flush=True
+                )
+            for one in setups.values():
+                one.env.close()
 
 
 class FlatProblem:
@@ -175,37 +177,43 @@ def cem_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
     return lambda: planner(start.clone())
 
 
-def flat(samples: list[int], repetitions: int) -> None:
-    print("the flat problem, 3 objects: ms per plan")
+def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
+    print("the flat problem, 3 objects: ms per plan; ours and theirs, which call f and the reward as torch has them")
     for count in samples:
-        one = setup(3, count, "planner=mpc")
+        setups = {
+            way: setup(3, count, "planner=mpc", f"planner.compile={str(way == 'compiled').lower()}") for way in ways
+        }
+        one = setups["direct"]
         problem = FlatProblem(one, scenes(one, 1))
+        theirs = {"pytorch_mppi": mppi_planner(problem, count), "torchrl CEM": cem_planner(problem, count)}
+        if "compiled" in ways:
+            native = FlatProblem(one, scenes(one, 1))
+            native.step = torch.compile(native.step, dynamic=False)  # type: ignore[method-assign]
+            theirs["pytorch_mppi, f compiled"] = mppi_planner(native, count)
+            theirs["torchrl CEM, f compiled"] = cem_planner(native, count)
+        ours = {f"ours, {way}": planning(one.planner, scenes(one, 1)) for way, one in setups.items()}
         with torch.inference_mode():
-            spent = milliseconds(
-                {
-                    "ours": planning(one.planner, scenes(one, 1)),
-                    "pytorch_mppi": mppi_planner(problem, count),
-                    "torchrl CEM": cem_planner(problem, count),
-                },
-                repetitions,
-            )
-        figures = ", ".join(f"{name} {value:.1f}" for name, value in spent.items())
-        ratios = ", ".join(f"{spent[name] / spent['ours']:.2f}" for name in ("pytorch_mppi", "torchrl CEM"))
-        print(f"{count:7d} samples: {figures}; theirs over ours {ratios}", flush=True)
-        one.env.close()
+            spent = milliseconds({**ours, **theirs}, repetitions)
+        for name, value in spent.items():
+            ratios = "" if name in ours else "; over ours " + ", ".join(f"{value / spent[own]:.2f}" for own in ours)
+            print(f"{count:7d} samples  {name:25s} {value:8.1f}{ratios}", flush=True)
+        for one in setups.values():
+            one.env.close()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a small part, to see that it runs")
     parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
-    quick, no_flat = (vars(parser.parse_args())[name] for name in ("quick", "no_flat"))
+    parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
+    quick, no_flat, no_compile = (vars(parser.parse_args())[name] for name in ("quick", "no_flat", "no_compile"))
+    ways = ["direct"] if no_compile else ["direct", "compiled"]
     if quick:
-        grid([32], [2], [1, 2], 2)
+        grid([32], [2], [1, 2], 2, ways)
     else:
-        grid([256, 1024, 8192], [1, 3, 5], [1, 16], 10)
+        grid([256, 1024, 8192], [1, 3, 5], [1, 16], 20, ways)
     if not no_flat:
-        flat([32] if quick else [1024, 8192], 2 if quick else 5)
+        flat([32] if quick else [1024, 8192], 2 if quick else 10, ways)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from cavin_pyro.worlds import check_world, object_ranges
 from envs.layouts import Layout
 from envs.pushing import PushingEnv
 from envs.workspace import MAXIMUM_OBJECTS
+from models.learned_priors import FlowPrior
 from models.pointnet import PointNet
 from planning import Planner
 from planning.protocol import RewardFunction
@@ -134,7 +135,7 @@ def _check_planner(options: dict[str, Any], model: PyroModule, path: Path) -> No
     """Make sure that the model has what the planner asks for, and no code that the planner would not choose.
 
     Raises:
-        UserError: it has not; the model that has is named.
+        UserError: it has not; the model that has is named. Or it is to be compiled, and cannot.
     """
     planner = class_of(options)
     missing = [name for name in getattr(planner, "needs", ()) if not hasattr(model, name)]
@@ -144,4 +145,8 @@ def _check_planner(options: dict[str, Any], model: PyroModule, path: Path) -> No
         raise UserError(
             f"{planner.__name__} needs a checkpoint of model={planner.usual_model}, but {path} holds "
             f"{type(model).__name__}, which {what}; planner=random takes any"
+        )
+    if options.get("compile") and any(isinstance(part, FlowPrior) for part in model.modules()):
+        raise UserError(
+            f"planner.compile=true, but the priors in {path} are flows, which cannot be compiled: take compile=false"
         )

@@ -99,7 +99,7 @@ class Compiled:
                 try:
                     with torch._inductor.config.patch(COMPILING):
                         native(*arguments)
-                except torch._dynamo.exc.Unsupported as error:
+                except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
                     what = str(error).splitlines()[0]
                     raise ValueError(f"compile=true: {function.__name__} cannot be compiled: {what}") from error
                 self._versions[version] = native

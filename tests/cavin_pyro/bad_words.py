@@ -125,6 +125,8 @@ BAD_WORDS = [
     ("plan", "planner.feature_weight=-1", "feature_weight must be zero or a positive number, not -1"),
     ("plan", "planner.idle_distance=-1", "idle_distance must be zero or a positive number, not -1"),
     ("plan", "planner.memory=3", "planner.memory must be true or false, not 3"),
+    ("plan", "planner.compile=3", "planner.compile must be true or false, not 3"),
+    ("plan", "planner.compile=true layout=random", "layout=random has another in every episode: take planner.compile"),
     ("plan", "planner.optimizer_options=3", "optimizer_options must be a section like"),
     ("plan", "planner.robustness.draws=0", "draws must be at least 1, not 0"),
     ("plan", "planner.robustness.start_noise=-1", "start_noise must be zero or a positive number, not -1"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,19 +33,22 @@ MODELS = sorted({*FITTING.values()})
 SMALL = ["maximum_steps=3", "objects=2", "planner.samples=16", "planner.horizon=6"]
 
 
+def save_untrained(path: Path, *words: str) -> Path:
+    """A very small checkpoint, as train writes it."""
+    with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
+        composed = hydra.compose("train", overrides=["guide=none", "model.width=8", *words])
+    config = {part: OmegaConf.to_container(composed[part], resolve=True) for part in ("model", "prior", "scales")}
+    with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
+        parts = {"model": building.build_model(config), "pointnet": PointNet()}
+        save_checkpoint(path, parts=parts, config=config, provenance={"step": 0})
+    return path
+
+
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """An untrained and very small checkpoint of every model, as train writes it."""
-    folder, paths = tmp_path_factory.mktemp("models"), {}
-    for name in MODELS:
-        with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
-            composed = hydra.compose("train", overrides=[f"model={name}", "guide=none", "model.width=8"])
-        config = {part: OmegaConf.to_container(composed[part], resolve=True) for part in ("model", "prior", "scales")}
-        with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
-            parts = {"model": building.build_model(config), "pointnet": PointNet()}
-            paths[name] = folder / f"{name}.safetensors"
-            save_checkpoint(paths[name], parts=parts, config=config, provenance={"step": 0})
-    return paths
+    """An untrained checkpoint of every model."""
+    folder = tmp_path_factory.mktemp("models")
+    return {name: save_untrained(folder / f"{name}.safetensors", f"model={name}") for name in MODELS}
 
 
 @pytest.fixture
@@ -97,6 +102,30 @@ def test_options_take_effect(planner: str, word: str) -> None:
         parts.env.close()
     returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
     assert not (torch.equal(*returns) and torch.equal(*actions))
+
+
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("planner", ["cavin", "mpc"])
+def test_compiled_plans_are_those_of_direct_planning(planner: str, setup: Callable[..., Setup]) -> None:
+    plans = []
+    for compile in ("false", "true"):
+        parts = setup(planner, FITTING[planner], "products=float32", f"planner.compile={compile}", "task=insertion")
+        episode = run_episode(parts.env, parts.planner, parts.pointnet, seed=1)
+        plans.append([decision.plan for decision in episode.decisions])
+        parts.env.close()
+    for direct, compiled in zip(*plans, strict=True):
+        torch.testing.assert_close(compiled.candidate_returns, direct.candidate_returns)
+        torch.testing.assert_close(compiled.actions, direct.actions, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(compiled.predicted_centers, direct.predicted_centers, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler")
+def test_flows_are_not_compiled(tmp_path: Path) -> None:
+    path = save_untrained(tmp_path / "flow.safetensors", "model=cascaded", "prior=flow")
+    with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
+        config = hydra.compose("evaluate", overrides=[f"checkpoint={path}", "planner.compile=true", "output=unused"])
+    with pytest.raises(UserError, match=r"the priors in .*flow\.safetensors are flows, which cannot be compiled: take"):
+        set_up(config)
 
 
 @pytest.mark.parametrize("model", MODELS)

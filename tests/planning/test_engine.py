@@ -1,0 +1,177 @@
+"""Compiled planning says what direct planning says, makes no code twice, and plans several environments at once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import CavinPlanner, CvaeMpcPlanner, Plan, Robustness, bulk
+from planning.engine import Compiled, directly
+from planning.inputs import HopelessEnvironmentError
+
+needs_a_compiler = pytest.mark.skipif(
+    shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler: g++, or one that CXX names"
+)
+
+
+class Pair(NamedTuple):
+    left: Tensor
+    right: Tensor | None
+
+
+def scaled(pair: Pair, factor: float, power: int) -> tuple[Pair, Tensor]:
+    left = factor * pair.left**power
+    return Pair(left, pair.right), left.sum()
+
+
+def rounded_product(layer: torch.nn.Linear, numbers: Tensor) -> Tensor:
+    return layer(numbers)
+
+
+def branching(numbers: Tensor) -> Tensor:
+    return numbers if bool(numbers.any()) else -numbers
+
+
+@pytest.fixture
+def precision() -> Iterator[None]:
+    before = torch.get_float32_matmul_precision()
+    yield
+    torch.set_float32_matmul_precision(before)
+
+
+def tensors(plan: Plan) -> list[Tensor]:
+    return [tensor for field in plan for tensor in (field if isinstance(field, State) else (field,))]
+
+
+@needs_a_compiler
+def test_code_is_made_once_for_each_constant_and_shape() -> None:
+    engine, numbers = Compiled(), torch.tensor([1.0, 2.0, 3.0])
+    cases = [
+        (numbers, None, 2.0, 2),
+        (numbers + 1, None, 2.0, 3),  # other numbers, and another count
+        (numbers, None, 0.5, 2),
+        (numbers[:2], None, 2.0, 2),
+        (numbers, numbers, 2.0, 2),
+    ]
+    for left, right, factor, power in cases:
+        expected, (pair, total) = (call(scaled, Pair(left, right), factor, power) for call in (directly, engine))
+        torch.testing.assert_close(pair.left, expected[0].left)
+        torch.testing.assert_close(total, expected[1])
+        assert isinstance(pair, Pair)
+        assert (pair.right is None) == (right is None)
+    assert len(engine._versions) == 4
+    assert len(cases) == 5
+
+
+@needs_a_compiler
+def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32(precision: None) -> None:
+    torch.manual_seed(0)
+    layer, numbers = torch.nn.Linear(64, 64), torch.randn(32, 64)
+    engine = Compiled()
+    with torch.inference_mode():
+        exact = layer(numbers)
+        torch.set_float32_matmul_precision("highest")
+        torch.testing.assert_close(engine(rounded_product, layer, numbers), exact)
+        torch.set_float32_matmul_precision("medium")
+        rounded = engine(rounded_product, layer, numbers)
+    assert rounded.dtype == torch.float32
+    assert torch.equal(rounded, rounded.bfloat16().float())
+    torch.testing.assert_close(rounded, exact, rtol=0.02, atol=0.02)
+
+
+@needs_a_compiler
+def test_what_cannot_be_compiled_is_one_clear_line() -> None:
+    with pytest.raises(ValueError, match=r"^compile=true: branching cannot be compiled: .*$"):
+        Compiled()(branching, torch.zeros(2))
+
+
+def test_no_compiler_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "nowhere++")
+    with pytest.raises(ValueError, match=r"^compile=true needs a C\+\+ compiler, and 'nowhere\+\+' was not found: "):
+        Compiled()
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("threads", [1, 3])
+def test_each_keeps_the_order_and_the_number_of_threads(threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        counts = Compiled().each(lambda item: (item, torch.get_num_threads()), range(7))
+        assert [item for item, _ in counts] == list(range(7))
+        assert {count for _, count in counts} == {1}
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("horizon", ["first_segment", "full_horizon"])
+def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
+    toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, precision: None, horizon: str
+) -> None:
+    torch.set_float32_matmul_precision("highest")
+    monkeypatch.setattr(bulk, "ENVIRONMENTS_ON_PROCESSOR", 1)
+    state = toy.scenes([[(0.1 * number, 0.0), (0.3, 0.2)] for number in range(4)], gains=(1.0, 0.0))
+    options = {"samples": 64, "horizon": 9, "memory": True, "robustness": Robustness(finalists=8, draws=4)}
+    direct, compiled = (
+        CavinPlanner(
+            toy.PointMass(),
+            toy.GoalDisc(goal=(0.4, 0.1), forbidden_below=-0.05),
+            motion_horizon=horizon,
+            compile=compile,
+            **options,
+        )
+        for compile in (False, True)
+    )
+    expected = direct.plan(state, toy.generators(*range(4)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)  # so that two environments are planned at once
+    try:
+        found = compiled.plan(state, toy.generators(*range(4)))
+        alone = compiled.plan(state.scene(slice(2, 3)), toy.generators(2))
+    finally:
+        torch.set_num_threads(threads)
+    for ours, theirs, one in zip(tensors(found), tensors(expected), tensors(alone), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+        assert torch.equal(ours[2:3], one)
+    assert len(compiled.engine._versions) == (4 if horizon == "first_segment" else 5)  # type: ignore[attr-defined]
+
+
+@needs_a_compiler
+def test_the_hopeless_environment_is_named(toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bulk, "ENVIRONMENTS_ON_PROCESSOR", 1)
+    planner = CvaeMpcPlanner(toy.Flat(), toy.GoalDisc(goal=(0.4, 0.0)), samples=8, horizon=6, compile=True)
+    state = toy.scenes([[(0.0, 0.0)], [(0.0, 0.0)], [(float("nan"), 0.0)]])
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(HopelessEnvironmentError, match="environment 2: none of the 8 "):
+            planner.plan(state, toy.generators(0, 1, 2))
+    finally:
+        torch.set_num_threads(threads)
+
+
+@needs_a_compiler
+def test_the_episode_decides_what_is_rewarded(toy: SimpleNamespace) -> None:
+    class Changing:
+        """A reward that says by `now` what it is in this episode."""
+
+        now = toy.GoalDisc(goal=(0.1, 0.0))
+
+    planner = CvaeMpcPlanner(toy.Flat(), Changing(), samples=256, horizon=3, compile=True)  # type: ignore[arg-type]
+    state = toy.scenes([[(0.0, 0.0)]])
+    for goal in (0.1, -0.1, 0.1):
+        Changing.now = toy.GoalDisc(goal=(goal, 0.0))
+        plan = planner.plan(state, toy.generators(0))
+        assert plan.expected_success.all()
+        reached = plan.predicted_centers[0, plan.segments[0] * 3 - 3 :, 0, 0]
+        assert (reached - goal).abs().min() < 0.05
