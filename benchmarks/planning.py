@@ -5,7 +5,7 @@ operations in it, and the share of this machine's own rate of float32 matrix pro
 flat problem (30 pushes searched at once, the same dynamics, reward and samples) for our MPC and two public planners.
 Medians of wall time, all in turn; crossing, sparse, horizon 30, T = 3. Set OMP_NUM_THREADS for the number of threads.
 Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The public planners
-come with the extra `benchmarks`; `--no-flat` and `--no-compile` leave things out.
+come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cavin_pyro.episodes import observed_state
 from cavin_pyro.setups import Setup, set_up
 from envs.tasks import TaskReward
 from models.state import State
-from planning import Planner
+from planning import MpcPlanner, Planner, PlanningModel
 
 HORIZON, SEGMENT = 30, 3
 FEATURES = 64
@@ -99,11 +99,16 @@ def grid(samples: list[int], objects: list[int], batches: list[int], repetitions
                 one.env.close()
 
 
+def next_state(model: PlanningModel, state: State, action: Tensor) -> State:
+    return model.next_state(state, action)
+
+
 class FlatProblem:
     """f and the reward as functions of a flat state `[..., M * 67]`, as the public planners want them."""
 
     def __init__(self, one: Setup, state: State) -> None:
-        self.model, self.mask = one.planner.model, state.mask[0]  # type: ignore[attr-defined]
+        planner: MpcPlanner = one.planner  # type: ignore[assignment]
+        self.model, self.engine, self.mask = planner.model, planner.engine, state.mask[0]
         self.reward = TaskReward(one.layout)
         self.objects = state.objects
         self.start = torch.cat((state.centers[0], state.features[0]), -1).flatten()
@@ -113,7 +118,7 @@ class FlatProblem:
         return State(parts[..., :3], parts[..., 3:], self.mask.expand(parts.shape[:-1]))
 
     def step(self, flat: Tensor, action: Tensor) -> Tensor:
-        after = self.model.next_state(self.unpack(flat), action)
+        after = self.engine(next_state, self.model, self.unpack(flat), action)
         return torch.cat((after.centers, after.features), -1).flatten(-2)
 
     def rewards(self, before: Tensor, after: Tensor) -> Tensor:
@@ -178,20 +183,17 @@ def cem_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
 
 
 def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
-    print("the flat problem, 3 objects: ms per plan; ours and theirs, which call f and the reward as torch has them")
+    print("the flat problem, 3 objects: ms per plan; all call the same f, direct or compiled by our engine")
     for count in samples:
         setups = {
             way: setup(3, count, "planner=mpc", f"planner.compile={str(way == 'compiled').lower()}") for way in ways
         }
-        one = setups["direct"]
-        problem = FlatProblem(one, scenes(one, 1))
-        theirs = {"pytorch_mppi": mppi_planner(problem, count), "torchrl CEM": cem_planner(problem, count)}
-        if "compiled" in ways:
-            native = FlatProblem(one, scenes(one, 1))
-            native.step = torch.compile(native.step, dynamic=False)  # type: ignore[method-assign]
-            theirs["pytorch_mppi, f compiled"] = mppi_planner(native, count)
-            theirs["torchrl CEM, f compiled"] = cem_planner(native, count)
-        ours = {f"ours, {way}": planning(one.planner, scenes(one, 1)) for way, one in setups.items()}
+        ours, theirs = {}, {}
+        for way, one in setups.items():
+            problem = FlatProblem(one, scenes(one, 1))
+            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1))
+            theirs[f"pytorch_mppi, f {way}"] = mppi_planner(problem, count)
+            theirs[f"torchrl CEM, f {way}"] = cem_planner(problem, count)
         with torch.inference_mode():
             spent = milliseconds({**ours, **theirs}, repetitions)
         for name, value in spent.items():
@@ -204,16 +206,18 @@ def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a small part, to see that it runs")
+    parser.add_argument("--no-grid", action="store_true", help="the public planners only")
     parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
-    quick, no_flat, no_compile = (vars(parser.parse_args())[name] for name in ("quick", "no_flat", "no_compile"))
-    ways = ["direct"] if no_compile else ["direct", "compiled"]
-    if quick:
-        grid([32], [2], [1, 2], 2, ways)
-    else:
-        grid([256, 1024, 8192], [1, 3, 5], [1, 16], 20, ways)
-    if not no_flat:
-        flat([32] if quick else [1024, 8192], 2 if quick else 10, ways)
+    words = parser.parse_args()
+    ways = ["direct"] if words.no_compile else ["direct", "compiled"]
+    samples, objects, batches, repetitions = (
+        ([32], [2], [1, 2], 2) if words.quick else ([256, 1024, 8192], [1, 3, 5], [1, 16], 20)
+    )
+    if not words.no_grid:
+        grid(samples, objects, batches, repetitions, ways)
+    if not words.no_flat:
+        flat([32] if words.quick else [1024, 8192], max(2, repetitions // 2), ways)
 
 
 if __name__ == "__main__":
