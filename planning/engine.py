@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from threading import Lock
 from types import FunctionType
 from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -97,13 +99,24 @@ class Compiled:
             if version not in self._versions:  # another thread may have been faster
                 native = _compiled(function, rounded, len(self._versions))
                 try:
-                    with torch._inductor.config.patch(COMPILING):
+                    with torch._inductor.config.patch(COMPILING), _distributions_unchecked():
                         native(*arguments)
                 except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
                     what = str(error).splitlines()[0]
                     raise ValueError(f"compile=true: {function.__name__} cannot be compiled: {what}") from error
                 self._versions[version] = native
         return self._versions[version](*arguments)
+
+
+@contextmanager
+def _distributions_unchecked() -> Iterator[None]:
+    """Torch's checks of distributions look at numbers, and compiled code has no branches."""
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
 
 
 def _compiled(function: Callable[..., Any], rounded: bool, number: int) -> Callable[..., Any]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pytest
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
 from models.state import State
 from planning import CavinPlanner, CvaeMpcPlanner, Plan, Robustness, bulk
@@ -132,6 +133,7 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
     toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, precision: None
 ) -> None:
     torch.set_float32_matmul_precision("highest")
+    monkeypatch.setattr(Distribution, "_validate_args", True)  # as torch has it, and other tests may not
     monkeypatch.setattr(bulk, "ENVIRONMENTS_ON_PROCESSOR", 1)
     state = toy.scenes([[(0.1 * number, 0.0), (0.3, 0.2)] for number in range(4)], gains=(1.0, 0.0))
     direct, compiled = (
@@ -159,6 +161,7 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
         assert torch.equal(ours[2:3], one)
     # The first segment of effects, the others, the same of motions, and what tries the best again.
     assert len(compiled.engine._versions) == 5  # type: ignore[attr-defined]
+    assert Distribution._validate_args
 
 
 def test_the_episode_decides_what_is_rewarded(toy: SimpleNamespace) -> None:
