@@ -11,12 +11,13 @@ from torch import Tensor
 Record = TypeVar("Record", bound=tuple)
 
 
-def apply(record: Record, function: Callable[[Tensor], Tensor]) -> Record:
-    """The same function of every field; None stays None."""
+def apply(record: Record, function: Callable[[Any], Any]) -> Record:
+    """The same function of every field; None stays None. Tuples without names will do, too."""
 
     def applied(value: Any) -> Any:
         if isinstance(value, tuple):
-            return type(value)(*map(applied, value))
+            parts = [applied(part) for part in value]
+            return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
         return None if value is None else function(value)
 
     return applied(record)

@@ -9,7 +9,8 @@ import torch
 
 from models.state import State
 from planning.candidates import Candidates, Search
-from planning.engine import Compiled, Engine, directly
+from planning.compiled import Compiled
+from planning.engine import Engine, directly
 from planning.inputs import check_horizon, check_positive
 from planning.memory import hints
 from planning.optimisers import make_optimiser

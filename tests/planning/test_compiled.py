@@ -15,7 +15,8 @@ from torch.distributions import Distribution
 
 from models.state import State
 from planning import CavinPlanner, CvaeMpcPlanner, Plan, Robustness, bulk
-from planning.engine import Compiled, directly
+from planning.compiled import Compiled
+from planning.engine import directly
 from planning.inputs import HopelessEnvironmentError
 
 needs_a_compiler = pytest.mark.skipif(
