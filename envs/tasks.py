@@ -7,6 +7,7 @@ progress in metres.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -90,6 +91,11 @@ class TaskReward:
             progress = self.potential(after, mask) - self.potential(before, mask)
             reward = reward + progress
         return Outcome(reward.to(centers.dtype), progress, success, violation, fall)
+
+    @property
+    def most(self) -> float:
+        """What no sequence of steps, which a success ends, earns more than; infinite where progress counts."""
+        return math.inf if self.dense else TIME_REWARD + GOAL_REWARD
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the metres still to go, whose change is the dense term: [...].

@@ -94,6 +94,7 @@ class CavinPlanner(SearchingPlanner):
         self.robustness = robustness
         self.idle_distance = idle_distance
         self.reachability = reachability
+        self.best_only = reachability is None  # it looks at many
 
     @in_bulk
     @torch.inference_mode()

@@ -48,9 +48,9 @@ class Compiled:
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Engine`. Raises ValueError for a function that cannot be compiled, saying why."""
-        arguments = fields.apply(arguments, _without_counts)
+        arguments = tuple(map(_without_count, arguments))
         rounded = torch.get_float32_matmul_precision() != "highest"
-        version = function, rounded, *_traits(arguments)
+        version = (function, rounded, *_traits(arguments, []))
         native = self._versions.get(version)
         return self._first(function, rounded, version, arguments) if native is None else native(*arguments)
 
@@ -104,7 +104,7 @@ def _compiled(function: Callable[..., Any], rounded: bool, number: int) -> Calla
     return torch.compile(own, fullgraph=True, dynamic=False, options=options)
 
 
-def _without_counts(value: Any) -> Any:
+def _without_count(value: Any) -> Any:
     """A whole number as a tensor, so that one version serves the segments of a plan, whatever their number."""
     return torch.tensor(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -113,11 +113,15 @@ def _in_float32(value: Any) -> Any:
     return value.float() if isinstance(value, Tensor) and value.dtype == torch.bfloat16 else value
 
 
-def _traits(value: Any) -> list[Any]:
-    """What a version is for: constants, and the shapes of tensors, in order."""
+def _traits(value: Any, traits: list[Any]) -> list[Any]:
+    """Adds to `traits` what a version is for: constants, and the shapes of tensors, in order."""
     if isinstance(value, tuple):
-        return [type(value), *(trait for field in value for trait in _traits(field))]
-    return [value.shape if isinstance(value, Tensor) else value]
+        traits.append(type(value))
+        for field in value:
+            _traits(field, traits)
+    else:
+        traits.append(value.shape if isinstance(value, Tensor) else value)
+    return traits
 
 
 def _device(value: Any) -> str:

@@ -34,11 +34,23 @@ def join(records: Sequence[Record], dimension: int = 1) -> Record:
 
     With `dimension=0` the environments: `[B_1, ...], ... -> [B_1 + ..., ...]`.
     """
+    return _combine(records, lambda values: torch.cat(list(values), dim=dimension))
 
-    def joined(values: Sequence[Any]) -> Any:
-        first = values[0]
-        if isinstance(first, tuple):
-            return type(first)(*map(joined, zip(*values, strict=True)))
-        return None if any(value is None for value in values) else torch.cat(list(values), dim=dimension)
 
-    return joined(list(records))
+def where(chosen: Tensor, record: Any, other: Any) -> Any:
+    """Fields `[B, ...]` of `record` in the environments `chosen: [B]` bool, of `other` elsewhere."""
+
+    def field(values: Sequence[Tensor]) -> Tensor:
+        first, second = values
+        return torch.where(chosen.view(-1, *[1] * (first.ndim - 1)), first, second)
+
+    return _combine([record, other], field)
+
+
+def _combine(records: Sequence[Any], function: Callable[[Sequence[Any]], Any]) -> Any:
+    """The same function of every field of several records; None where one of them has None."""
+    first = records[0]
+    if isinstance(first, tuple):
+        parts = [_combine(values, function) for values in zip(*records, strict=True)]
+        return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
+    return None if any(record is None for record in records) else function(records)

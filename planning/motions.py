@@ -81,6 +81,10 @@ class Closeness(NamedTuple):
         first = torch.where(executed, distance, standing.first_distance)
         return Aim(distance, first, sound, failed_in_executed, progress)
 
+    def settled(self, standing: Aim) -> Tensor:
+        """`[B]` bool: nowhere, for no sequence ends before the others."""
+        return torch.zeros_like(standing.sound[:, 0])
+
 
 class MotionPlan(NamedTuple):
     """The chosen motion codes, their actions, and where f says that they lead; S segments of T steps."""

@@ -6,24 +6,20 @@ active".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
 
-def draw_parents(failed: Tensor, active: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+def choose_parents(failed: Tensor, active: Tensor, chances: Tensor) -> Tensor:
     """For every plan, the number of the plan that it goes on from: `[B, N]` int64.
 
-    `failed`, `active`: `[B, N]` bool. A failed plan goes on from an active one, drawn uniformly with its
-    environment's generator; every other plan from itself, successful ones too. An environment with no active
-    plan keeps all of its plans. A generator is used only where its environment replaces something.
+    `failed`, `active`: `[B, N]` bool. `chances`: `[B, N]`, uniform in [0, 1). A failed plan goes on from an active one,
+    all equally likely; every other plan from itself, successful ones too. An environment with no active plan keeps all
+    of its plans.
     """
-    environments, plans = failed.shape
-    parents = torch.arange(plans, device=failed.device).repeat(environments, 1)
-    for index in (failed.any(-1) & active.any(-1)).nonzero().flatten().tolist():
-        living = active[index].nonzero().squeeze(-1)
-        dead = failed[index].nonzero().squeeze(-1)
-        choice = torch.randint(len(living), (len(dead),), generator=generators[index], device=failed.device)
-        parents[index, dead] = living[choice]
-    return parents
+    own = torch.arange(failed.shape[-1], device=failed.device).expand_as(failed)
+    living = active.cumsum(-1)  # of the first plans, up to and including each
+    number = living[:, -1:]
+    rank = (chances * number).long().clamp(max=(number - 1).clamp(min=0))  # a product may be rounded up to its factor
+    parents = torch.searchsorted(living, rank + 1).clamp(max=failed.shape[-1] - 1)
+    return torch.where(failed & (number > 0), parents, own)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -53,6 +54,15 @@ class CumulativeReward:
         path = stretch.path if self.at == "path" else stretch.path[..., -1:, :, :]
         return returns.advance(standing, self.reward, before.centers, path, before.mask)
 
+    def settled(self, standing: Progress) -> Tensor:
+        """`[B]` bool: where no plan that goes on can come to a higher return than the best that has ended.
+
+        Nowhere, unless the reward function tells by `most` what it is that no sequence of steps earns more than.
+        """
+        ended = torch.where(standing.active, -torch.inf, standing.returns).amax(-1)
+        possible = torch.where(standing.active, standing.returns + most_of(self.reward), -torch.inf).amax(-1)
+        return ended > possible
+
 
 @dataclass(frozen=True)
 class StrideLimits:
@@ -75,6 +85,11 @@ class StrideLimits:
             raise ValueError(f"stride_limits must be two distances in metres, low then high, not {limits}")
         object.__setattr__(self, "limits", tuple(limits))
 
+    @property
+    def most(self) -> float:
+        """What no sequence of steps earns more than: as without limits, which only take away."""
+        return most_of(self.reward)
+
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
         """Judge the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
         outcome = self.reward(previous, centers, mask)
@@ -96,3 +111,8 @@ class StrideLimits:
         strides = (after - before).norm(dim=-1)
         short = ((strides < shortest) | ~mask).all(-1)
         return short | ((strides > longest) & mask).any(-1)
+
+
+def most_of(reward: RewardFunction) -> float:
+    """What no sequence of steps earns more than, if the reward function knows: else infinite."""
+    return getattr(reward, "most", math.inf)

@@ -27,6 +27,7 @@ class SearchingPlanner:
     """
 
     strides: ClassVar[str] = "segments"  # what `stride_limits` limits, or "pushes"
+    best_only = True  # whether of the plans that were considered only the one with the highest return matters
 
     def __init__(
         self,
@@ -81,5 +82,15 @@ class SearchingPlanner:
         Raises ValueError for a memory of codes whose prior is not made of noise (`planning.sampling.code_of`).
         """
         left = hints(previous, generators) if self.memory else None
-        wanted = Search(level, self.score, state, generators, self.segments, self.from_noise, left, self.engine)
+        wanted = Search(
+            level,
+            self.score,
+            state,
+            generators,
+            self.segments,
+            self.from_noise,
+            left,
+            best_only=self.best_only,
+            engine=self.engine,
+        )
         return self.optimiser.optimise(wanted, self.samples)

@@ -61,6 +61,9 @@ class Score(Protocol):
     def advance(self, standing: Any, segment: int, before: State, stretch: Stretch) -> Any:
         """`Standing` after one more segment, which begins at `before: [B, n]`."""
 
+    def settled(self, standing: Any) -> Tensor:
+        """`[B]` bool: where no plan that goes on can come to a higher return than the best that has ended."""
+
 
 class Segment(NamedTuple):
     """What is kept of one segment of R plans."""

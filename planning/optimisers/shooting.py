@@ -29,4 +29,4 @@ class Shooting:
         if search.hints is not None:
             known = search.hints[:, :samples]
             noise[:, samples - known.shape[1] :] = known
-        return search.evaluate(noise, replacement=self.replacement)
+        return search.evaluate(noise, replacement=self.replacement, for_best=search.best_only)

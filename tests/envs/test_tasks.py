@@ -298,3 +298,22 @@ def test_double_precision_is_not_lost_on_the_way() -> None:
     step = 1e-12  # metres; far below what single precision tells apart
     outcome = judge(CROSSING, [tile(2, 3), ASIDE], [(tile(2, 3)[0], tile(2, 3)[1] - step), ASIDE])
     assert outcome.progress.item() == pytest.approx(step, rel=1e-3)
+
+
+@given(
+    layout=st.sampled_from([CLEARING, INSERTION, CROSSING]),
+    path=st.lists(st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6)), min_size=2, max_size=8),
+)
+def test_nobody_earns_more_than_the_most_that_can_be_earned(layout: Layout, path: list[Point]) -> None:
+    total = 0.0
+    for before, after in pairwise(path):
+        step = judge(layout, [before], [after])
+        total += float(step.reward)
+        if step.success or step.failure:
+            break
+    assert total <= TaskReward(layout).most
+
+
+def test_the_most_that_can_be_earned_is_earned_by_a_success_at_once() -> None:
+    assert judge(CROSSING, [ASIDE], [tile(2, 2)]).reward == TaskReward(CROSSING).most
+    assert TaskReward(CROSSING, reward="dense").most == math.inf  # progress is earned, too

@@ -138,6 +138,7 @@ class GoalDisc:
         dense: bool = False,
     ) -> None:
         self.goal, self.radius, self.forbidden_below, self.dense = goal, radius, forbidden_below, dense
+        self.most = torch.inf if dense else 99.0
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
         success = self.distance(centers) <= self.radius

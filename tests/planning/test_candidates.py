@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
 from planning.candidates import Candidates, Search, join
 from planning.rewards import CumulativeReward
 
 
-def search(toy: SimpleNamespace, *, goal: tuple[float, float] = (9.0, 9.0)) -> Search:
-    reward = toy.GoalDisc(goal=goal, forbidden_below=-1.0, dense=True)
-    state = toy.scenes([[(0.0, 0.1)], [(0.3, 0.0)]])
-    return Search(toy.Placed(), CumulativeReward(reward), state, toy.generators(0, 1), segments=4)
+def search(toy: SimpleNamespace, *, dense: bool = True, environments: slice = slice(0, 2)) -> Search:
+    reward = toy.GoalDisc(goal=(9.0, 9.0) if dense else (0.5, 0.5), forbidden_below=-1.0, dense=dense)
+    state = toy.scenes([[(0.0, 0.1)], [(0.3, 0.0)]]).scene(environments)
+    generators = toy.generators(0, 1)[environments]
+    return Search(toy.Placed(), CumulativeReward(reward), state, generators, segments=4)
 
 
 def same(ours: Candidates, theirs: Candidates) -> None:
@@ -64,3 +67,63 @@ def test_plans_that_have_ended_stay_where_they_are(toy: SimpleNamespace) -> None
     ended, going = search(toy).evaluate(noise).plans.centers[0, :, 0, :2].tolist()
     assert ended == [0.0, -2.0]
     assert going == [1.0, 1.0]
+
+
+def places(first_to_arrive: tuple[int, ...], count: int = 6) -> Tensor:
+    """Noise `[B, n, 4, 2]`; in each environment plan 1 comes to the goal in one segment, plan 3 in the next."""
+    noise = torch.full((len(first_to_arrive), count, 4, 2), 0.2)
+    noise[:, 0, 1:] = -2.0  # dead from the second segment on: a copy takes its place
+    for environment, number in enumerate(first_to_arrive):
+        noise[environment, 1, number] = 0.5
+        noise[environment, 3, number + 1 :] = 0.5
+    return noise
+
+
+def test_a_search_for_the_best_plan_ends_when_none_can_be_better(toy: SimpleNamespace) -> None:
+    noise = places((0, 1))
+    all_plans = search(toy, dense=False).evaluate(noise, replacement=True)
+    until_settled = search(toy, dense=False).evaluate(noise, replacement=True, for_best=True)
+    for candidates in (all_plans, until_settled):
+        assert candidates.returns.argmax(-1).tolist() == [1, 1]
+        assert candidates.returns.amax(-1).tolist() == [99.0, 98.0]
+        assert torch.equal(candidates.noise[:, 1:], noise[:, 1:])  # of all but the copies
+    # Plan 3 would arrive one segment later, which nobody waits for.
+    assert all_plans.returns[:, 3].tolist() == [98.0, 97.0]
+    assert until_settled.returns[:, 3].tolist() == [-1.0, -2.0]
+    places_of = until_settled.history(lambda segment: segment.stretch.states.centers)[..., 0, 0]
+    torch.testing.assert_close(places_of[0, :, 1:], places_of[0, :, :1].expand(-1, 3))
+    torch.testing.assert_close(places_of[1, :, 2:], places_of[1, :, 1:2].expand(-1, 2))
+
+
+def test_what_an_environment_finds_does_not_depend_on_when_others_are_settled(toy: SimpleNamespace) -> None:
+    noise = places((0, 2))
+    both = search(toy, dense=False).evaluate(noise, replacement=True, for_best=True)
+    for number in range(2):
+        own = slice(number, number + 1)
+        alone = search(toy, dense=False, environments=own).evaluate(noise[own], replacement=True, for_best=True)
+        for ours, theirs in zip(alone.standing, both.standing, strict=True):
+            assert torch.equal(ours, theirs[own])
+        assert torch.equal(alone.plans.centers, both.plans.centers[own])
+        for read in (lambda segment: segment.stretch.path, lambda segment: segment.stretch.code):
+            assert torch.equal(alone.history(read), both.history(read)[own])
+
+
+def test_a_settled_search_asks_the_model_nothing_more(toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, extend = [], toy.Placed.extend
+    monkeypatch.setattr(toy.Placed, "extend", lambda *given: asked.append(given[1]) or extend(*given))
+    search(toy, dense=False).evaluate(places((0, 1)), for_best=True)
+    assert asked == [0, 1]
+    asked.clear()
+    search(toy, dense=False).evaluate(places((3, 0)), for_best=True)
+    assert asked == [0, 1, 2, 3]
+
+
+def test_where_nobody_knows_the_most_that_can_be_earned_no_search_is_settled_before_all_have_ended(
+    toy: SimpleNamespace,
+) -> None:
+    noise = places((0, 1))
+    problem = search(toy, dense=False)
+    problem.score.reward.most = torch.inf  # type: ignore[attr-defined]
+    assert problem.evaluate(noise, for_best=True).returns[:, 3].tolist() == [98.0, 97.0]
+    asked = problem.evaluate(torch.full((2, 5, 4, 2), 0.5), for_best=True)
+    assert asked.returns.tolist() == [[99.0] * 5] * 2

@@ -19,7 +19,8 @@ from planning.rewards import CumulativeReward
 TOP = (0.8, -0.6)
 SAMPLES = 512
 # Largest distance from the top per segment, the root of the mean square, with 512 samples of 6 numbers (3 segments).
-TOLERANCE = {"evolution": 0.62, "shooting": 0.65, "smc": 0.45, "cem": 0.2, "icem": 0.2, "mppi": 0.2}
+# Of 20,000 independent draws of 512, 99.9 % come closer than 0.74.
+TOLERANCE = {"evolution": 0.62, "shooting": 0.74, "smc": 0.45, "cem": 0.2, "icem": 0.2, "mppi": 0.2}
 each_optimiser = pytest.mark.parametrize("name", sorted(OPTIMISERS))
 
 
