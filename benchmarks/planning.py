@@ -3,18 +3,22 @@
 Milliseconds per plan with the shipped checkpoint, direct and compiled (`planner.compile=true`), the floating-point
 operations in it, and the share of this machine's own rate of float32 matrix products that planning reaches; then the
 flat problem (30 pushes searched at once, the same dynamics, reward and samples) for our MPC and two public planners.
-Medians of wall time, all in turn; crossing, sparse, horizon 30, T = 3. Set OMP_NUM_THREADS for the number of threads.
-Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The public planners
-come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out.
+Wall time, all in turn, medians and the fastest; crossing, sparse, horizon 30, T = 3, the first scenes of 16 episodes,
+planned one after another or all at once: how long a search goes on depends on the scene. "Algorithm 1" is compiled
+planning without the tries of `planner.robustness`, which are not in the paper. Set OMP_NUM_THREADS for the number of
+threads. Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The public
+planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # this file would hide `planning`
 
@@ -29,7 +33,8 @@ from envs.tasks import TaskReward
 from models.state import State
 from planning import MpcPlanner, Planner, PlanningModel
 
-HORIZON, SEGMENT = 30, 3
+HORIZON = 30
+SCENES = 16  # also the larger batch
 FEATURES = 64
 
 
@@ -48,8 +53,15 @@ def generators(count: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in range(count)]
 
 
-def milliseconds(actions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, float]:
-    """Median wall time of each action, all of them in turn, so that what else the machine does falls on all."""
+class Times(NamedTuple):
+    """Of repetitions, in milliseconds."""
+
+    median: float
+    fastest: float
+
+
+def milliseconds(actions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, Times]:
+    """Wall time of each action, all of them in turn, so that what else the machine does falls on all."""
     times: dict[str, list[float]] = {name: [] for name in actions}
     for repetition in range(repetitions + 1):
         for name, action in actions.items():
@@ -57,18 +69,26 @@ def milliseconds(actions: dict[str, Callable[[], object]], repetitions: int) -> 
             action()
             if repetition:  # the first warms up
                 times[name].append(1e3 * (time.perf_counter() - began))
-    return {name: statistics.median(values) for name, values in times.items()}
+    return {name: Times(statistics.median(values), min(values)) for name, values in times.items()}
 
 
-def planning(planner: Planner, state: State) -> Callable[[], object]:
-    return lambda: planner.plan(state, generators(len(state.centers)))
+def planning(planner: Planner, state: State, batch: int) -> Callable[[], object]:
+    """Plans for all scenes, as many at once as `batch`."""
+
+    def plan() -> None:
+        sources = generators(len(state.centers))
+        for begin in range(0, len(sources), batch):
+            chunk = slice(begin, begin + batch)
+            planner.plan(state.scene(chunk), sources[chunk])
+
+    return plan
 
 
 def matrix_rate() -> float:
     """Floating-point operations per second of one large product in float32."""
     size = 2048
     left, right = torch.rand(size, size), torch.rand(size, size)
-    best = min(milliseconds({"product": lambda: left @ right}, 1)["product"] for _ in range(5))
+    best = milliseconds({"product": lambda: left @ right}, 5)["product"].fastest
     return 2 * size**3 / (best / 1e3)
 
 
@@ -78,25 +98,41 @@ def operations(action: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def grid(samples: list[int], objects: list[int], batches: list[int], repetitions: int, ways: list[str]) -> None:
-    print(f"{torch.get_num_threads()} thread(s); ms per plan, and what share that is of the matrix rate")
-    print("samples  objects  batch  GFLOP per plan  matrix GFLOP/s" + "".join(f"  {way:>10}  share" for way in ways))
+def planners(objects: int, samples: int, ways: list[str]) -> tuple[dict[str, Any], State]:
+    """A planner for each of the `ways`, and the scenes that they plan for."""
+    found: dict[str, Any] = {}
+    for way in ways:
+        one = setup(objects, samples, f"planner.compile={str(way == 'compiled').lower()}")
+        found[way], state = one.planner, scenes(one, SCENES)
+        one.env.close()
+    if "compiled" in found:
+        found["Algorithm 1"] = copy.copy(found["compiled"])  # with what has been compiled
+        found["Algorithm 1"].robustness = None
+    return found, state
+
+
+def grid(samples: list[int], objects: list[int], repetitions: int, ways: list[str]) -> None:
+    columns = [*ways, "Algorithm 1"] if "compiled" in ways else ways
+    print(f"{torch.get_num_threads()} thread(s); ms per plan, median (fastest), and what share of the matrix rate")
+    print("samples  objects  batch  GFLOP  matrix GFLOP/s" + "".join(f"  {way:>15}  share" for way in columns))
     for count in samples:
         for number in objects:
-            setups = {way: setup(number, count, f"planner.compile={str(way == 'compiled').lower()}") for way in ways}
-            for batch in batches:
-                actions = {way: planning(one.planner, scenes(one, batch)) for way, one in setups.items()}
-                work = operations(planning(setups["direct"].planner, scenes(setups["direct"], 1)))
+            found, state = planners(number, count, ways)
+            work = dict.fromkeys(columns, operations(planning(found["direct"], state, 1)) / SCENES)
+            if "Algorithm 1" in found:
+                plain = copy.copy(found["direct"])
+                plain.robustness = None
+                work["Algorithm 1"] = operations(planning(plain, state, 1)) / SCENES
+            for batch in (1, SCENES):
                 rate = matrix_rate()  # anew each time: where cores are shared, it changes by the minute
-                spent = milliseconds(actions, max(2, repetitions // batch))
+                spent = milliseconds({way: planning(found[way], state, batch) for way in columns}, repetitions)
                 figures = "".join(
-                    f"  {value / batch:10.1f}  {work / (value / batch / 1e3) / rate:5.2f}" for value in spent.values()
+                    f"  {spent[way].median / SCENES:7.1f} ({spent[way].fastest / SCENES:5.1f})"
+                    f"  {work[way] / (spent[way].median / SCENES / 1e3) / rate:5.2f}"
+                    for way in columns
                 )
-                print(
-                    f"{count:7d}  {number:7d}  {batch:5d}  {work / 1e9:14.2f}  {rate / 1e9:14.0f}{figures}", flush=True
-                )
-            for one in setups.values():
-                one.env.close()
+                gflop = work["direct"] / 1e9
+                print(f"{count:7d}  {number:7d}  {batch:5d}  {gflop:5.2f}  {rate / 1e9:14.0f}{figures}", flush=True)
 
 
 def next_state(model: PlanningModel, state: State, action: Tensor) -> State:
@@ -191,14 +227,15 @@ def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
         ours, theirs = {}, {}
         for way, one in setups.items():
             problem = FlatProblem(one, scenes(one, 1))
-            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1))
+            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1), 1)
             theirs[f"pytorch_mppi, f {way}"] = mppi_planner(problem, count)
             theirs[f"torchrl CEM, f {way}"] = cem_planner(problem, count)
         with torch.inference_mode():
             spent = milliseconds({**ours, **theirs}, repetitions)
-        for name, value in spent.items():
-            ratios = "" if name in ours else "; over ours " + ", ".join(f"{value / spent[own]:.2f}" for own in ours)
-            print(f"{count:7d} samples  {name:25s} {value:8.1f}{ratios}", flush=True)
+        for name, (median, fastest) in spent.items():
+            times = ", ".join(f"{median / spent[own].median:.2f}" for own in ours)
+            ratios = "" if name in ours else f"; over ours {times}"
+            print(f"{count:7d} samples  {name:25s} {median:8.1f} ({fastest:.1f}){ratios}", flush=True)
         for one in setups.values():
             one.env.close()
 
@@ -211,13 +248,11 @@ def main() -> None:
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
     words = parser.parse_args()
     ways = ["direct"] if words.no_compile else ["direct", "compiled"]
-    samples, objects, batches, repetitions = (
-        ([32], [2], [1, 2], 2) if words.quick else ([256, 1024, 8192], [1, 3, 5], [1, 16], 20)
-    )
+    samples, objects, repetitions = ([32], [2], 2) if words.quick else ([256, 1024, 8192], [1, 3, 5], 5)
     if not words.no_grid:
-        grid(samples, objects, batches, repetitions, ways)
+        grid(samples, objects, repetitions, ways)
     if not words.no_flat:
-        flat([32] if words.quick else [1024, 8192], max(2, repetitions // 2), ways)
+        flat([32] if words.quick else [1024, 8192], 2 * repetitions, ways)
 
 
 if __name__ == "__main__":

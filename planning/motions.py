@@ -108,7 +108,7 @@ def choose_motions(
     chosen = ranking.best(scores, "distances of motion plans to the subgoals")
     if robustness is not None:
         # Our addition: of the best, the one that still works where its pushes start a little elsewhere.
-        numbers, cost = try_again(
+        chosen = try_again(
             robustness,
             model,
             score.reward,
@@ -116,12 +116,11 @@ def choose_motions(
             score.effects.subgoals.step(slice(0, 1)),
             scores,
             candidates.at(0, pushes_of),
+            aim.distance - aim.first_distance,
             candidates.search.generators,
             feature_weight=score.feature_weight,
             engine=candidates.search.engine,
         )
-        cost = cost + (aim.distance - aim.first_distance).gather(1, numbers)  # later segments, as they were
-        chosen = numbers.gather(1, cost.argmin(-1, keepdim=True)).squeeze(1)
     winner = candidates.take(chosen.unsqueeze(-1))
     return MotionPlan(
         codes=winner.history(lambda segment: segment.stretch.code)[:, 0],

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning import ranking, returns
+from planning import fields, ranking, returns
 from planning.engine import Engine, directly
 from planning.following import follow
 from planning.inputs import check_positive, check_weight
 from planning.protocol import PlanningModel, RewardFunction
 from planning.sampling import noise_each
+
+QUARTER = 4  # one in so many goes on to the next round, and is tried so many times as often
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,11 @@ class Robustness:
     to f, and just misses it on the table. Displacing its start tells the two apart. And the farther f sends an object,
     the farther it errs: a long push past a forbidden place fails more often than a short one.
 
-    finalists: motions that are tried again, the best by line 10. draws: times that each is tried.
+    Tries go where they decide: there are rounds of them, after each of which the best quarter goes on and is tried four
+    times as often (sequential halving, Karnin, Koren and Somekh, ICML 2013).
+
+    finalists: motions that are tried again, the best by line 10. draws: times that each is tried in the first round.
+    rounds: as many tries each, of fewer and fewer motions. 1 tries all equally often.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
     outcome_noise: standard deviation, in x and in y, of where a push leaves an object, per metre that f predicts it to
         move. A try fails by where the objects might be, while its distance to the subgoal is f's.
@@ -34,8 +40,9 @@ class Robustness:
     Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
     """
 
-    finalists: int = 128
-    draws: int = 16
+    finalists: int = 256
+    draws: int = 2
+    rounds: int = 3
     start_noise: float = 0.03
     outcome_noise: float = 0.5
     failure_cost: float = 0.3
@@ -43,6 +50,7 @@ class Robustness:
     def __post_init__(self) -> None:
         check_positive("finalists", self.finalists)
         check_positive("draws", self.draws)
+        check_positive("rounds", self.rounds)
         check_weight("start_noise", self.start_noise)
         check_weight("outcome_noise", self.outcome_noise)
         check_weight("failure_cost", self.failure_cost)
@@ -56,31 +64,49 @@ def try_again(
     goal: State,
     scores: Tensor,
     actions: Tensor,
+    later: Tensor,
     generators: Sequence[torch.Generator],
     *,
     feature_weight: float,
     engine: Engine = directly,
-) -> tuple[Tensor, Tensor]:
-    """Finalists and how they did: numbers `[B, R]` int64 and mean costs `[B, R]` in square metres.
+) -> Tensor:
+    """Number of the motion that did best on average, `[B]` int64.
 
     state: `[B]`, where all motions begin. goal: `[B, 1]`, the first subgoal. scores: `[B, N]`, the higher the better.
-    actions: `[B, N, T, 4]`, the segment that will be executed. A finalist whose score or whose cost is not finite
-    costs infinity.
+    actions: `[B, N, T, 4]`, the segment that will be executed. later: `[B, N]` square metres that the segments after it
+    cost. A motion whose score or whose cost is not finite loses.
     """
-    count = min(robustness.finalists, scores.shape[-1])
-    best = scores.topk(count, -1)
-    environments = torch.arange(len(scores), device=scores.device).unsqueeze(-1)
-    tried = actions[environments, best.indices].unsqueeze(2)  # [B, R, 1, T, 4]
-    tried = tried.repeat(1, 1, robustness.draws, 1, 1)
-    tried[..., :2] += robustness.start_noise * noise_each(tried[..., :2].shape[1:], generators)
-    pushes = tried.flatten(1, 2).clamp(-1.0, 1.0)  # [B, R D, T, 4]
+    best = scores.topk(min(robustness.finalists, scores.shape[-1]), -1)
+    numbers, draws, tried = best.indices, robustness.draws, 0
+    hopeless = ~torch.isfinite(best.values)
+    total = torch.zeros_like(best.values)  # cost of all tries so far
+    for number in range(robustness.rounds):
+        if number:
+            going = (total / tried).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
+            numbers, hopeless, total = (field.gather(1, going) for field in (numbers, hopeless, total))
+            draws = QUARTER * draws
+        pushes, errors = _displaced(robustness, state, fields.take((actions,), numbers)[0], draws, generators)
+        distance, failed = engine(_attempts, model, reward, state, goal, pushes, errors, feature_weight)
+        cost = (distance + robustness.failure_cost * failed).unflatten(1, (-1, draws)).sum(-1)
+        cost = cost + draws * later.gather(1, numbers)
+        total = torch.where(hopeless | ~torch.isfinite(cost), torch.inf, total + cost)
+        tried += draws
+    return numbers.gather(1, total.argmin(-1, keepdim=True)).squeeze(1)
 
+
+def _displaced(
+    robustness: Robustness, state: State, actions: Tensor, draws: int, generators: Sequence[torch.Generator]
+) -> tuple[Tensor, Tensor | None]:
+    """Every one of `actions: [B, R, T, 4]` often, displaced: `[B, R draws, T, 4]`, and what f may err by.
+
+    For errors `[B, R draws, T, M, 2]` see `outcomes`; None where nothing is expected of f.
+    """
+    tried = actions.repeat_interleave(draws, 1)
+    tried[..., :2] += robustness.start_noise * noise_each(tried[..., :2].shape[1:], generators)
     errors = None
     if robustness.outcome_noise:
-        errors = robustness.outcome_noise * noise_each((*pushes.shape[1:3], state.objects, 2), generators)
-    distance, failed = engine(_attempts, model, reward, state, goal, pushes, errors, feature_weight)
-    cost = (distance + robustness.failure_cost * failed).unflatten(1, (count, robustness.draws)).mean(-1)
-    return best.indices, torch.where(torch.isfinite(best.values) & torch.isfinite(cost), cost, torch.inf)
+        errors = robustness.outcome_noise * noise_each((*tried.shape[1:3], state.objects, 2), generators)
+    return tried.clamp(-1.0, 1.0), errors
 
 
 def _attempts(

@@ -144,7 +144,7 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
             samples=64,
             horizon=9,
             memory=True,
-            robustness=Robustness(finalists=8, draws=4),
+            robustness=Robustness(finalists=16, draws=2, rounds=2),
             compile=compile,
         )
         for compile in (False, True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +13,7 @@ from torch.distributions import Distribution, Normal
 
 from models.state import State
 from planning import CavinPlanner, Robustness
-from planning.robustness import outcomes
+from planning.robustness import outcomes, try_again
 
 SAMPLES = 64
 
@@ -86,6 +88,43 @@ def test_pushes_that_are_not_displaced_change_nothing(toy: SimpleNamespace) -> N
 def test_only_finalists_are_tried_again(toy: SimpleNamespace) -> None:
     assert chosen_motion(toy, Robustness(finalists=1)) == pytest.approx(0.1)
     assert chosen_motion(toy, Robustness(finalists=10 * SAMPLES)) == pytest.approx(0.09)  # there are no more than N
+
+
+def test_the_best_go_on_and_are_tried_more_often(toy: SimpleNamespace) -> None:
+    tried = []
+
+    def counting(function: Callable, *given: Any) -> Any:
+        tried.append(given[4])  # [B, n, T, 4] pushes
+        return function(*given)
+
+    state, actions = scenes(2), torch.rand(2, SAMPLES, 1, 4, generator=torch.Generator().manual_seed(0))
+    options = Robustness(finalists=32, draws=2, rounds=3, start_noise=0.0, outcome_noise=0.0)
+    model: Any = toy.PointMass()  # whose f does what the push says, up to the objects' gain of zero
+    goal = scenes(2).map(lambda field: field.unsqueeze(1))
+    scores = torch.arange(float(SAMPLES)).expand(2, -1)
+    later = torch.stack([torch.arange(float(SAMPLES)), -torch.arange(float(SAMPLES))])  # the last ones are finalists
+    given = model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later, toy.generators(0, 1)
+    chosen = try_again(options, *given, feature_weight=0.0, engine=counting)  # type: ignore[arg-type]
+    assert chosen.tolist() == [32, 63]
+    assert [pushes.shape[1] for pushes in tried] == [64, 64, 64]
+    often = [[len(set(map(tuple, pushes[:, 0].tolist()))) for pushes in three] for three in tried]
+    assert often == [[32, 32], [8, 8], [2, 2]]
+
+
+def test_as_many_tries_shared_out_in_rounds_find_better_motions_than_equal_shares(toy: SimpleNamespace) -> None:
+    state, model = scenes(40)._replace(features=torch.ones(40, 2, 4)), toy.PointMass()
+    goal, generators = state.map(lambda field: field.unsqueeze(1)), toy.generators(*range(40))
+    actions = torch.zeros(40, SAMPLES, 1, 4)
+    actions[..., 2] = torch.linspace(0.12, 0.8, SAMPLES)[:, None]  # 20 to 45 % of the tries fail
+    scores = torch.zeros(40, SAMPLES)
+    reward = toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=-0.01)
+    distance = []
+    for options in ({"draws": 12, "rounds": 1}, {"draws": 4, "rounds": 3}):
+        robustness = Robustness(finalists=SAMPLES, outcome_noise=1.0, start_noise=0.0, **options)
+        given = model, reward, state, goal, scores, actions, scores, generators
+        chosen = try_again(robustness, *given, feature_weight=0.0)
+        distance.append(actions[range(40), chosen, 0, 2].mean())
+    assert distance[1] < 0.8 * distance[0]
 
 
 def test_a_predicted_failure_costs(toy: SimpleNamespace) -> None:
@@ -172,6 +211,7 @@ def test_motions_that_are_not_finite_never_win(horizon: str, toy: SimpleNamespac
     [
         ({"finalists": 0}, "finalists must be at least 1"),
         ({"draws": 0}, "draws must be at least 1"),
+        ({"rounds": 0}, "rounds must be at least 1"),
         ({"outcome_noise": -0.1}, "outcome_noise must be zero or a positive number"),
         ({"start_noise": -0.1}, "start_noise must be zero or a positive number"),
         ({"failure_cost": float("nan")}, "failure_cost must be zero or a positive number"),
