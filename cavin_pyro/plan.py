@@ -16,7 +16,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.files import output_folder, write_json
     from cavin_pyro.provenance import provenance
     from cavin_pyro.runs import check_same_run, write_config
-    from cavin_pyro.setups import set_up
+    from cavin_pyro.setups import set_up, tell_of_compiling
     from cavin_pyro.showing import episode_files, show_episode
     from cavin_pyro.viewers import check_viewer
 
@@ -25,6 +25,7 @@ def main(config: DictConfig) -> None:
     setup = set_up(copy.deepcopy(config), render=True)
     folder = output_folder(config.output)
     write_config(folder, config)
+    tell_of_compiling(config)
     row = show_episode(setup, folder, seed=config.seed, video=config.video, viewer=config.viewer)
     setup.env.close()
     write_json(folder / "results.json", {**row, "provenance": provenance()})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,12 @@ def check_words(config: DictConfig) -> None:
             "planner.compile=true makes code for one layout, and layout=random has another in every episode: "
             "take planner.compile=false"
         )
+
+
+def tell_of_compiling(config: DictConfig) -> None:
+    """One line on standard error where the first plan will take long, since nothing is seen meanwhile."""
+    if config.planner.get("compile"):
+        print("planner.compile=true: the first plan is compiled, which takes a minute or two", file=sys.stderr)
 
 
 def set_up(config: DictConfig, *, render: bool = False) -> Setup:

@@ -85,28 +85,50 @@ def try_again(
             going = (total / tried).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
             numbers, hopeless, total = (field.gather(1, going) for field in (numbers, hopeless, total))
             draws = QUARTER * draws
-        pushes, errors = _displaced(robustness, state, fields.take((actions,), numbers)[0], draws, generators)
-        distance, failed = engine(_attempts, model, reward, state, goal, pushes, errors, feature_weight)
-        cost = (distance + robustness.failure_cost * failed).unflatten(1, (-1, draws)).sum(-1)
+        distance, failed = tries(
+            robustness,
+            model,
+            reward,
+            state,
+            goal,
+            fields.take((actions,), numbers)[0],
+            draws,
+            generators,
+            feature_weight=feature_weight,
+            engine=engine,
+        )
+        cost = (distance + robustness.failure_cost * failed).sum(-1)
         cost = cost + draws * later.gather(1, numbers)
         total = torch.where(hopeless | ~torch.isfinite(cost), torch.inf, total + cost)
         tried += draws
     return numbers.gather(1, total.argmin(-1, keepdim=True)).squeeze(1)
 
 
-def _displaced(
-    robustness: Robustness, state: State, actions: Tensor, draws: int, generators: Sequence[torch.Generator]
-) -> tuple[Tensor, Tensor | None]:
-    """Every one of `actions: [B, R, T, 4]` often, displaced: `[B, R draws, T, 4]`, and what f may err by.
+def tries(
+    robustness: Robustness,
+    model: PlanningModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State,
+    actions: Tensor,
+    draws: int,
+    generators: Sequence[torch.Generator],
+    *,
+    feature_weight: float = 0.0,
+    engine: Engine = directly,
+) -> tuple[Tensor, Tensor]:
+    """What becomes of `actions: [B, R, T, 4]`, each of them displaced and tried `draws` times.
 
-    For errors `[B, R draws, T, M, 2]` see `outcomes`; None where nothing is expected of f.
+    Square metres to the `goal: [B, 1]`, `[B, R, draws]`, and whether the try fails, `[B, R, draws]` bool. `state: [B]`.
     """
-    tried = actions.repeat_interleave(draws, 1)
-    tried[..., :2] += robustness.start_noise * noise_each(tried[..., :2].shape[1:], generators)
+    pushes = actions.repeat_interleave(draws, 1)  # [B, R draws, T, 4]
+    pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
     errors = None
     if robustness.outcome_noise:
-        errors = robustness.outcome_noise * noise_each((*tried.shape[1:3], state.objects, 2), generators)
-    return tried.clamp(-1.0, 1.0), errors
+        errors = robustness.outcome_noise * noise_each((*pushes.shape[1:3], state.objects, 2), generators)
+    pushes = pushes.clamp(-1.0, 1.0)
+    distance, failed = engine(_attempts, model, reward, state, goal, pushes, errors, feature_weight)
+    return distance.unflatten(1, (-1, draws)), failed.unflatten(1, (-1, draws))
 
 
 def _attempts(

@@ -37,6 +37,14 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
     assert all(float(line.split()[5]) > 0.0 for line in (alone, together))
 
 
+def test_ways_to_share_out_tries_are_compared() -> None:
+    lines = run("tries", "--decisions", "1", "--episodes", "1", "--pushes", "1", "--truth", "16").splitlines()
+    assert lines[0] == "1 of 2 plans"
+    rows = [line.split() for line in lines[2:]]
+    assert all(int(row[0]) * int(row[1]) * int(row[2]) == int(row[3]) for row in rows)
+    assert all(float(row[4]) >= 0.0 and row[5].endswith("%") for row in rows)
+
+
 def test_collection_tells_where_its_time_goes() -> None:
     printed = run("collection", "--transitions", "12", "--camera", "kinect2")
     shares = [float(share) for share in re.findall(r"([\d.]+) %", printed)]

@@ -15,10 +15,11 @@ from omegaconf import OmegaConf
 
 from cavin_pyro import building
 from cavin_pyro.checkpoint import save_checkpoint
+from cavin_pyro.command import compose
 from cavin_pyro.episodes import OUTCOMES, run_episode
 from cavin_pyro.errors import UserError
 from cavin_pyro.figures_plan import draw_plan
-from cavin_pyro.setups import Setup, set_up
+from cavin_pyro.setups import Setup, set_up, tell_of_compiling
 from models.pointnet import PointNet
 from planning.optimisers import OPTIMISERS
 
@@ -117,6 +118,14 @@ def test_compiled_plans_are_those_of_direct_planning(setup: Callable[..., Setup]
         torch.testing.assert_close(compiled.candidate_returns, direct.candidate_returns)
         torch.testing.assert_close(compiled.actions, direct.actions, rtol=1e-3, atol=1e-4)
         torch.testing.assert_close(compiled.predicted_centers, direct.predicted_centers, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("planner", ["cavin", "random"])
+def test_who_waits_for_compiling_is_told_so(planner: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for compile in (False, True):
+        words = [f"planner={planner}", *([f"planner.compile={compile}"] if planner == "cavin" else [])]
+        tell_of_compiling(compose("evaluate", *words))
+        assert capsys.readouterr().err.count("\n") == int(compile and planner == "cavin")
 
 
 @pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler")
