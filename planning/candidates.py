@@ -239,22 +239,25 @@ def _extended(
 
     `here`: see `Level.extend`. The `generators` are read where there is no noise.
     """
+    compiling = torch.compiler.is_compiling()  # compiled code has no branches
     stretch = level.extend(number, here, before, noise, generators)
-    going = standing.active
-    if settled is not None:
-        going = going & ~settled.unsqueeze(-1)
+    going, over = standing.active, None
+    if settled is not None and (compiling or bool(settled.any())):
+        over = settled.unsqueeze(-1)  # [B, 1]
+        going = going & ~over
         nothing = fields.apply((stretch.code, stretch.actions), torch.zeros_like)
         code, actions = fields.where(settled, nothing, (stretch.code, stretch.actions))
         stretch = stretch._replace(code=code, actions=actions)
     stretch = _stay(stretch, before, going)
     after = score.advance(standing, number, before, stretch)
+    if over is not None:
+        after = fields.where(over[:, 0], standing, after)
     if settled is not None:
-        after = fields.where(settled, standing, after)
         settled = score.settled(after)
     if chances is None:
         return Extension(stretch, after, None, stretch.states, after, settled)
-    dead = after.failed if settled is None else after.failed & ~settled.unsqueeze(-1)
-    if not torch.compiler.is_compiling() and not bool(dead.any()):
+    dead = after.failed if over is None else after.failed & ~over
+    if not compiling and not bool(dead.any()):
         return Extension(stretch, after, None, stretch.states, after, settled)
     parents = choose_parents(dead, after.active, chances)
     return Extension(stretch, after, parents, *fields.take((stretch.states, after), parents), settled)
