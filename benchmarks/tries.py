@@ -4,7 +4,7 @@ Plans of whole episodes (crossing, sparse, 5 and 3 objects, seeds from 10000 on)
 Of some of them the 256 best motions by line 10 are tried 512 times each, by f with displaced pushes and with the errors
 that `planner.robustness` assumes of it. Printed is, for several ways of sharing tries out, how much worse than the best
 the motion is that they choose, and how often it fails. That is no success rate: f and its errors stand for the table.
-Takes ten minutes on 2 cores.
+Takes five minutes on 2 cores.
 """
 
 from __future__ import annotations
