@@ -19,7 +19,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.files import output_folder, replacing, write_json
     from cavin_pyro.provenance import provenance
     from cavin_pyro.runs import check_same_run, write_config
-    from cavin_pyro.setups import set_up, tell_of_compiling
+    from cavin_pyro.setups import set_up
     from cavin_pyro.statistics import summarise, table
 
     at_least("episodes", config.episodes, 1)
@@ -29,7 +29,6 @@ def main(config: DictConfig) -> None:
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
     write_config(folder, config)
-    tell_of_compiling(config)
     results = summarise(evaluate(config, folder))
     text = table(results, f"{config.task}, layout {config.layout}, {config.reward} reward, {config.objects} objects")
     if others:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from cavin_pyro.episodes import Episode
 from cavin_pyro.files import replacing
 from cavin_pyro.progress import progress_bar
-from cavin_pyro.setups import Setup, set_up
+from cavin_pyro.setups import Setup, set_up, tell_of_compiling
 
 Row = dict[str, Any]
 
@@ -30,6 +30,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     path = folder / "episodes.jsonl"
     rows = _finished(path)
     seeds = [seed for seed in range(config.seed, config.seed + config.episodes) if seed not in rows]
+    if seeds:
+        tell_of_compiling(config)
     with progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar:
         with replacing(path) as temporary:
             temporary.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from models.state import State
 from planning import fields
 from planning.engine import Engine, directly
-from planning.replacement import choose_parents
+from planning.extension import extended
 from planning.sampling import noise_each, uniform_each
 from planning.segments import Level, Score, Segment, Stretch
 
@@ -139,7 +139,7 @@ class Candidates:
         # Until the first segment all plans are in one state, so the model need not read it n times.
         here = before if self.kept else search.state.expand_plans(1)
         what = search.level, search.score, number, here, before, self.standing, noise, chances, settled
-        after = _extended(*what, search.generators) if noise is None else search.engine(_extended, *what)
+        after = extended(*what, search.generators) if noise is None else search.engine(extended, *what)
         kept = (*self.kept, Segment(noise, after.stretch, after.standing))
         if after.parents is None or last:
             candidates = Candidates(search, after.stretch.states, after.standing, kept, (*self.sources, None))
@@ -210,68 +210,3 @@ def join(parts: Sequence[Candidates]) -> Candidates:
     standing = fields.join([part.standing for part in parts])
     plans = fields.join([part.plans for part in parts])
     return Candidates(parts[0].search, plans, standing, kept, (None,) * len(kept))
-
-
-class Extension(NamedTuple):
-    """Plans one segment on."""
-
-    stretch: Stretch
-    standing: Any  # after it
-    parents: Tensor | None  # [B, n] int64, where copies take the place of the dead
-    plans: State  # [B, n] and then
-    onward: Any  # their standing
-    settled: Tensor | None  # [B] bool, see `Search.evaluate`
-
-
-def _extended(
-    level: Level,
-    score: Score,
-    number: int,
-    here: State,
-    before: State,
-    standing: Any,
-    noise: Tensor | None,
-    chances: Tensor | None,
-    settled: Tensor | None,
-    generators: Sequence[torch.Generator] = (),
-) -> Extension:
-    """Segment `number` of plans that have come to `before: [B, n]`. For the rest see `Candidates.step`.
-
-    `here`: see `Level.extend`. The `generators` are read where there is no noise.
-    """
-    compiling = torch.compiler.is_compiling()  # compiled code has no branches
-    stretch = level.extend(number, here, before, noise, generators)
-    going, over = standing.active, None
-    if settled is not None and (compiling or bool(settled.any())):
-        over = settled.unsqueeze(-1)  # [B, 1]
-        going = going & ~over
-        nothing = fields.apply((stretch.code, stretch.actions), torch.zeros_like)
-        code, actions = fields.where(settled, nothing, (stretch.code, stretch.actions))
-        stretch = stretch._replace(code=code, actions=actions)
-    stretch = _stay(stretch, before, going)
-    after = score.advance(standing, number, before, stretch)
-    if over is not None:
-        after = fields.where(over[:, 0], standing, after)
-    if settled is not None:
-        settled = score.settled(after)
-    if chances is None:
-        return Extension(stretch, after, None, stretch.states, after, settled)
-    dead = after.failed if over is None else after.failed & ~over
-    if not compiling and not bool(dead.any()):
-        return Extension(stretch, after, None, stretch.states, after, settled)
-    parents = choose_parents(dead, after.active, chances)
-    return Extension(stretch, after, parents, *fields.take((stretch.states, after), parents), settled)
-
-
-def _stay(stretch: Stretch, before: State, active: Tensor) -> Stretch:
-    """Keep plans where they are that have ended: not `active: [B, n]`; no copy where all go on."""
-    if not torch.compiler.is_compiling() and bool(active.all()):
-        return stretch
-    going = active[..., None, None]
-    states = State(
-        torch.where(going, stretch.states.centers, before.centers),
-        torch.where(going, stretch.states.features, before.features),
-        stretch.states.mask,
-    )
-    path = torch.where(going.unsqueeze(-1), stretch.path, before.centers.unsqueeze(-3))
-    return stretch._replace(states=states, path=path)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning import fields, ranking, returns
+from planning import ranking, returns
 from planning.engine import Engine, directly
 from planning.following import follow
 from planning.inputs import check_positive, check_weight
@@ -31,7 +31,7 @@ class Robustness:
     times as often (sequential halving, Karnin, Koren and Somekh, ICML 2013).
 
     finalists: motions that are tried again, the best by line 10. draws: times that each is tried in the first round.
-    rounds: as many tries each, of fewer and fewer motions. 1 tries all equally often.
+    rounds: as many tries each, of fewer and fewer motions, until one is left. 1 tries all equally often.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
     outcome_noise: standard deviation, in x and in y, of where a push leaves an object, per metre that f predicts it to
         move. A try fails by where the objects might be, while its distance to the subgoal is f's.
@@ -81,6 +81,8 @@ def try_again(
     hopeless = ~torch.isfinite(best.values)
     total = torch.zeros_like(best.values)  # cost of all tries so far
     for number in range(robustness.rounds):
+        if number and total.shape[-1] == 1:
+            break  # the choice is made
         if number:
             going = (total / tried).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
             numbers, hopeless, total = (field.gather(1, going) for field in (numbers, hopeless, total))
@@ -91,7 +93,7 @@ def try_again(
             reward,
             state,
             goal,
-            fields.take((actions,), numbers)[0],
+            actions.take_along_dim(numbers[..., None, None], dim=1),
             draws,
             generators,
             feature_weight=feature_weight,

@@ -75,3 +75,16 @@ def test_it_repeats_with_its_seed_and_does_not_depend_on_the_batch(toy: SimpleNa
 def test_counts_below_one_are_one_clear_line(name: str) -> None:
     with pytest.raises(ValueError, match=f"^{name} must be at least 1, not 0$"):
         Reachability(**{name: 0})
+
+
+def test_who_looks_at_many_plans_has_them_searched_to_their_end(toy: SimpleNamespace) -> None:
+    def successes(reachability: Reachability | None) -> Tensor:
+        reward = toy.GoalDisc(goal=(0.2, 0.0))
+        planner = CavinPlanner(toy.PointMass(), reward, samples=256, horizon=12, memory=True, reachability=reachability)
+        returns = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0)).candidate_returns
+        return returns[returns > 0.0]
+
+    alone, many = successes(None), successes(Reachability(4, 2))
+    assert alone.max() == many.max()
+    assert alone.min() > alone.max() - 3.0  # all of the segment in which the first one succeeds
+    assert many.min() < many.max() - 3.0

@@ -72,3 +72,10 @@ def test_bad_limits_are_one_clear_line(toy: SimpleNamespace, limits: object) -> 
 def test_an_unknown_place_of_reward_is_one_clear_line(toy: SimpleNamespace) -> None:
     with pytest.raises(ValueError, match="^unknown reward_at 'goal': take path or subgoals$"):
         CumulativeReward(toy.Line(), "goal")
+
+
+def test_limits_take_away_from_what_can_be_earned_and_add_nothing(toy: SimpleNamespace) -> None:
+    sparse, dense = (toy.GoalDisc(goal=(0.0, 0.0), dense=dense) for dense in (False, True))
+    assert StrideLimits(sparse, (0.1, 0.3), of="segments").most == sparse.most == 99.0
+    assert StrideLimits(dense, (0.1, 0.3), of="segments").most == float("inf")
+    assert StrideLimits(toy.Hill((0.0, 0.0)), (0.1, 0.3), of="segments").most == float("inf")  # it does not say

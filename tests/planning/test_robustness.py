@@ -111,6 +111,21 @@ def test_the_best_go_on_and_are_tried_more_often(toy: SimpleNamespace) -> None:
     assert often == [[32, 32], [8, 8], [2, 2]]
 
 
+def test_nobody_is_tried_again_who_is_the_last(toy: SimpleNamespace) -> None:
+    tried = []
+
+    def counting(function: Callable, *given: Any) -> Any:
+        tried.append(given[4].shape[1])
+        return function(*given)
+
+    state, scores = scenes(1), torch.zeros(1, SAMPLES)
+    given = toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0)), state, state.map(lambda field: field.unsqueeze(1)), scores
+    options = Robustness(finalists=5, draws=2, rounds=40)
+    actions = torch.zeros(1, SAMPLES, 1, 4)
+    try_again(options, *given, actions, scores, toy.generators(0), feature_weight=0.0, engine=counting)  # type: ignore[arg-type]
+    assert tried == [10, 8]
+
+
 def test_as_many_tries_shared_out_in_rounds_find_better_motions_than_equal_shares(toy: SimpleNamespace) -> None:
     state, model = scenes(40)._replace(features=torch.ones(40, 2, 4)), toy.PointMass()
     goal, generators = state.map(lambda field: field.unsqueeze(1)), toy.generators(*range(40))
