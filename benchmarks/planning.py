@@ -218,7 +218,9 @@ def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
     print("the flat problem, 3 objects: ms per plan; all call the same f, direct or compiled by our engine")
     for count in samples:
         setups = {
-            way: setup(3, count, "planner=mpc", f"planner.compile={str(way == 'compiled').lower()}") for way in ways
+            # No margin: all maximise the task's own reward.
+            way: setup(3, count, "planner=mpc", "margin=0", f"planner.compile={str(way == 'compiled').lower()}")
+            for way in ways
         }
         ours, theirs = {}, {}
         for way, one in setups.items():

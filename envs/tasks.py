@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial, reduce
+from operator import or_
 from typing import NamedTuple
 
 import torch
@@ -73,12 +75,12 @@ class TaskReward:
             mask: [..., M] bool, True for real objects.
         """
         before, after = torch.broadcast_tensors(previous[..., :2], centers[..., :2])
-        fall = (self._entered(_off_table, before, after) & mask).any(dim=-1)
+        fall = _of_any(partial(self._entered, _off_table), before, after, mask)
         if self.layout.task == "clearing":
             violation = torch.zeros_like(fall)
-            success = (~mask | (self._region.signed_distance(after) > self.margin)).all(dim=-1)
+            success = ~_of_any(lambda _, now: ~(self._region.signed_distance(now) > self.margin), before, after, mask)
         elif self.layout.task == "insertion":
-            violation = (self._entered(self._inside_region, before, after) & mask).any(dim=-1)
+            violation = _of_any(partial(self._entered, self._inside_region), before, after, mask)
             success = self._arrived(after[..., 0, :])
         else:
             violation = self._entered(self._region.signed_distance, before[..., 0, :], after[..., 0, :])
@@ -120,6 +122,8 @@ class TaskReward:
         """
         now = depth(after)
         entered = now > 0.0
+        if self.margin == 0.0:
+            return entered
         near = (now > -self.margin) & ~entered
         if torch.compiler.is_compiling():  # compiled code has no branches, and a second look costs it little
             return entered | (near & (now > depth(before)))
@@ -134,6 +138,14 @@ class TaskReward:
     def _arrived(self, target: Tensor) -> Tensor:
         assert self._goal is not None
         return self._goal.contains(target)
+
+
+def _of_any(holds: Callable[[Tensor, Tensor], Tensor], before: Tensor, after: Tensor, mask: Tensor) -> Tensor:
+    """Whether `holds` is true of any real object: [...]. before, after: [..., M, 2] metres. mask: [..., M] bool."""
+    if torch.compiler.is_compiling():  # an object at a time: native code then takes many scenes at once
+        objects = zip(before.unbind(-2), after.unbind(-2), mask.unbind(-1), strict=True)
+        return reduce(or_, [holds(*where) & real for *where, real in objects])
+    return (holds(before, after) & mask).any(dim=-1)
 
 
 def _off_table(points: Tensor) -> Tensor:

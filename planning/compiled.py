@@ -22,6 +22,7 @@ COMPILING = {
     "freezing": True,  # weights become part of the code, packed as its products want them
     "cpp_wrapper": True,  # what calls the products is native as well, and lets go of the interpreter's lock
     "cpp.dynamic_threads": True,  # the same code for one thread and for several
+    "cpp.use_decompose_tanh": True,  # faster than a call where numbers to be taken at once are few
     "compile_threads": 1,  # helper processes would compile no faster, and stay until the end
 }
 

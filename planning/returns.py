@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from itertools import accumulate
+from operator import or_
 from typing import NamedTuple
 
 import torch
@@ -63,18 +66,37 @@ def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: 
     reward that is not finite is a failure of reward -inf, whatever the reward function says of it: no
     comparison holds for NaN, so "no object is in the region" would be a success.
     """
-    previous = before_each(start, centers)
+    states = torch.cat([start.unsqueeze(-3), centers], dim=-3)  # [..., T + 1, M, 3]
     step_mask = mask.unsqueeze(-2).expand(centers.shape[:-1])
+    if torch.compiler.is_compiling():
+        states, step_mask = (_plans_side_by_side(values, mask.ndim - 1) for values in (states, step_mask))
+    previous, centers = states[..., :-1, :, :], states[..., 1:, :, :]
     outcome = reward(previous, centers, step_mask)
-    sound = torch.isfinite(outcome.reward) & (torch.isfinite(centers).all(-1) | ~step_mask).all(-1)
+    # A sum is finite only where everything in it is.
+    sound = torch.isfinite(outcome.reward + centers.where(step_mask.unsqueeze(-1), 0.0).sum((-2, -1)))
     failure = outcome.failure | ~sound
-    ends = failure | outcome.success
-    ended_before = ends.cumsum(-1) > ends  # the running count exceeds the step's own share
+    ends = (failure | outcome.success).unbind(-1)
+    ended_before = torch.stack([torch.zeros_like(ends[0]), *accumulate(ends[:-1], or_)], -1)
     counts = progress.active.unsqueeze(-1) & ~ended_before
     earned = torch.where(sound, outcome.reward, -torch.inf)
     return Progress(
         returns=progress.returns + torch.where(counts, earned, 0.0).sum(-1),
-        succeeded=progress.succeeded | (counts & outcome.success & ~failure).any(-1),
-        failed=progress.failed | (counts & failure).any(-1),
+        succeeded=progress.succeeded | _at_any_step(counts & outcome.success & ~failure),
+        failed=progress.failed | _at_any_step(counts & failure),
         segments=progress.segments + progress.active,
     )
+
+
+def _at_any_step(steps: Tensor) -> Tensor:
+    """`[..., T]` bool -> `[...]`. As native code faster than torch's `any`."""
+    return reduce(or_, steps.unbind(-1))
+
+
+def _plans_side_by_side(values: Tensor, batch_dimensions: int) -> Tensor:
+    """The same `[B, n, ...]`; in memory, first come all plans' first numbers, then all plans' second ones.
+
+    Native code then judges sixteen plans at a time.
+    """
+    numbers = values.flatten(batch_dimensions).movedim(-1, 0)
+    apart = torch.cat([numbers[:1], numbers[1:]])  # what is joined is written to memory
+    return apart.movedim(0, -1).unflatten(-1, values.shape[batch_dimensions:])

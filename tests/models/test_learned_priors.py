@@ -10,7 +10,7 @@ from pyro.distributions import Normal
 from torch import Tensor, nn
 from torch.distributions import kl_divergence
 
-from models.learned_priors import ConditionalPrior, FlowPrior
+from models.learned_priors import ConditionalPrior, FlowPrior, SceneContext
 from models.state import State
 
 SIZES = {"dimension": 4, "feature_dimension": 6, "width": 8}
@@ -82,6 +82,12 @@ def test_the_state_and_the_effect_matter(kind: type, random_state: Callable[...,
     turned = state._replace(features=-state.features)
     for other in (prior(moved, effect_code), prior(turned, effect_code), prior(state, effect_code + 1)):
         assert not torch.allclose(other.log_prob(codes), expected, atol=1e-3)
+
+
+def test_code_that_is_to_be_native_says_the_same(random_state: Callable[..., State]) -> None:
+    context, state = stirred(SceneContext(feature_dimension=6, effect_dimension=None, width=8)), double(random_state(7))
+    native = torch.compile(context, backend="eager", fullgraph=True)
+    torch.testing.assert_close(native(state, None), context(state, None))
 
 
 @each_prior
