@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable
 from typing import Any
 
@@ -18,12 +16,9 @@ from planning import returns
 from planning.compiled import Compiled
 from planning.protocol import RewardFunction
 from planning.returns import Progress
+from tests.compiler import needs_a_compiler
 
 PLANS = 4000
-
-needs_a_compiler = pytest.mark.skipif(
-    shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler: g++, or one that CXX names"
-)
 
 
 def judged(progress: Progress, reward: RewardFunction, start: Tensor, path: Tensor, mask: Tensor) -> Progress:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +20,7 @@ from cavin_pyro.figures_plan import draw_plan
 from cavin_pyro.setups import Setup, set_up, tell_of_compiling
 from models.pointnet import PointNet
 from planning.optimisers import OPTIMISERS
+from tests.compiler import needs_a_compiler
 
 FITTING = {
     "cavin": "cascaded",
@@ -105,7 +104,7 @@ def test_options_take_effect(planner: str, word: str) -> None:
     assert not (torch.equal(*returns) and torch.equal(*actions))
 
 
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler")
+@needs_a_compiler
 def test_compiled_plans_are_those_of_direct_planning(setup: Callable[..., Setup]) -> None:
     plans = []
     for compile in ("false", "true"):
@@ -128,7 +127,7 @@ def test_who_waits_for_compiling_is_told_so(planner: str, capsys: pytest.Capture
         assert capsys.readouterr().err.count("\n") == int(compile and planner == "cavin")
 
 
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler")
+@needs_a_compiler
 def test_flows_are_not_compiled(tmp_path: Path) -> None:
     path = save_untrained(tmp_path / "flow.safetensors", "model=cascaded", "prior=flow")
     with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -18,10 +16,7 @@ from planning import CavinPlanner, CvaeMpcPlanner, Plan, Robustness, bulk
 from planning.compiled import Compiled
 from planning.engine import directly
 from planning.inputs import HopelessEnvironmentError
-
-needs_a_compiler = pytest.mark.skipif(
-    shutil.which(os.environ.get("CXX", "g++")) is None, reason="needs a C++ compiler: g++, or one that CXX names"
-)
+from tests.compiler import needs_a_compiler
 
 
 class Pair(NamedTuple):
