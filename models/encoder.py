@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -41,22 +43,33 @@ class StateEncoder(nn.Module):
                 f"features have {state.features.shape[-1]} numbers per object; "
                 f"this model expects {self.feature_dimension}"
             )
-        positions = relative_positions(state.centers)
-        parts = (
-            self.spatial(positions),
-            self.geometric(state.features),
-            self.relations(positions, state.mask),
-        )
-        return torch.cat(parts, -1)
+        spatial, others = self._of_positions(relative_positions(state.centers))
+        return torch.cat((spatial, self.geometric(state.features), self._relations(others, state.mask)), -1)
 
-    def relations(self, positions: Tensor, mask: Tensor) -> Tensor:
-        """`positions: [..., M, 3]` in 0.1 m, `mask: [..., M]` -> `[..., M, width]`."""
+    def _of_positions(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Spatial features, and W p of the first relation layer: `[..., M, 3]` in 0.1 m -> twice `[..., M, width]`."""
+        first, difference = self.spatial[0], self.difference
+        assert isinstance(first, nn.Linear)
+        if not torch.compiler.is_compiling():
+            return self.spatial(positions), functional.linear(positions, difference.weight)
+        # A product costs native code some 20 microseconds, however small it is.
+        weight = torch.cat((first.weight, difference.weight))
+        bias = torch.cat((first.bias, torch.zeros_like(difference.bias)))
+        spatial, others = functional.linear(positions, weight, bias).chunk(2, -1)
+        return spatial.relu(), others
+
+    def _relations(self, others: Tensor, mask: Tensor) -> Tensor:
+        """`others: [..., M, width]`, W p of every object, `mask: [..., M]` -> `[..., M, width]`."""
         # The first layer is linear in the difference, W (p_j - p_i) + b = W p_j - (W p_i - b): M products
         # instead of M squared. Pairs are visited by cyclic shifts, so that no object meets itself.
-        others = functional.linear(positions, self.difference.weight)
         own = others - self.difference.bias
+        shifts = range(1, others.shape[-2])
+        hidden = ((others.roll(-shift, -2) - own).relu_() for shift in shifts)
+        if shifts and torch.compiler.is_compiling():  # one product; torch alone is faster within its caches
+            related: Iterable[Tensor] = self.relation(torch.stack(list(hidden)))
+        else:
+            related = map(self.relation, hidden)
         total = torch.zeros_like(others)
-        for shift in range(1, positions.shape[-2]):
-            hidden = (others.roll(-shift, -2) - own).relu_()
-            total = total + self.relation(hidden) * mask.roll(-shift, -1).unsqueeze(-1)
+        for shift, relation in zip(shifts, related, strict=True):
+            total = total + relation * mask.roll(-shift, -1).unsqueeze(-1)
         return total

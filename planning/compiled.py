@@ -8,11 +8,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
-from types import FunctionType
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from planning import fields
@@ -45,16 +44,20 @@ class Compiled:
                 f"compile=true needs a C++ compiler, and '{compiler}' was not found: install it, name another one in "
                 "the environment variable CXX, or take compile=false"
             )
-        self._versions: dict[Any, Callable[..., Any]] = {}
+        self._versions: dict[Any, _Native] = {}
         self._compiling = Lock()
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Engine`. Raises ValueError for a function that cannot be compiled, saying why."""
-        arguments = tuple(map(_without_count, arguments))
         rounded = torch.get_float32_matmul_precision() != "highest"
-        version = (function, rounded, *_traits(arguments, []))
+        tensors: list[Tensor] = []
+        traits: list[Any] = [function, rounded]
+        _take_apart(arguments, tensors, traits)
+        version = tuple(traits)
         native = self._versions.get(version)
-        return self._first(function, rounded, version, arguments) if native is None else native(*arguments)
+        if native is None:
+            native = self._first(version, function, rounded, arguments, tensors)
+        return native(tensors)
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """See `Engine`: a thread of torch's for each of the items, as many at once as torch has threads."""
@@ -67,18 +70,63 @@ class Compiled:
         finally:
             torch.set_num_threads(threads)  # it is all threads' number in part
 
-    def _first(self, function: Callable[..., Any], rounded: bool, version: Any, arguments: tuple[Any, ...]) -> Any:
+    def _first(
+        self, version: Any, function: Callable[..., Any], rounded: bool, arguments: Any, tensors: list[Tensor]
+    ) -> _Native:
         with self._compiling:
             if version not in self._versions:  # another thread may have been faster
-                native = _compiled(function, rounded, len(self._versions))
                 try:
-                    with torch._inductor.config.patch(COMPILING), _distributions_unchecked():
-                        native(*arguments)
-                except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
+                    self._versions[version] = _Native(function, rounded, arguments, tensors)
+                except RuntimeError as error:  # as all of torch's are that say so
                     what = str(error).splitlines()[0]
                     raise ValueError(f"compile=true: {function.__name__} cannot be compiled: {what}") from error
-                self._versions[version] = native
-        return self._versions[version](*arguments)
+            return self._versions[version]
+
+
+class _Native:
+    """One function for one kind of arguments; their kind is not looked at again."""
+
+    def __init__(
+        self, function: Callable[..., Any], rounded: bool, arguments: tuple[Any, ...], tensors: list[Tensor]
+    ) -> None:
+        """`tensors` are those of the `arguments`, in order."""
+        forms: list[Any] = []
+        with _distributions_unchecked():
+            exported = torch.export.export(
+                _InARow(function, rounded, arguments, forms.append), tuple(tensors), strict=False
+            )
+        graph = exported.module(check_guards=False)
+        self._call = torch._inductor.compile(graph, [*tensors], options=COMPILING)
+        self._form = fields.apply(forms[-1], lambda value: torch.empty(0) if isinstance(value, Tensor) else value)
+
+    def __call__(self, tensors: list[Tensor]) -> Any:
+        return _put_together(self._form, iter(self._call(*tensors)))
+
+
+class _InARow(nn.Module):
+    """A function as torch exports one: of tensors in a row, to tensors in a row. `keep` is given what it returns."""
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        rounded: bool,
+        arguments: tuple[Any, ...],
+        keep: Callable[[Any], None],
+    ) -> None:
+        super().__init__()
+        self._function = function
+        self._rounded = rounded
+        self._arguments = arguments
+        self._keep = keep
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        arguments = _put_together(self._arguments, iter(tensors))
+        with torch.autocast(tensors[0].device.type, torch.bfloat16, enabled=self._rounded):
+            result = fields.apply(self._function(*arguments), _in_float32)
+        self._keep(result)
+        results: list[Tensor] = []
+        _take_apart(result, results, [])
+        return tuple(results)
 
 
 @contextmanager
@@ -92,42 +140,32 @@ def _distributions_unchecked() -> Iterator[None]:
         Distribution.set_default_validate_args(before)
 
 
-def _compiled(function: Callable[..., Any], rounded: bool, number: int) -> Callable[..., Any]:
-    def native(*arguments: Any) -> Any:
-        with torch.autocast(_device(arguments), torch.bfloat16, enabled=rounded):
-            return fields.apply(function(*arguments), _in_float32)
+def _take_apart(value: Any, tensors: list[Tensor], traits: list[Any]) -> None:
+    """Adds its tensors to `tensors`, in order, and to `traits` what a version is for: all but the tensors' numbers.
 
-    # Torch keeps what it has compiled with the code object. Each version has one of its own, since only tensors are
-    # compared at a call: comparing all that a model consists of takes longer than some of the functions.
-    own = FunctionType(
-        native.__code__.replace(co_name=f"{function.__name__}_{number}"), globals(), closure=native.__closure__
-    )
-    options: dict[str, Any] = {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe}
-    return torch.compile(own, fullgraph=True, dynamic=False, options=options)
+    A whole number becomes a tensor, so that one version serves the segments of a plan, whatever their number.
+    """
+    if isinstance(value, tuple):
+        traits.append(type(value))
+        for part in value:
+            _take_apart(part, tensors, traits)
+        return
+    if isinstance(value, int) and not isinstance(value, bool):
+        value = torch.tensor(value)
+    if isinstance(value, Tensor):
+        tensors.append(value)
+        value = value.dtype, value.shape, value.stride()
+    traits.append(value)
 
 
-def _without_count(value: Any) -> Any:
-    """A whole number as a tensor, so that one version serves the segments of a plan, whatever their number."""
-    return torch.tensor(value) if isinstance(value, int) and not isinstance(value, bool) else value
+def _put_together(value: Any, tensors: Iterator[Tensor]) -> Any:
+    """The same with other tensors, in order; whole numbers come back as the tensors that they became."""
+    if isinstance(value, tuple):
+        parts = [_put_together(part, tensors) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    counted = isinstance(value, int) and not isinstance(value, bool)
+    return next(tensors) if counted or isinstance(value, Tensor) else value
 
 
 def _in_float32(value: Any) -> Any:
     return value.float() if isinstance(value, Tensor) and value.dtype == torch.bfloat16 else value
-
-
-def _traits(value: Any, traits: list[Any]) -> list[Any]:
-    """Adds to `traits` what a version is for: constants, and the shapes of tensors, in order."""
-    if isinstance(value, tuple):
-        traits.append(type(value))
-        for field in value:
-            _traits(field, traits)
-    else:
-        traits.append(value.shape if isinstance(value, Tensor) else value)
-    return traits
-
-
-def _device(value: Any) -> str:
-    """Type of the first tensor's device; empty where there is no tensor."""
-    if isinstance(value, tuple):
-        return next(filter(None, map(_device, value)), "")
-    return value.device.type if isinstance(value, Tensor) else ""

@@ -25,7 +25,7 @@ class EffectLevel(NamedTuple):
 
     def dimension(self, state: State) -> int:
         """C; `state: [B]`."""
-        return dimension_of(self.model.effect_prior, [state.expand_plans(1)])
+        return dimension_of(self.model.effect_prior, [state.expand_plans(0)])
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
@@ -47,7 +47,7 @@ class MotionLevel(NamedTuple):
 
     def dimension(self, state: State) -> int:
         """Z; `state: [B]`."""
-        return dimension_of(self.model.motion_prior, [state.expand_plans(1), *self._effects(0, 1)])
+        return dimension_of(self.model.motion_prior, [state.expand_plans(0), *self._effects(0, 0)])
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]

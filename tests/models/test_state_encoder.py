@@ -41,6 +41,13 @@ def test_relations_equal_their_definition_pair_by_pair(random_state: Callable[..
     assert expected.abs().max() > 0.1
 
 
+@pytest.mark.parametrize("objects", [1, 2, 5])
+def test_code_that_is_to_be_native_says_the_same(random_state: Callable[..., State], objects: int) -> None:
+    encoder, state = small_encoder(), double(random_state(3, objects=objects))
+    native = torch.compile(encoder, backend="eager", fullgraph=True)
+    assert torch.allclose(native(state), encoder(state), atol=1e-12)
+
+
 def test_reordering_objects_reorders_features(random_state: Callable[..., State]) -> None:
     encoder = small_encoder()
     state = double(random_state(3, objects=5, real=4))

@@ -67,6 +67,14 @@ def test_code_is_made_once_for_each_constant_and_shape() -> None:
 
 
 @needs_a_compiler
+def test_code_is_for_numbers_as_they_lie_in_memory() -> None:
+    engine, numbers = Compiled(), torch.arange(12.0).reshape(3, 4)
+    for left in (numbers, numbers.t().contiguous().t(), numbers[:1].expand(3, 4), numbers):
+        pair, total = engine(scaled, Pair(left, left[0]), 3.0, 1)
+        torch.testing.assert_close((*pair, total), (3 * left, left[0], 3 * left.sum()))
+
+
+@needs_a_compiler
 def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32(precision: None) -> None:
     torch.manual_seed(0)
     layer, numbers = torch.nn.Linear(64, 64), torch.randn(32, 64)
