@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -63,13 +61,8 @@ class StateEncoder(nn.Module):
         # The first layer is linear in the difference, W (p_j - p_i) + b = W p_j - (W p_i - b): M products
         # instead of M squared. Pairs are visited by cyclic shifts, so that no object meets itself.
         own = others - self.difference.bias
-        shifts = range(1, others.shape[-2])
-        hidden = ((others.roll(-shift, -2) - own).relu_() for shift in shifts)
-        if shifts and torch.compiler.is_compiling():  # one product; torch alone is faster within its caches
-            related: Iterable[Tensor] = self.relation(torch.stack(list(hidden)))
-        else:
-            related = map(self.relation, hidden)
         total = torch.zeros_like(others)
-        for shift, relation in zip(shifts, related, strict=True):
-            total = total + relation * mask.roll(-shift, -1).unsqueeze(-1)
+        for shift in range(1, others.shape[-2]):
+            hidden = (others.roll(-shift, -2) - own).relu_()
+            total = total + self.relation(hidden) * mask.roll(-shift, -1).unsqueeze(-1)
         return total

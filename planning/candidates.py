@@ -70,7 +70,7 @@ class Search:
             chances = uniform_each((len(noise), count), self.generators).unbind(1)
         candidates = self.begin(count)
         for number, segment in enumerate(noise, 1):
-            if settled is not None and bool(settled.all()):
+            if settled is not None and all(settled.tolist()):
                 candidates = candidates.rest(segment)
             else:
                 candidates, settled = candidates.step(segment, chances[number - 1], settled, last=number == len(noise))

@@ -123,7 +123,7 @@ def tries(
 
     Square metres to the `goal: [B, 1]`, `[B, R, draws]`, and whether the try fails, `[B, R, draws]` bool. `state: [B]`.
     """
-    pushes = actions.repeat_interleave(draws, 1)  # [B, R draws, T, 4]
+    pushes = actions.unsqueeze(2).repeat(1, 1, draws, 1, 1).flatten(1, 2)  # [B, R draws, T, 4]
     pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
     errors = None
     if robustness.outcome_noise:
