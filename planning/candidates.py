@@ -35,7 +35,7 @@ class Search:
     @property
     def dimension(self) -> int:
         """D, the numbers of noise per segment."""
-        return self.level.dimension(self.state)
+        return self.level.dimension
 
     def begin(self, count: int) -> Candidates:
         """n = `count` plans without a segment yet."""

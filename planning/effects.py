@@ -42,12 +42,12 @@ def choose_effects(candidates: Candidates, chosen: Tensor | None = None) -> Effe
         subgoals=State(
             winner.history(lambda segment: segment.stretch.states.centers)[:, 0],
             winner.history(lambda segment: segment.stretch.states.features)[:, 0],
-            winner.history(lambda segment: segment.stretch.states.mask)[:, 0],
+            winner.plans.mask.expand(-1, len(winner.kept), -1),  # whoever is real stays so
         ),
         segments=progress.segments[environments, chosen],
         expected_return=progress.returns[environments, chosen],
         expected_success=progress.succeeded[environments, chosen],
-        noise=remembered(candidates, chosen),
+        noise=remembered(winner),
         candidate_centers=candidates.history(lambda segment: segment.stretch.states.centers),
         candidate_returns=progress.returns,
     )

@@ -14,7 +14,7 @@ from planning import returns
 from planning.following import follow
 from planning.proposals import Proposal
 from planning.protocol import PlanningModel
-from planning.sampling import codes_each, dimension_of, noise_each, sample_each
+from planning.sampling import codes_each, noise_each, sample_each
 from planning.segments import Stretch, of_segment
 
 
@@ -23,9 +23,10 @@ class EffectLevel(NamedTuple):
 
     model: PlanningModel
 
-    def dimension(self, state: State) -> int:
-        """C; `state: [B]`."""
-        return dimension_of(self.model.effect_prior, [state.expand_plans(0)])
+    @property
+    def dimension(self) -> int:
+        """C."""
+        return self.model.effect_dimension
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
@@ -45,9 +46,10 @@ class MotionLevel(NamedTuple):
     model: PlanningModel
     effect_codes: Tensor | None
 
-    def dimension(self, state: State) -> int:
-        """Z; `state: [B]`."""
-        return dimension_of(self.model.motion_prior, [state.expand_plans(0), *self._effects(0, 0)])
+    @property
+    def dimension(self) -> int:
+        """Z."""
+        return self.model.motion_dimension
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
@@ -74,7 +76,8 @@ class PushLevel(NamedTuple):
     model: PlanningModel
     proposal: Proposal
 
-    def dimension(self, state: State) -> int:
+    @property
+    def dimension(self) -> int:
         """What the proposal takes for T pushes."""
         return self.proposal.held + self.model.segment_length * self.proposal.own
 
@@ -83,7 +86,7 @@ class PushLevel(NamedTuple):
     ) -> Stretch:
         """See `planning.candidates.Level`."""
         if noise is None:
-            noise = noise_each((plans.batch_shape[-1], self.dimension(plans)), generators)
+            noise = noise_each((plans.batch_shape[-1], self.dimension), generators)
         held, pushes, path = noise[..., : self.proposal.held], [], []
         for own in noise[..., self.proposal.held :].split(self.proposal.own, -1):
             push = self.proposal(plans, held, own).unsqueeze(-2)

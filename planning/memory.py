@@ -12,11 +12,11 @@ from planning.plan import Plan
 from planning.sampling import noise_each
 
 
-def remembered(candidates: Candidates, chosen: Tensor) -> Tensor:
-    """The noise `[B, K, D]` that plans number `chosen: [B]` were made of; K = 0 where they were not made of noise."""
-    if any(segment.noise is None for segment in candidates.kept):
-        return candidates.plans.centers.new_empty(len(chosen), 0, 0)
-    return candidates.take(chosen.unsqueeze(-1)).noise[:, 0]
+def remembered(chosen: Candidates) -> Tensor:
+    """The noise `[B, K, D]` that the chosen plans `[B, 1]` were made of; K = 0 where they were not made of noise."""
+    if any(segment.noise is None for segment in chosen.kept):
+        return chosen.plans.centers.new_empty(*chosen.plans.batch_shape[:1], 0, 0)
+    return chosen.noise[:, 0]
 
 
 def hints(previous: Plan | None, generators: Sequence[torch.Generator]) -> Tensor | None:

@@ -30,17 +30,25 @@ class PlanningModel(Protocol):
     def segment_length(self) -> int:
         """`T`, the number of pushes that lead from a state to its subgoal."""
 
+    @property
+    def effect_dimension(self) -> int:
+        """C, the numbers of an effect code."""
+
+    @property
+    def motion_dimension(self) -> int:
+        """Z, the numbers of a motion code."""
+
     def effect_prior(self, state: State) -> Distribution:
-        """p(c | s), or p(c): batch `[...]`, event `[16]`."""
+        """p(c | s), or p(c): batch `[...]`, event `[C]`."""
 
     def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
-        """p(z | s, c), or p(z): batch `[...]`, event `[16]`; `effect_code: [..., 16]`."""
+        """p(z | s, c), or p(z): batch `[...]`, event `[Z]`; `effect_code: [..., C]`."""
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
-        """Mean of the meta-dynamics h(s' | s, c), the state T steps on: `[...]`; `effect_code: [..., 16]`."""
+        """Mean of the meta-dynamics h(s' | s, c), the state T steps on: `[...]`; `effect_code: [..., C]`."""
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
-        """Mean of the action generator g(a | s, c, z): `[..., T, 4]` normalised pushes; codes `[..., 16]`."""
+        """Mean of the action generator g(a | s, c, z): `[..., T, 4]` pushes; codes `[..., C]`, `[..., Z]`."""
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., 4]`."""

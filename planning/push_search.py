@@ -44,7 +44,8 @@ class PushSearch(SearchingPlanner):
 
     def _best(self, candidates: Candidates) -> Plan:
         progress = candidates.standing
-        sound = candidates.history(lambda segment: torch.isfinite(pushes_of(segment)).all(-1).all(-1)).all(-1)
+        # A sum is finite only where everything in it is.
+        sound = torch.isfinite(candidates.history(pushes_of).sum((-3, -2, -1)))
         scores = torch.where(sound, progress.returns, -torch.inf)
         chosen = ranking.best(scores, "returns of push sequences")
         environments = torch.arange(len(chosen), device=chosen.device)
@@ -64,6 +65,6 @@ class PushSearch(SearchingPlanner):
             expected_return=progress.returns[environments, chosen],
             expected_success=progress.succeeded[environments, chosen],
             candidate_centers=candidates.history(lambda segment: segment.stretch.states.centers),
-            noise=remembered(candidates, chosen),
+            noise=remembered(winner),
             candidate_returns=progress.returns,
         )

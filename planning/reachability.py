@@ -93,11 +93,10 @@ def _first_segment(
 class _FirstByMotions:
     """Given plans: the first segment as it was predicted by f, the others by h from there."""
 
+    dimension = 0  # there is nothing to search
+
     def __init__(self, model: PlanningModel, first: Stretch, codes: Tensor) -> None:
         self.model, self.first, self.codes = model, first, codes
-
-    def dimension(self, state: State) -> int:
-        return 0  # there is nothing to search
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]

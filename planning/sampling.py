@@ -54,11 +54,6 @@ def codes_each(prior: Callable[..., Distribution], conditions: Sequence[State | 
     )
 
 
-def dimension_of(prior: Callable[..., Distribution], conditions: Sequence[State | Tensor]) -> int:
-    """D, the numbers of a code of `prior(*conditions)`, asked for the first environment of `[B, N]`."""
-    return prior(*(_scene(condition, 0) for condition in conditions)).event_shape[0]
-
-
 def code_of(prior: Distribution, noise: Tensor) -> Tensor:
     """The code that standard normal noise stands for: mean + scale * noise, or through a flow's transforms.
 

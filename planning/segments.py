@@ -23,8 +23,9 @@ class Stretch(NamedTuple):
 class Level(Protocol):
     """What is searched: effect codes, motion codes or raw pushes."""
 
-    def dimension(self, state: State) -> int:
-        """D, the numbers that settle one segment; `state: [B]`."""
+    @property
+    def dimension(self) -> int:
+        """D, the numbers that settle one segment."""
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]

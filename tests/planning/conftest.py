@@ -26,6 +26,7 @@ class PointMass:
     """
 
     segment_length = 3
+    effect_dimension = motion_dimension = 16
 
     def __init__(self, noise: float = 0.02) -> None:
         self.noise = noise  # metres per push
@@ -52,6 +53,7 @@ class Flat:
     """Without effects: the T = 3 pushes are the motion code's first six numbers, times 0.05 m; f obeys."""
 
     segment_length = 3
+    motion_dimension = 16
 
     def motion_prior(self, state: State) -> Distribution:
         return standard_normal(state)
@@ -68,6 +70,7 @@ class Tabled:
     """One object on a line, codes from tables: h moves it by c, each of the T = 2 pushes by c / 2 + z."""
 
     segment_length = 2
+    effect_dimension = motion_dimension = 16
 
     def __init__(self, effects: Sequence[Sequence[float]], motions: Sequence[Sequence[float]]) -> None:
         self.effects = iter(effects)
@@ -107,8 +110,7 @@ class Listed(Distribution):
 class Placed:
     """A level whose plans are wherever two numbers of noise per segment say: x and y of the target, in metres."""
 
-    def dimension(self, state: State) -> int:
-        return 2
+    dimension = 2
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]

@@ -26,6 +26,7 @@ class Grazing:
     """
 
     segment_length = 1
+    effect_dimension = motion_dimension = 16
     narrow, wide = 0.001, 10.0
 
     def effect_prior(self, state: State) -> Distribution:
