@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.errors import UserError
-from cavin_pyro.files import replacing
+from cavin_pyro.files import read_json, replacing, write_json
 
 
 def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
@@ -45,6 +46,34 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
                 f"{folder} holds a run with {name}={earlier.get(name)}, not {now.get(name)}: "
                 "resume with the same words, or choose another output=DIR"
             )
+
+
+def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
+    """Make sure that a run goes on with the data that it began with, wherever they lie now; the first time, note them.
+
+    Args:
+        data: of each dataset its number of `transitions` and the `mark` of its contents, among other things.
+
+    Raises:
+        UserError: the run in this folder began with other data, or what it noted of them cannot be read.
+    """
+    path = folder / "data.json"
+    now = [{name: dataset[name] for name in ("transitions", "mark")} for dataset in data]
+    if not path.exists():
+        write_json(path, now)
+    elif (earlier := read_json(path)) != now:
+        raise UserError(
+            f"{folder} holds a run with other data, {_of_transitions(earlier)} instead of {_of_transitions(now)}: "
+            "resume with the same data=DIR, or choose another output=DIR"
+        )
+
+
+def _of_transitions(data: Any) -> str:
+    """What `data.json` holds, in words."""
+    try:
+        return " and ".join(f"{dataset['transitions']} transitions ({dataset['mark']})" for dataset in data)
+    except (TypeError, KeyError):
+        return "something unreadable"
 
 
 def flat_words(value: Any, prefix: str = "") -> dict[str, Any]:

@@ -38,7 +38,7 @@ def train(config: DictConfig) -> Trainer:
     from cavin_pyro.files import output_folder, write_json
     from cavin_pyro.pairs import check_pair
     from cavin_pyro.provenance import training_provenance
-    from cavin_pyro.runs import check_same_run, write_config
+    from cavin_pyro.runs import check_same_data, check_same_run, write_config
     from cavin_pyro.settings import data_folders, trainer_settings, window_settings
     from cavin_pyro.training import Trainer
     from cavin_pyro.windows import load_windows
@@ -60,10 +60,11 @@ def train(config: DictConfig) -> Trainer:
 
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("data", "output"))
+    record = training_provenance(data, source, windows)
+    check_same_data(folder, record["data"])
     settings = write_config(folder, config)
     parts = {"model": model, "guide": guide, "pointnet": pointnet}
     path = folder / "checkpoint.safetensors"
-    record = training_provenance(data, source, windows)
 
     def save(step: int, row: dict[str, float]) -> None:
         save_checkpoint(path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row})

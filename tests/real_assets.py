@@ -5,4 +5,4 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-REAL_ASSETS = Path(os.environ.get("CAVIN_ASSETS", Path(__file__).resolve().parents[2] / "shared" / "assets"))
+REAL_ASSETS = Path(os.environ.get("CAVIN_ASSETS") or Path(__file__).resolve().parents[2] / "shared" / "assets")

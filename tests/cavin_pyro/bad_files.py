@@ -82,6 +82,7 @@ BAD_FILES = [
     ("collect", "output=@pushes seed=4", "holds a dataset with"),
     ("evaluate", "output=@used", "holds a run with"),
     ("train", "output=@used", "holds a run with"),
+    ("train", "output=@used_otherwise", "holds a run with other data, 7 transitions (0a1b) instead of 72 transitions"),
     ("check", "output=@used", "holds a run with"),
     # Layouts.
     ("plan", "layout=@nothing.yaml", "nothing.yaml cannot be read"),

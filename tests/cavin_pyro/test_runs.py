@@ -7,7 +7,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.errors import UserError
-from cavin_pyro.runs import check_same_run, write_config
+from cavin_pyro.runs import check_same_data, check_same_run, write_config
 
 
 def config(**changes: object) -> DictConfig:
@@ -53,3 +53,21 @@ def test_a_damaged_configuration_is_named(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("seed: [1")
     with pytest.raises(UserError, match=r"config\.yaml is damaged"):
         check_same_run(tmp_path, config(), ignore=())
+
+
+def test_training_goes_on_with_the_same_data_wherever_they_lie(tmp_path: Path) -> None:
+    data = {"transitions": 60, "mark": "12ab", "episodes": 12}
+    check_same_data(tmp_path, [data])
+    check_same_data(tmp_path, [{**data, "episodes": 13}])
+    noted = (tmp_path / "data.json").read_text()
+    for other in ([{**data, "mark": "34cd"}], [{**data, "transitions": 70}], [data, data]):
+        with pytest.raises(UserError, match=r"other data, 60 transitions \(12ab\) instead of .* or choose another"):
+            check_same_data(tmp_path, other)
+    assert (tmp_path / "data.json").read_text() == noted
+
+
+@pytest.mark.parametrize("content", ["[1]", "5", '[{"transitions": 60}]'])
+def test_a_note_of_data_that_is_none_is_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "data.json").write_text(content)
+    with pytest.raises(UserError, match="other data, something unreadable instead of 60 transitions"):
+        check_same_data(tmp_path, [{"transitions": 60, "mark": "12ab"}])
