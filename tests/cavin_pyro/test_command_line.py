@@ -147,7 +147,7 @@ def test_folders_of_the_same_name_that_are_no_packages_do_no_harm(shell: SimpleN
             "windows.validation_fraction=0.4 trainer.batch_size=2",
             300,
             "checkpoint.safetensors",
-            {"config.yaml"},
+            {"config.yaml", "data.json"},
         ),
     ],
 )
