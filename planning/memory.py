@@ -15,7 +15,7 @@ from planning.sampling import noise_each
 def remembered(chosen: Candidates) -> Tensor:
     """The noise `[B, K, D]` that the chosen plans `[B, 1]` were made of; K = 0 where they were not made of noise."""
     if any(segment.noise is None for segment in chosen.kept):
-        return chosen.plans.centers.new_empty(*chosen.plans.batch_shape[:1], 0, 0)
+        return chosen.plans.centers.new_empty(len(chosen.plans.mask), 0, 0)
     return chosen.noise[:, 0]
 
 
