@@ -10,7 +10,7 @@ import torch
 PRODUCTS = {"float32": "highest", "bfloat16": "medium"}  # to torch's names
 
 # glibc's names for the options of mallopt, <malloc.h>.
-TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3
+TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD, LARGEST_FAST = -1, -2, -3, 1
 LARGEST_ON_HEAP = 32 * 2**20  # bytes; the most that glibc accepts
 KEPT = 256 * 2**20  # bytes; enough for a plan of 8,192 samples
 
@@ -33,3 +33,4 @@ def keep_freed_memory() -> None:
         mallopt(MMAP_THRESHOLD, LARGEST_ON_HEAP)
         mallopt(TRIM_THRESHOLD, KEPT)
         mallopt(TOP_PAD, KEPT // 16)
+        mallopt(LARGEST_FAST, 0)  # else every large tensor goes through all small ones that were freed before it

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
 from typing import Any
 
 import torch
@@ -23,30 +24,57 @@ class TileSet:
         self.tiles = tuple(tiles)
         self.centers = _tensor([tile_center(tile) for tile in self.tiles]).reshape(-1, 2)
         # Neighbours compute their common border from the same half index, so that rounding leaves no gap.
-        rows = _rows(self.tiles)
-        self._low = _tensor([tile_center((i - 0.5, first - 0.5)) for i, first, _ in rows]).reshape(-1, 2)
-        self._high = _tensor([tile_center((i + 0.5, last + 0.5)) for i, _, last in rows]).reshape(-1, 2)
-        edges = _tensor(_outline(set(self.tiles))).reshape(-1, 2, 2)
-        self._edge_low, self._edge_high = edges[:, 0], edges[:, 1]
+        rows = [
+            (tile_center((i - 0.5, first - 0.5)), tile_center((i + 0.5, last + 0.5)))
+            for i, first, last in _rows(self.tiles)
+        ]
+        self._rows, self._edges = _Rectangles(rows), _Rectangles(_outline(set(self.tiles)))
 
     def contains(self, points: Tensor) -> Tensor:
         """Whether points [..., 2] metres lie in the union, its border included: [...] bool."""
-        x, y = points[..., :1], points[..., 1:]
-        (low_x, low_y), (high_x, high_y) = self._low.to(points).T, self._high.to(points).T
-        across, along = torch.minimum(x - low_x, high_x - x), torch.minimum(y - low_y, high_y - y)
+
+        def depth(x: Tensor, y: Tensor, low: Any, high: Any) -> Tensor:
+            across, along = torch.minimum(x - low[0], high[0] - x), torch.minimum(y - low[1], high[1] - y)
+            return torch.minimum(across, along)
+
         # Not `any` of four comparisons: native code takes many points at once where numbers are compared last.
-        return torch.minimum(across, along).amax(dim=-1) >= 0.0
+        return self._rows.of_each(depth, points, torch.amax, torch.maximum) >= 0.0
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Metres from points [..., 2] to the union's outline, negative inside: [...]."""
-        # One axis at a time: edges innermost is several times faster than axes innermost.
-        squared = torch.zeros(()).to(points)
-        for axis in (0, 1):
-            coordinate = points[..., axis, None]
-            low, high = self._edge_low[:, axis].to(points), self._edge_high[:, axis].to(points)
-            squared = squared + (coordinate - torch.clamp(coordinate, low, high)).square()
-        distance = squared.amin(dim=-1).sqrt()
+
+        def squared(x: Tensor, y: Tensor, low: Any, high: Any) -> Tensor:
+            # One axis at a time: edges innermost is several times faster than axes innermost.
+            across, along = x - torch.clamp(x, low[0], high[0]), y - torch.clamp(y, low[1], high[1])
+            return across.square() + along.square()
+
+        distance = self._edges.of_each(squared, points, torch.amin, torch.minimum).sqrt()
         return torch.where(self.contains(points), -distance, distance)
+
+
+class _Rectangles:
+    """Some, sides parallel to the axes; those without width are edges."""
+
+    def __init__(self, corners: Sequence[Sequence[Sequence[float]]]) -> None:
+        """`corners`: (x, y) of the low and of the high one, in metres, of each."""
+        self._corners = corners
+        self._low, self._high = _tensor(corners).reshape(-1, 2, 2).permute(1, 2, 0)  # [2, n] each
+
+    def of_each(
+        self,
+        measure: Callable[[Tensor, Tensor, Any, Any], Tensor],
+        points: Tensor,
+        best: Callable[..., Tensor],
+        better: Callable[[Tensor, Tensor], Tensor],
+    ) -> Tensor:
+        """The `best` of what `measure` says of x and y of points [..., 2] and of each one's corners: [...].
+
+        `better` is the same, of two.
+        """
+        x, y = points.unbind(-1)
+        if torch.compiler.is_compiling():  # a rectangle at a time: native code then takes many points at once
+            return reduce(better, [measure(x, y, low, high) for low, high in self._corners])
+        return best(measure(x.unsqueeze(-1), y.unsqueeze(-1), self._low.to(points), self._high.to(points)), dim=-1)
 
 
 def _tensor(numbers: Sequence[Any]) -> Tensor:

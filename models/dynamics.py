@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from torch import Tensor, nn
-from torch.nn import functional
 
-from models.layers import fully_connected
+from models.layers import fully_connected, unit
 from models.state import State
 
 PUSH_RANGE = 0.15  # metres, farthest that one push moves an object along an axis
@@ -58,7 +57,7 @@ class StateChange(nn.Module):
         centers = state.centers + gate * (
             self.reach * motion.contiguous().tanh()
         )  # tanh too is slow on what is apart in memory
-        features = functional.normalize(state.features + gate * turn, dim=-1)
+        features = unit(state.features + gate * turn)
         return State(centers, features, state.mask.expand(centers.shape[:-1]))
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import reduce
+from operator import add
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.layers import fully_connected, relative_positions
+from models.layers import Linear, fully_connected, relative_positions
 from models.state import State
 
 
@@ -26,7 +30,7 @@ class StateEncoder(nn.Module):
         self.maximum_objects = maximum_objects
         self.spatial = fully_connected(3, width)
         self.geometric = fully_connected(feature_dimension, width)
-        self.difference = nn.Linear(3, width)
+        self.difference = Linear(3, width)
         self.relation = fully_connected(width, width)
 
     def forward(self, state: State) -> Tensor:
@@ -41,28 +45,23 @@ class StateEncoder(nn.Module):
                 f"features have {state.features.shape[-1]} numbers per object; "
                 f"this model expects {self.feature_dimension}"
             )
-        spatial, others = self._of_positions(relative_positions(state.centers))
-        return torch.cat((spatial, self.geometric(state.features), self._relations(others, state.mask)), -1)
+        positions = relative_positions(state.centers)
+        spatial, difference = self.spatial(positions), self._differences(positions)
+        related = [  # pairs are visited by cyclic shifts, so that no object meets itself
+            self.relation(difference(shift).relu_()) * state.mask.roll(-shift, -1).unsqueeze(-1)
+            for shift in range(1, state.objects)
+        ]
+        relations = reduce(add, related) if related else torch.zeros_like(spatial)
+        return torch.cat((spatial, self.geometric(state.features), relations), -1)
 
-    def _of_positions(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Spatial features, and W p of the first relation layer: `[..., M, 3]` in 0.1 m -> twice `[..., M, width]`."""
-        first, difference = self.spatial[0], self.difference
-        assert isinstance(first, nn.Linear)
-        if not torch.compiler.is_compiling():
-            return self.spatial(positions), functional.linear(positions, difference.weight)
-        # A product costs native code some 20 microseconds, however small it is.
-        weight = torch.cat((first.weight, difference.weight))
-        bias = torch.cat((first.bias, torch.zeros_like(difference.bias)))
-        spatial, others = functional.linear(positions, weight, bias).chunk(2, -1)
-        return spatial.relu(), others
+    def _differences(self, positions: Tensor) -> Callable[[int], Tensor]:
+        """The first relation layer, W (p_j - p_i) + b, of `positions: [..., M, 3]` in 0.1 m.
 
-    def _relations(self, others: Tensor, mask: Tensor) -> Tensor:
-        """`others: [..., M, width]`, W p of every object, `mask: [..., M]` -> `[..., M, width]`."""
-        # The first layer is linear in the difference, W (p_j - p_i) + b = W p_j - (W p_i - b): M products
-        # instead of M squared. Pairs are visited by cyclic shifts, so that no object meets itself.
+        What is returned takes a cyclic shift, which says for each object i which one j is, and gives `[..., M, width]`.
+        """
+        if torch.compiler.is_compiling():  # it is no product there (see `layers.Linear`)
+            return lambda shift: self.difference(positions.roll(-shift, -2) - positions)
+        # Linear in the difference: W p_j - (W p_i - b) takes M products instead of M squared.
+        others = functional.linear(positions, self.difference.weight)
         own = others - self.difference.bias
-        total = torch.zeros_like(others)
-        for shift in range(1, others.shape[-2]):
-            hidden = (others.roll(-shift, -2) - own).relu_()
-            total = total + self.relation(hidden) * mask.roll(-shift, -1).unsqueeze(-1)
-        return total
+        return lambda shift: others.roll(-shift, -2) - own

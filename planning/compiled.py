@@ -96,6 +96,8 @@ class _Native:
                 _InARow(function, rounded, arguments, forms.append), tuple(tensors), strict=False
             )
         graph = exported.module(check_guards=False)
+        graph.graph.set_codegen(torch.fx.graph.CodeGen())  # in a row it comes and goes: nothing is to be taken apart
+        graph.recompile()
         self._call = torch._inductor.compile(graph, [*tensors], options=COMPILING)
         self._form = fields.apply(forms[-1], lambda value: torch.empty(0) if isinstance(value, Tensor) else value)
 

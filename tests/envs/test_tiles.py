@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from envs.tiles import TileSet, table_distance
 from envs.workspace import TABLE_HIGH, TABLE_LOW, tile_center
+from tests.tracing import traced
 
 TILES = st.sets(st.tuples(st.integers(0, 4), st.integers(0, 6)), min_size=1, max_size=20)
 X, Y = st.floats(TABLE_LOW[0], TABLE_HIGH[0]), st.floats(TABLE_LOW[1], TABLE_HIGH[1])
@@ -95,3 +96,12 @@ def test_the_distance_to_the_tables_edge_is_that_to_the_nearest_side(x: float, y
 def test_points_off_the_table_are_at_a_negative_distance_from_its_edge() -> None:
     off = torch.tensor([[0.21, 0.0], [1.0, 0.0], [0.6, -0.7], [0.6, 0.62]])
     torch.testing.assert_close(table_distance(off), torch.tensor([-0.01, -0.02, -0.09, -0.01]))
+
+
+def test_distances_are_compiled_to_the_same_numbers() -> None:
+    union = TileSet([(0, 0), (0, 1), (1, 1), (2, 3)])
+    points = torch.rand(200, 2) * 0.9 + torch.tensor([0.15, -0.65])
+    torch.testing.assert_close(traced(union.signed_distance, points)(points), union.signed_distance(points))
+    inside = traced(union.contains, points)(points)
+    assert torch.equal(inside, union.contains(points))
+    assert inside.any() and not inside.all()
