@@ -99,3 +99,5 @@ def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:
         min(config.workers, len(seeds)), initializer=_begin, initargs=(config,)
     ) as pool:
         yield from pool.imap_unordered(_episode, seeds)
+        pool.close()  # workers end by themselves, and give back what they hold, such as the compiler's locks
+        pool.join()
