@@ -80,8 +80,8 @@ def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32(pre
     layer, numbers = torch.nn.Linear(64, 64), torch.randn(32, 64)
     engine = Compiled()
     with torch.inference_mode():
-        exact = layer(numbers)
         torch.set_float32_matmul_precision("highest")
+        exact = layer(numbers)
         torch.testing.assert_close(engine(rounded_product, layer, numbers), exact)
         torch.set_float32_matmul_precision("medium")
         rounded = engine(rounded_product, layer, numbers)
