@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from models.layers import fully_connected
+from models.layers import fully_connected, unit
 
 CLOUD_UNIT = 0.1  # metres; about the size of an object
 DECODED_POINTS = 64
@@ -24,7 +23,7 @@ class PointNet(nn.Module):
     def forward(self, clouds: Tensor) -> Tensor:
         """`clouds: [..., P, 3]` metres from the object's centre, in any order -> `[..., F]`."""
         pooled = self.points(clouds / CLOUD_UNIT).amax(-2)
-        return functional.normalize(self.feature(pooled), dim=-1)
+        return unit(self.feature(pooled))
 
 
 class PointNetAutoencoder(nn.Module):

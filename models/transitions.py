@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pyro
 from torch import Tensor
-from torch.nn import functional
 
 from models.dynamics import Dynamics
 from models.encoder import StateEncoder
+from models.layers import unit
 from models.likelihoods import Scales
 from models.state import State, Window, stack_steps
 
@@ -55,7 +55,7 @@ def generate_transitions(
         centers = pyro.sample(f"next_centers_{step}", scales.centers(mean, state.mask))
         features = pyro.sample(f"next_features_{step}", scales.features(mean, state.mask))
         drawn.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
-        state = drawn[-1]._replace(features=functional.normalize(features, dim=-1))
+        state = drawn[-1]._replace(features=unit(features))
     steps = stack_steps(drawn)
     pyro.deterministic("next_centers", steps.centers, event_dim=3)
     pyro.deterministic("next_features", steps.features, event_dim=3)

@@ -16,6 +16,7 @@ def products(graph: torch.fx.GraphModule) -> int:
 
 @pytest.mark.parametrize("inputs", [1, 3, FEW, FEW + 1])
 def test_a_linear_layer_of_few_inputs_is_compiled_without_a_product_to_the_same_numbers(inputs: int) -> None:
+    torch.set_float32_matmul_precision("highest")
     layer, values = Linear(inputs, 8), torch.randn(2, 5, inputs)
     assert products(traced(layer, values)) == (inputs > FEW)
     torch.testing.assert_close(traced(layer, values)(values), layer(values))

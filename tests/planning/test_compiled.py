@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -37,13 +36,6 @@ def branching(numbers: Tensor) -> Tensor:
     return numbers if bool(numbers.any()) else -numbers
 
 
-@pytest.fixture
-def precision() -> Iterator[None]:
-    before = torch.get_float32_matmul_precision()
-    yield
-    torch.set_float32_matmul_precision(before)
-
-
 def tensors(plan: Plan) -> list[Tensor]:
     return [tensor for field in plan for tensor in (field if isinstance(field, State) else (field,))]
 
@@ -75,7 +67,7 @@ def test_code_is_for_numbers_as_they_lie_in_memory() -> None:
 
 
 @needs_a_compiler
-def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32(precision: None) -> None:
+def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32() -> None:
     torch.manual_seed(0)
     layer, numbers = torch.nn.Linear(64, 64), torch.randn(32, 64)
     engine = Compiled()
@@ -134,7 +126,7 @@ def test_what_an_item_complains_of_is_heard() -> None:
 
 @needs_a_compiler
 def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
-    toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, precision: None
+    toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch.set_float32_matmul_precision("highest")
     monkeypatch.setattr(Distribution, "_validate_args", True)  # as torch has it, and other tests may not
