@@ -20,11 +20,14 @@ settings.load_profile("cavin_pyro")
 
 
 @pytest.fixture(autouse=True)
-def products_round_as_before() -> Iterator[None]:
-    """Commands say what matrix products of their process round to; a test of one must not change the next."""
-    precision = torch.get_float32_matmul_precision()
+def products_are_not_rounded() -> Iterator[None]:
+    """Commands say what matrix products of their process round to; a test of one must not change the next.
+
+    Nor must a fixture of a whole module: so every test begins with torch's own default.
+    """
+    torch.set_float32_matmul_precision("highest")
     yield
-    torch.set_float32_matmul_precision(precision)
+    torch.set_float32_matmul_precision("highest")
 
 
 @pytest.fixture(scope="session")
