@@ -1,5 +1,7 @@
 # make demo   sets up .venv once, then plans and executes an episode of each task with the shipped checkpoint
 # make test   sets up what the tests need once, then runs the checks and the tests
+# make soak   runs the tests that make test leaves out: whole families, of which it runs a representative
+# make docs   builds the documentation as a site, site/index.html, and checks every link in it
 # make clean  removes .venv and what tools leave behind
 #
 # PYTHON is the interpreter that .venv is made with: make test PYTHON=/path/to/python3.10
@@ -12,8 +14,10 @@ install := $(bin)/python -m pip install --disable-pip-version-check --no-input -
 # what a broken installation left behind is thrown away, never used.
 installed := .venv/installed
 installed_for_tests := .venv/installed-for-tests
+# The variable switches off a notice about what comes after Material for MkDocs: docs/reference/dependencies.md.
+build_docs := NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict --quiet
 
-.PHONY: demo test clean
+.PHONY: demo test soak docs clean
 
 demo: $(installed)
 	$(bin)/python -m cavin_pyro.demo
@@ -23,7 +27,14 @@ test: $(installed_for_tests)
 	$(bin)/ruff format --check .
 	$(bin)/mypy
 	$(bin)/lint-imports
+	$(build_docs)
 	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+soak: $(installed_for_tests)
+	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist worksteal -m soak
+
+docs: $(installed_for_tests)
+	$(build_docs)
 
 $(installed): pyproject.toml constraints.txt
 	$(if $(PYTHON),,$(error Python 3.11 or 3.10 with its venv module is needed and neither was found; install it, or say where it is: make PYTHON=/path/to/python3.11))
@@ -37,9 +48,9 @@ $(installed): pyproject.toml constraints.txt
 
 $(installed_for_tests): $(installed)
 	@rm -f $(installed) $(installed_for_tests)
-	$(install) --no-build-isolation --editable '.[test]'
+	$(install) --no-build-isolation --editable '.[test,docs]'
 	@touch $(installed) $@
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .venv build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cavin_pyro.collection import CollectionSettings, collect_episode, open_scene
-from cavin_pyro.dataset import shard_path, write_shard
-from envs.object_sets import OBJECT_SETS
+from cavin_pyro.data.collection import CollectionConfig, collect_episode, open_scene
+from cavin_pyro.data.dataset import shard_path, write_shard
+from envs.objects.object_sets import OBJECT_SETS
 from envs.sensors import CAMERAS
 
 
@@ -28,25 +28,25 @@ def main() -> None:
     parser.add_argument("--camera", default="ideal", choices=list(CAMERAS))
     parser.add_argument("--assets", help="folder of meshes, for the sets that need one")
     parser.add_argument("--data", type=Path, help="folder of a dataset that is there already")
-    words = parser.parse_args()
-    if words.data:
-        split_of(words.data)
+    arguments = parser.parse_args()
+    if arguments.data:
+        split_of(arguments.data)
     else:
-        measure(words)
+        measure(arguments)
 
 
-def measure(words: argparse.Namespace) -> None:
+def measure(arguments: argparse.Namespace) -> None:
     """Collect some transitions and report."""
-    settings = CollectionSettings(seed=1, object_set=words.objects, assets=words.assets, camera=words.camera)
+    settings = CollectionConfig(seed=1, object_set=arguments.objects, assets=arguments.assets, camera=arguments.camera)
     scene = open_scene(settings)
     collect_episode(scene, settings, 10**6)  # meshes are written and libraries loaded
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     made, episode, shard, size, writing = 0, 0, 0, 0, 0.0
     wall, cpu = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        while made < words.transitions:
+        while made < arguments.transitions:
             episodes = []
-            while len(episodes) < settings.episodes_per_shard and made < words.transitions:
+            while len(episodes) < settings.episodes_per_shard and made < arguments.transitions:
                 episodes.append(collect_episode(scene, settings, episode))
                 made, episode = made + int(episodes[-1]["length"]), episode + 1
             began, path = time.process_time(), shard_path(Path(folder), shard)

@@ -11,9 +11,9 @@ from collections import defaultdict
 
 import numpy as np
 
-from cavin_pyro.collection import CollectionSettings
-from envs.object_sets import load_object_set
-from envs.objects import WHOLE_TABLE
+from cavin_pyro.data.collection import CollectionConfig
+from envs.objects.object_sets import load_object_set
+from envs.objects.sampling import WHOLE_TABLE
 from envs.policy import HeuristicPushingPolicy
 from envs.robots import PUSH_STEPS
 from envs.scene import Scene
@@ -54,25 +54,27 @@ def creep(scene: Scene) -> np.ndarray:
 
 
 def main() -> None:
-    word, assets, *numbers = sys.argv[1:]
+    name, assets, *numbers = sys.argv[1:]
     wanted, count = [*map(int, numbers), *(1000, 0)[len(numbers) :]]
-    settings = CollectionSettings(seed=1)
-    scene = Scene(object_set=load_object_set(word, assets))
+    settings = CollectionConfig(seed=1)
+    scene = Scene(object_set=load_object_set(name, assets))
     found: dict[str, list[float]] = defaultdict(list)
     watch, made, falls = Watch(scene), 0, 0
     for episode in range(10**9):
         drawing, acting = np.random.default_rng([settings.seed, episode]).spawn(2)
         began = time.process_time()
-        seen = scene.draw([WHOLE_TABLE] * (count or 1 + episode % 5), settings.ranges, drawing)
+        observation = scene.sample([WHOLE_TABLE] * (count or 1 + episode % 5), settings.ranges, drawing)
         found["reset, ms"].append(1e3 * (time.process_time() - began))
         for body in scene.bodies:
             depths = [-contact[8] for contact in scene.world._bullet.getContactPoints(body, 0)]
             found["depth in the table at rest, mm"].append(1e3 * max(depths, default=0.0))
         if episode % 20 == 0:
             found["creep in a second, mm"].extend(1e3 * creep(scene))
-        policy = HeuristicPushingPolicy(acting, hold=settings.hold, perturbed=settings.perturbed)
+        policy = HeuristicPushingPolicy(
+            acting, intent_length=settings.intent_length, perturbation_rate=settings.perturbation_rate
+        )
         for _ in range(settings.steps):
-            action = policy.act(seen) if episode % 5 else acting.uniform(-1.0, 1.0, 4)
+            action = policy.act(observation) if episode % 5 else acting.uniform(-1.0, 1.0, 4)
             watch.settling = 0
             began = time.process_time()
             report = scene.push(action)
@@ -80,7 +82,7 @@ def main() -> None:
             if not report.unsafe:
                 found["steps to settle after a push"].append(watch.settling - PUSH_STEPS)
             began = time.process_time()
-            seen = scene.observe()
+            observation = scene.observe()
             found["image and clouds, ms"].append(1e3 * (time.process_time() - began))
             assert np.isfinite(scene.ground_truth().positions).all()
             made += 1
@@ -90,7 +92,7 @@ def main() -> None:
         if made >= wanted:
             break
     print(
-        f"{word}: {made} pushes in {episode + 1} scenes, {falls} falls off the edge, {watch.through} through the table"
+        f"{name}: {made} pushes in {episode + 1} scenes, {falls} falls off the edge, {watch.through} through the table"
     )
     for name, values in sorted(found.items()):
         mean, (median, high) = np.mean(values), np.percentile(values, [50, 99])

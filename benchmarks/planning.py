@@ -5,9 +5,9 @@ operations in it, and the share of this machine's own rate of float32 matrix pro
 flat problem (30 pushes searched at once, the same dynamics, reward and samples) for our MPC and two public planners.
 Wall time, all in turn, medians and the fastest; crossing, sparse, horizon 30, T = 3, the first scenes of 16 episodes,
 planned one after another or all at once: how long a search goes on depends on the scene. "Algorithm 1" is compiled
-planning without the tries of `planner.robustness`, which are not in the paper. Set OMP_NUM_THREADS for the number of
-threads. Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The public
-planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out.
+planning without the perturbed rollouts of `planner.robustness`, which are not in the paper. Set OMP_NUM_THREADS for the
+number of threads. Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The
+public planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from cavin_pyro.command import compose
-from cavin_pyro.episodes import observed_state
-from cavin_pyro.setups import Setup, set_up
+from cavin_pyro.config.composition import compose
+from cavin_pyro.evaluation.factory import Setup, set_up
+from cavin_pyro.evaluation.rollout import observed_state
 from envs.tasks import TaskReward
 from models.state import State
 from planning import MpcPlanner, Planner, PlanningModel
@@ -38,9 +38,9 @@ SCENES = 16  # also the larger batch
 FEATURES = 64
 
 
-def setup(objects: int, samples: int, *words: str) -> Setup:
+def setup(objects: int, samples: int, *overrides: str) -> Setup:
     shared = ["task=crossing", f"objects={objects}", f"planner.samples={samples}", f"planner.horizon={HORIZON}"]
-    return set_up(compose("evaluate", *words, *shared))
+    return set_up(compose("evaluate", *overrides, *shared))
 
 
 def scenes(one: Setup, count: int) -> State:
@@ -144,7 +144,7 @@ class FlatProblem:
     def __init__(self, one: Setup, state: State) -> None:
         planner: MpcPlanner = one.planner  # type: ignore[assignment]
         self.model, self.engine, self.mask = planner.model, planner.engine, state.mask[0]
-        self.reward = TaskReward(one.layout)
+        self.reward = TaskReward(one.task)
         self.objects = state.objects
         self.start = torch.cat((state.centers[0], state.features[0]), -1).flatten()
 
@@ -247,13 +247,13 @@ def main() -> None:
     parser.add_argument("--no-grid", action="store_true", help="the public planners only")
     parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
-    words = parser.parse_args()
-    ways = ["direct"] if words.no_compile else ["direct", "compiled"]
-    samples, objects, repetitions = ([32], [2], 2) if words.quick else ([256, 1024, 8192], [1, 3, 5], 4)
-    if not words.no_grid:
+    arguments = parser.parse_args()
+    ways = ["direct"] if arguments.no_compile else ["direct", "compiled"]
+    samples, objects, repetitions = ([32], [2], 2) if arguments.quick else ([256, 1024, 8192], [1, 3, 5], 4)
+    if not arguments.no_grid:
         grid(samples, objects, repetitions, ways)
-    if not words.no_flat:
-        flat([32] if words.quick else [1024, 8192], 2 * repetitions, ways)
+    if not arguments.no_flat:
+        flat([32] if arguments.quick else [1024, 8192], 2 * repetitions, ways)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 from robots_pictures import draw_deviations, photograph_arms
 from scipy.spatial.transform import Rotation
 
-from envs.objects import ObjectParameters, ObjectRanges, draw_objects
+from envs.objects.sampling import ObjectParameters, ObjectRanges, sample_objects
 from envs.physics import Poses
 from envs.policy import HeuristicPushingPolicy
 from envs.scene import FALLEN, Scene
@@ -67,12 +67,12 @@ class Watched:
 
 
 def scenes(count: int, heavy: bool, seed: int) -> list[tuple[list[ObjectParameters], np.random.Generator]]:
-    drawn = []
+    sampled = []
     for number in range(count):
         generator, points = np.random.default_rng([seed, number]).spawn(2)
-        objects = draw_objects([AREA] * OBJECTS, ObjectRanges(clearance=0.12), generator)
-        drawn.append(([replace(one, mass=10.0, friction=0.8) for one in objects] if heavy else objects, points))
-    return drawn
+        objects = sample_objects([AREA] * OBJECTS, ObjectRanges(clearance=0.12), generator)
+        sampled.append(([replace(one, mass=10.0, friction=0.8) for one in objects] if heavy else objects, points))
+    return sampled
 
 
 def put(scene: Scene, poses: Poses) -> None:
@@ -90,12 +90,12 @@ def pushes(
     scene, seconds = Scene(robot=robot, assets=assets), defaultdict(float)
     found: dict[str, Any] = {"script": [], "names": [], "after": [], "ended": [], "line": [], "end": []}
     for number, (objects, points) in enumerate(scenes(-(-count // PUSHES_PER_SCENE), heavy, seed=5)):
-        seen = scene.reset(objects, points)
+        observation = scene.reset(objects, points)
         policy = HeuristicPushingPolicy(np.random.default_rng(number))
         scene.robot = watched = Watched(scene.robot, scene, seconds)  # type: ignore[assignment]
         for turn in range(PUSHES_PER_SCENE):
             if script is None:
-                before, action = scene.ground_truth(), policy.act(seen)
+                before, action = scene.ground_truth(), policy.act(observation)
                 found["script"].append((before, action))
             else:
                 before, action = script[number * PUSHES_PER_SCENE + turn]
@@ -109,7 +109,7 @@ def pushes(
                 deviation, last = line(np.array(watched.tips), action)
                 found["line"].append(deviation)
                 found["end"].append(last)
-            seen = scene.observe() if script is None else seen
+            observation = scene.observe() if script is None else observation
     scene.close()
     return {**found, "seconds": seconds}
 
@@ -208,16 +208,16 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="where the single deviations are written")
     parser.add_argument("--read", type=Path, nargs="+", help="draw what earlier runs wrote instead of measuring")
     parser.add_argument("--draw", type=Path, help="folder for pictures of the deviations and of the arms")
-    words = parser.parse_args()
-    if words.read:
-        results = {name: one for path in words.read for name, one in json.loads(path.read_text()).items()}
+    arguments = parser.parse_args()
+    if arguments.read:
+        results = {name: one for path in arguments.read for name, one in json.loads(path.read_text()).items()}
     else:
-        results = measure(words.robots, words.assets, words.pushes, words.weights)
-    if words.draw:
-        draw_deviations(words.draw / "robots-deviations.png", results)
-        photograph_arms(words.draw / "robots.png", words.robots, words.assets)
-    if words.json:
-        words.json.write_text(json.dumps(results))
+        results = measure(arguments.robots, arguments.assets, arguments.pushes, arguments.weights)
+    if arguments.draw:
+        draw_deviations(arguments.draw / "robots-deviations.png", results)
+        photograph_arms(arguments.draw / "robots.png", arguments.robots, arguments.assets)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results))
 
 
 if __name__ == "__main__":

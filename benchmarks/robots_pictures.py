@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.camera import Camera
-from envs.objects import ObjectParameters
+from envs.objects.sampling import ObjectParameters
 from envs.physics.arm import Arm
 from envs.robots import TIP_HEIGHT
 from envs.scene import Scene
+from envs.sensors.camera import Camera
 from envs.workspace import normalised_push
 
 COLORS = {"sawyer": "#D55E00", "panda": "#0072B2", "stick, beside": "#777777"}

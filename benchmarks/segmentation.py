@@ -3,9 +3,9 @@
 Under `camera=kinect2`, `segmentation=clusters` against the simulator's own mask of the same images. First single images
 of random scenes of 1 to 5 objects: the number of objects, and the distance between the centres that both give. Then
 whether every object keeps its place in the list from the first image to the last: over ten pushes of the heuristic
-policy, from such scenes and from objects crowded together as when collecting, and over whole episodes of the three
+policy, from such scenes and from objects in clutter as when collecting, and over whole episodes of the three
 tasks with 3 and 5 objects, as the shipped checkpoint plays them (`planner=cavin`, sparse rewards, at most 60 pushes).
-An episode in whose first image the number is wrong does not begin, as in `Scene.draw`.
+An episode in whose first image the number is wrong does not begin, as in `Scene.sample`.
 Results go to a file line by line (--log), from which a run that was stopped goes on. --pictures DIR draws what failed.
 """
 
@@ -25,12 +25,11 @@ sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")
 import numpy as np
 from scipy.stats import binomtest, bootstrap
 
-from cavin_pyro.collection import crowd
-from cavin_pyro.command import compose
-from cavin_pyro.progress import progress_bar
-from cavin_pyro.setups import Setup, set_up
-from envs.layouts import TASK_NAMES
-from envs.objects import WHOLE_TABLE, ObjectRanges
+from cavin_pyro.config.composition import compose
+from cavin_pyro.data.collection import clutter_area
+from cavin_pyro.evaluation.factory import Setup, set_up
+from cavin_pyro.storage.progress import progress_bar
+from envs.objects.sampling import WHOLE_TABLE, ObjectRanges
 from envs.observation import MINIMUM_PIXELS, Observation
 from envs.policy import HeuristicPushingPolicy
 from envs.scene import Scene
@@ -38,6 +37,7 @@ from envs.segmentation import ClusterSegmenter, Pixels, Segmenter
 from envs.sensors import DepthImage
 
 SEED = 5
+TASKS = ("clearing", "insertion", "crossing")
 PUSHES = 10
 View = tuple[DepthImage, list[np.ndarray]]
 Pictures = Callable[[str, View, list[Pixels], list[Any]], None]  # the last: whose colour each place has
@@ -47,21 +47,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=1000)
     parser.add_argument("--episodes", type=int, default=200)
-    parser.add_argument("--crowds", type=int, default=200)
+    parser.add_argument("--clutters", type=int, default=200)
     parser.add_argument("--tasks", type=int, default=240)
     parser.add_argument("--log", type=Path, default=Path("runs/segmentation.jsonl"))
     parser.add_argument("--pictures", type=Path)
-    words = parser.parse_args()
-    words.log.parent.mkdir(parents=True, exist_ok=True)
-    done = [json.loads(line) for line in words.log.read_text().splitlines()] if words.log.exists() else []
+    arguments = parser.parse_args()
+    arguments.log.parent.mkdir(parents=True, exist_ok=True)
+    done = [json.loads(line) for line in arguments.log.read_text().splitlines()] if arguments.log.exists() else []
     scene = Scene(camera="kinect2", segmentation="mask")
-    picture = draw_into(words.pictures) if words.pictures else lambda *_: None
-    with open(words.log, "a", encoding="utf-8") as log:
+    picture = draw_into(arguments.pictures) if arguments.pictures else lambda *_: None
+    with open(arguments.log, "a", encoding="utf-8") as log:
         for kind, count, run in (
-            ("scene", words.scenes, one_scene),
-            ("episode", words.episodes, one_episode),
-            ("crowd", words.crowds, partial(one_episode, crowded=True)),
-            ("task", words.tasks, one_task),
+            ("scene", arguments.scenes, one_scene),
+            ("episode", arguments.episodes, one_episode),
+            ("clutter", arguments.clutters, partial(one_episode, cluttered=True)),
+            ("task", arguments.tasks, one_task),
         ):
             known = {line["number"] for line in done if line["kind"] == kind}
             with progress_bar(kind + "s", total=count, initial=len(known), unit=kind) as bar:
@@ -74,22 +74,24 @@ def main() -> None:
     report(done)
 
 
-def begin(scene: Scene, number: int, *, crowded: bool = False) -> tuple[np.random.Generator, Any]:
+def begin(scene: Scene, number: int, *, cluttered: bool = False) -> tuple[np.random.Generator, Any]:
     """Draw a scene of 1 to 5 objects anywhere on the table, or of 2 to 5 as close to each other as when collecting."""
     generator = np.random.default_rng([SEED, number])
-    count = int(generator.integers(2 if crowded else 1, 6))
-    area, ranges = (crowd(generator), ObjectRanges(clearance=0.12)) if crowded else (WHOLE_TABLE, ObjectRanges())
-    return generator, scene.draw([area] * count, ranges, generator)
+    count = int(generator.integers(2 if cluttered else 1, 6))
+    area, ranges = (
+        (clutter_area(generator), ObjectRanges(clearance=0.12)) if cluttered else (WHOLE_TABLE, ObjectRanges())
+    )
+    return generator, scene.sample([area] * count, ranges, generator)
 
 
-def look(scene: Scene) -> View:
+def capture(scene: Scene) -> View:
     """A new image, and for each object the pixels that the simulator says are its own and have a measurement."""
-    image = scene.look()
-    return image, [mask & (image.depth > 0.0) for mask in scene.truth()]
+    image = scene.capture()
+    return image, [mask & (image.depth > 0.0) for mask in scene.true_masks()]
 
 
 def owners(found: list[Pixels], truth: list[np.ndarray]) -> list[int | None]:
-    """For each place in the list the object to which most of its pixels belong; -1 for none, None if not seen."""
+    """The object to which most pixels of each place in the list belong; -1 for none, None if it is not visible."""
     named: list[int | None] = []
     for pixels in found:
         counts = [int(mask[pixels].sum()) for mask in truth]
@@ -100,7 +102,7 @@ def owners(found: list[Pixels], truth: list[np.ndarray]) -> list[int | None]:
 
 def one_scene(scene: Scene, number: int, picture: Pictures) -> dict[str, Any]:
     begin(scene, number)
-    view = look(scene)
+    view = capture(scene)
     return judge_scene(view, scene.point_at_target(view[0]), number, picture)
 
 
@@ -110,8 +112,8 @@ def judge_scene(view: View, target: tuple[int, int] | None, number: int, picture
     found = ClusterSegmenter().start(image, target)
     spent = time.process_time() - began
     named = owners(found, truth)
-    seen = [body for body, mask in enumerate(truth) if mask.sum() >= MINIMUM_PIXELS]
-    right = sum(name is not None for name in named) == len(seen)
+    visible = [body for body, mask in enumerate(truth) if mask.sum() >= MINIMUM_PIXELS]
+    right = sum(name is not None for name in named) == len(visible)
     errors = []
     for name, pixels in zip(named, found, strict=True):
         if name is not None and name >= 0:
@@ -121,24 +123,24 @@ def judge_scene(view: View, target: tuple[int, int] | None, number: int, picture
             errors.append(float(np.linalg.norm(centers[0] - centers[1])))
     if not right:
         picture(f"scene {number}", view, found, list(range(len(found))))
-    return {"objects": len(seen), "right": right, "errors": errors, "seconds": spent}
+    return {"objects": len(visible), "right": right, "errors": errors, "seconds": spent}
 
 
-def one_episode(scene: Scene, number: int, picture: Pictures, *, crowded: bool = False) -> dict[str, Any]:
-    generator, seen = begin(scene, (2 if crowded else 1) * 10**6 + number, crowded=crowded)
+def one_episode(scene: Scene, number: int, picture: Pictures, *, cluttered: bool = False) -> dict[str, Any]:
+    generator, observation = begin(scene, (2 if cluttered else 1) * 10**6 + number, cluttered=cluttered)
     policy = HeuristicPushingPolicy(generator.spawn(1)[0])
 
-    def later(seen: Observation) -> Iterator[View]:
+    def later(observation: Observation) -> Iterator[View]:
         for _ in range(PUSHES):
-            fallen = scene.push(policy.act(seen)).fallen
-            seen = scene.observe()
-            yield look(scene)
+            fallen = scene.push(policy.act(observation)).fallen
+            observation = scene.observe()
+            yield capture(scene)
             if fallen:
                 return
 
-    view = look(scene)
-    name = f"{'crowd' if crowded else 'episode'} {number}"
-    return judge_episode(view, scene.point_at_target(view[0]), later(seen), name, picture)
+    view = capture(scene)
+    name = f"{'clutter' if cluttered else 'episode'} {number}"
+    return judge_episode(view, scene.point_at_target(view[0]), later(observation), name, picture)
 
 
 def judge_episode(
@@ -176,7 +178,7 @@ class Watched:
     def follow(self, image: DepthImage) -> list[Pixels]:
         found = self.segmenter.follow(image)
         self.images += 1
-        truth = [mask & (image.depth > 0.0) for mask in self.scene.truth()]
+        truth = [mask & (image.depth > 0.0) for mask in self.scene.true_masks()]
         # The scene numbers its bodies as the first image did, so every place has its own number.
         if self.kept and any(name not in (None, place) for place, name in enumerate(owners(found, truth))):
             self.kept = False
@@ -192,14 +194,14 @@ def task_setup(task: str, objects: int) -> Setup:
 
 def one_task(_: Scene, number: int, picture: Pictures) -> dict[str, Any]:
     """Tasks and numbers of objects take turns."""
-    task, objects = TASK_NAMES[number % 3], (3, 5)[number // 3 % 2]
+    task, objects = TASKS[number % 3], (3, 5)[number // 3 % 2]
     one = task_setup(task, objects)
     scene = one.env.scene
     if not isinstance(scene.segmenter, Watched):
         scene.segmenter = Watched(scene.segmenter, scene, picture)
     watched = scene.segmenter
     watched.name = f"{task} {number}"
-    outcome = one.run_episode(number).outcome
+    outcome = one.rollout(number).outcome
     return {"task": task, "objects": objects, "kept": watched.kept, "images": watched.images, "outcome": outcome}
 
 
@@ -218,7 +220,7 @@ def report(lines: list[dict[str, Any]]) -> None:
             f"centre error: median {np.median(errors):.2f} mm [{interval.low:.2f}, {interval.high:.2f}], at most {tail}"
         )
         print(f"CPU time: {1e3 * np.median([line['seconds'] for line in scenes]):.1f} ms for a first image")
-    for kind, where in (("episode", "anywhere"), ("crowd", "crowded")):
+    for kind, where in (("episode", "anywhere"), ("clutter", "in clutter")):
         some = [line for line in lines if line["kind"] == kind]
         begun = [line for line in some if line["begun"]]
         if not begun:

@@ -17,11 +17,11 @@ import torch
 from pyro.infer import Trace_ELBO
 from torch import Tensor, nn
 
-from cavin_pyro.objectives import Objective
-from cavin_pyro.training import unchecked_programs
+from cavin_pyro.training.objectives import Objective
+from cavin_pyro.training.trainer import unchecked_programs
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
-from models.layers import SCALE_FLOOR
+from models.networks.layers import SCALE_FLOOR
 from models.state import State, Window
 
 PAIRS = 60  # of steps per batch size
@@ -81,7 +81,7 @@ def moments(network: nn.Module, arguments: tuple) -> tuple[Tensor, Tensor]:
 
 
 def kl(mean: Tensor, scale: Tensor, value: Tensor) -> Tensor:
-    """log q - log p at a drawn code: [B]."""
+    """log q - log p at a sampled code: [B]."""
     return (0.5 * value.square() - 0.5 * ((value - mean) / scale).square() - scale.log()).sum(-1)
 
 
@@ -114,7 +114,7 @@ def seconds(step: Callable[[], None]) -> float:
 def main() -> None:
     torch.set_num_threads(1)
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
-    for count in [int(word) for word in sys.argv[1:]] or [64, 256, 512]:
+    for count in [int(argument) for argument in sys.argv[1:]] or [64, 256, 512]:
         torch.manual_seed(0)
         model = CascadedModel()
         guide, window = CascadedGuide(model), random_windows(count)

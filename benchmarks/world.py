@@ -1,6 +1,6 @@
 """Does the world last? `python benchmarks/world.py --resets 20000 --pushes 100000 --log runs/world.jsonl`
 
-Resets scenes of all tasks and pushes in them, some of the pushes meant to do harm, in one process. Prints the rates,
+Resets scenes of all tasks and pushes in them, some of them adversarial, in one process. Prints the rates,
 resident memory over time and its slope, objects that went through the table, the fastest that anything moved, and
 what became of every kind of action. Exit status 1 where something crashed, hung, fell through or jumped.
 
@@ -25,18 +25,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavin_pyro.progress import progress_bar
-from envs.layouts import TASK_NAMES
-from envs.objects import ObjectRanges
+from cavin_pyro.storage.progress import progress_bar
+from envs.objects.sampling import ObjectRanges
 from envs.observation import Observation
 from envs.physics import TIME_STEP
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import ObservationDict, PushingEnv
 from envs.robots import ROBOTS
 from envs.scene import FALLEN, Scene
+from envs.tasks import TASKS
 from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, normalised_push
 
-EPISODE = 20  # pushes after which a scene is drawn anew, if it has not ended before
+EPISODE = 20  # pushes after which a new scene is sampled, if it has not ended before
 EVERY = 5  # physics steps between two looks at the objects
 SPEED = 2.0  # metres per second, sideways or upwards; the tool goes at most 0.7
 FALLING = 4.0  # metres per second, downwards; where objects lie close, one of five may be dropped from 0.7 m (3.7 m/s)
@@ -85,10 +85,10 @@ class Watch:
         self._before = now
 
 
-def harm(kind: str, seen: ObservationDict, generator: np.random.Generator) -> Push:
-    """A push that means harm [4]; `seen` holds at least one object."""
-    real = np.flatnonzero(seen["mask"])
-    center = seen["centers"][generator.choice(real), :2].astype(np.float64)
+def adversarial_push(kind: str, observation: ObservationDict, generator: np.random.Generator) -> Push:
+    """An adversarial push [4]; `observation` holds at least one object."""
+    real = np.flatnonzero(observation["mask"])
+    center = observation["centers"][generator.choice(real), :2].astype(np.float64)
     angle = generator.uniform(-np.pi, np.pi)
     direction = np.array([np.cos(angle), np.sin(angle)])
     anything = generator.uniform(-1.0, 1.0, size=4)
@@ -99,7 +99,7 @@ def harm(kind: str, seen: ObservationDict, generator: np.random.Generator) -> Pu
     elif kind == "onto an object":
         anything = normalised_push(center, 0.1 * direction)
     elif kind == "into the pile":
-        middle = seen["centers"][real, :2].mean(axis=0)
+        middle = observation["centers"][real, :2].mean(axis=0)
         toward = (middle - center) / max(float(np.linalg.norm(middle - center)), 1e-6)
         anything = normalised_push(center - 0.08 * toward, 0.141 * toward)
     elif kind == "off the table":
@@ -113,19 +113,19 @@ KINDS = ("NaN", "infinite", "out of range", "onto an object", "into the pile", "
 
 
 class World:
-    """The environments that are reset and pushed in, one per task, and what was seen in them."""
+    """The environments that are reset and pushed in, one per task, and their watches."""
 
     def __init__(self, robot: str, assets: Path | None) -> None:
-        words: dict[str, Any] = {"layout": "random", "ranges": ObjectRanges(clearance=0.1), "robot": robot}
-        self.envs = [PushingEnv(task=task, assets=assets, **words) for task in TASK_NAMES]
+        arguments: dict[str, Any] = {"layout": "random", "ranges": ObjectRanges(clearance=0.1), "robot": robot}
+        self.envs = [PushingEnv(task=task, assets=assets, **arguments) for task in TASKS]
         self.watches = [Watch(env.scene) for env in self.envs]
 
     def reset(self, number: int) -> tuple[PushingEnv, ObservationDict]:
         """Scene `number`: tasks and 1 to 5 objects take turns."""
         env = self.envs[number % len(self.envs)]
         env.objects = 1 + number // len(self.envs) % MAXIMUM_OBJECTS
-        seen, _ = env.reset(seed=number)
-        return env, seen
+        observation, _ = env.reset(seed=number)
+        return env, observation
 
     def report(self) -> dict[str, float]:
         """The worst since the last report."""
@@ -155,17 +155,21 @@ def push_some(world: World, first: int, count: int, advance: Callable[[], Any], 
     made, number = 0, 10**6 + first
     while made < count:
         signal.setitimer(signal.ITIMER_PROF, PATIENCE)
-        env, seen = world.reset(number)
+        env, observation = world.reset(number)
         generator = np.random.default_rng([number, 2])
         policy = HeuristicPushingPolicy(generator)
         for _ in range(min(EPISODE, count - made)):
             signal.setitimer(signal.ITIMER_PROF, PATIENCE)
             kind = str(generator.choice(KINDS)) if generator.random() < share else "heuristic"
-            action = harm(kind, seen, generator) if kind in KINDS else policy.act(_observation(seen)).astype(np.float32)
+            action = (
+                adversarial_push(kind, observation, generator)
+                if kind in KINDS
+                else policy.act(_observation(observation)).astype(np.float32)
+            )
             before, made, terminated = env.scene.ground_truth().positions, made + 1, False
             advance()
             try:
-                seen, _, terminated, _, info = env.step(action)
+                observation, _, terminated, _, info = env.step(action)
             except ValueError:  # what is not finite is refused, and nothing else
                 still = np.array_equal(before, env.scene.ground_truth().positions)
                 ends[f"{kind}: {'refused' if still and kind in ('NaN', 'infinite') else 'WRONG'}"] += 1
@@ -180,8 +184,13 @@ def push_some(world: World, first: int, count: int, advance: Callable[[], Any], 
     return ends
 
 
-def _observation(seen: ObservationDict) -> Observation:
-    return Observation(seen["clouds"], seen["centers"], seen["mask"].astype(bool), seen["visible"].astype(bool))
+def _observation(observation: ObservationDict) -> Observation:
+    return Observation(
+        observation["clouds"],
+        observation["centers"],
+        observation["mask"].astype(bool),
+        observation["visible"].astype(bool),
+    )
 
 
 def resident() -> float:
@@ -262,24 +271,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--resets", type=int, default=1000)
     parser.add_argument("--pushes", type=int, default=1000)
-    parser.add_argument("--adversarial", type=float, default=0.25, help="share of the pushes that mean harm")
+    parser.add_argument("--adversarial", type=float, default=0.25, help="share of adversarial pushes")
     parser.add_argument("--robot", default="stick", choices=list(ROBOTS))
     parser.add_argument("--assets", type=Path, help="folder of the files that some robots need")
     parser.add_argument("--chunk", type=int, default=500, help="resets or pushes per line of the log")
     parser.add_argument("--log", type=Path, help="by default runs/world-ROBOT.jsonl")
-    words = parser.parse_args()
-    words.log = words.log or Path("runs", f"world-{words.robot}.jsonl")
-    words.log.parent.mkdir(parents=True, exist_ok=True)
-    text = words.log.read_text(encoding="utf-8") if words.log.exists() else ""
+    arguments = parser.parse_args()
+    arguments.log = arguments.log or Path("runs", f"world-{arguments.robot}.jsonl")
+    arguments.log.parent.mkdir(parents=True, exist_ok=True)
+    text = arguments.log.read_text(encoding="utf-8") if arguments.log.exists() else ""
     lines = [json.loads(line) for line in text.splitlines()]
     signal.signal(signal.SIGPROF, _hung)
-    world = partial(World, words.robot, words.assets)
-    run("resets", reset_some, words.resets, words.log, lines, world, words.chunk)
+    world = partial(World, arguments.robot, arguments.assets)
+    run("resets", reset_some, arguments.resets, arguments.log, lines, world, arguments.chunk)
 
-    def push(*arguments: Any) -> Counter[str]:
-        return push_some(*arguments, share=words.adversarial)
+    def push(*given: Any) -> Counter[str]:
+        return push_some(*given, share=arguments.adversarial)
 
-    run("pushes", push, words.pushes, words.log, lines, world, words.chunk)
+    run("pushes", push, arguments.pushes, arguments.log, lines, world, arguments.chunk)
     well = [summary(phase, lines) for phase in ("resets", "pushes")]
     sys.exit(0 if all(well) else 1)
 

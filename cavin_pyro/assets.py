@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import NoReturn
 
-from cavin_pyro.command import guarded
+from cavin_pyro.config.application import guarded
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        from cavin_pyro.errors import UserError
+        from cavin_pyro.config.errors import UserError
 
         raise UserError(f"{message}; {' '.join(self.format_usage().split())}")
 

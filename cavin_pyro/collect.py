@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from omegaconf import DictConfig
 
-from cavin_pyro.command import command
+from cavin_pyro.config.application import command
 
 
 @command("collect")
@@ -15,38 +15,29 @@ def main(config: DictConfig) -> None:
 
     Resumes what was interrupted.
     """
-    from cavin_pyro.collection import collect, repair
-    from cavin_pyro.data_summary import summarise_data
-    from cavin_pyro.errors import UserError, at_least, check_seed, fraction
-    from cavin_pyro.figures_data import draw_data
-    from cavin_pyro.files import output_folder, write_json
-    from cavin_pyro.worlds import collecting_world
+    from cavin_pyro.config.commands.collection import CollectionOptions
+    from cavin_pyro.config.errors import UserError
+    from cavin_pyro.data.collection import collect, repair
+    from cavin_pyro.data.summary import summarize_data
+    from cavin_pyro.data.world import collecting_world
+    from cavin_pyro.storage.files import output_folder, write_json
+    from cavin_pyro.visualization.data_summary import draw_data
     from envs.workspace import MAXIMUM_OBJECTS
 
-    for name in ("transitions", "workers", "steps", "hold", "minimum_objects", "episodes_per_shard"):
-        at_least(name, config[name], 1)
-    check_seed(config.seed)
     if not config.minimum_objects <= config.maximum_objects <= MAXIMUM_OBJECTS:
         raise UserError(
             f"maximum_objects must be between minimum_objects={config.minimum_objects} and {MAXIMUM_OBJECTS}, "
             f"not {config.maximum_objects}"
         )
-    fraction("perturbed", config.perturbed)
     settings = replace(
         collecting_world(config.env),
-        seed=config.seed,
-        steps=config.steps,
-        hold=config.hold,
-        perturbed=config.perturbed,
-        minimum_objects=config.minimum_objects,
-        maximum_objects=config.maximum_objects,
-        episodes_per_shard=config.episodes_per_shard,
+        **{one.name: config[one.name] for one in fields(CollectionOptions)},
     )
     folder = output_folder(config.output)
     if config.repair:
         print(f"{repair(settings, folder)} files collected again")
     metadata = collect(settings, folder, transitions=config.transitions, workers=config.workers)
-    summary = summarise_data(folder)
+    summary = summarize_data(folder)
     write_json(folder / "statistics.json", summary.figures())
     draw_data(folder / "statistics.png", summary)
     print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")

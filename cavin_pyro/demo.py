@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from cavin_pyro.command import command
+from cavin_pyro.config.application import command
 
 
 @command("demo")
@@ -12,10 +12,10 @@ def main(config: DictConfig) -> None:
     """Plan and execute an episode of each task with the shipped checkpoint, from depth images alone."""
     import copy
 
-    from cavin_pyro.files import output_folder
-    from cavin_pyro.runs import write_config
-    from cavin_pyro.setups import set_up
-    from cavin_pyro.showing import show_episode
+    from cavin_pyro.evaluation.factory import set_up
+    from cavin_pyro.storage.files import output_folder
+    from cavin_pyro.storage.run_directory import write_config
+    from cavin_pyro.visualization.rendering import render_episode
 
     for task in config.tasks:
         words = copy.deepcopy(config)
@@ -23,7 +23,7 @@ def main(config: DictConfig) -> None:
         setup = set_up(copy.deepcopy(words), render=True)
         folder = output_folder(f"{config.output}/{task}")
         write_config(folder, words)
-        row = show_episode(setup, folder, seed=config.seed, video=True)
+        row = render_episode(setup, folder, seed=config.seed, video=True)
         setup.env.close()
         print(f"{task}: {row['outcome']} after {row['steps']} pushes")
         for what, name in (("picture", "plan.png"), ("from above", "plan-above.png"), ("video", "episode.mp4")):

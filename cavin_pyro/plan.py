@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from cavin_pyro.command import command
+from cavin_pyro.config.application import command
 
 
 @command("plan")
@@ -13,23 +13,22 @@ def main(config: DictConfig) -> None:
     import copy
     from pathlib import Path
 
-    from cavin_pyro.files import output_folder, write_json
-    from cavin_pyro.provenance import provenance
-    from cavin_pyro.runs import check_same_run, write_config
-    from cavin_pyro.setups import set_up, tell_of_compiling
-    from cavin_pyro.showing import episode_files, show_episode
-    from cavin_pyro.viewers import check_viewer
+    from cavin_pyro.evaluation.factory import announce_waiting, set_up
+    from cavin_pyro.storage.files import output_folder, write_json
+    from cavin_pyro.storage.provenance import provenance
+    from cavin_pyro.storage.run_directory import check_same_run, write_config
+    from cavin_pyro.visualization.rendering import check_viewer, episode_files, render_episode
 
     check_viewer(config.viewer)
     check_same_run(Path(config.output), config, ignore=("output", "video", "viewer"))
     setup = set_up(copy.deepcopy(config), render=True)
     folder = output_folder(config.output)
     write_config(folder, config)
-    tell_of_compiling(config)
-    row = show_episode(setup, folder, seed=config.seed, video=config.video, viewer=config.viewer)
+    announce_waiting(config)
+    row = render_episode(setup, folder, seed=config.seed, video=config.video, viewer=config.viewer)
     setup.env.close()
     write_json(folder / "results.json", {**row, "provenance": provenance()})
-    print(f"{config.task}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
+    print(f"{setup.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
     for name in episode_files(video=config.video, viewer=config.viewer):
         print(f"  {folder / name}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from cavin_pyro.command import command
+from cavin_pyro.config.application import command
 
 
 @command("pretrain")
@@ -13,30 +13,24 @@ def main(config: DictConfig) -> None:
     import numpy as np
     import torch
 
-    from cavin_pyro.building import check_sizes, construct
-    from cavin_pyro.checkpoint import save_checkpoint
-    from cavin_pyro.errors import UserError, at_least, check_seed
-    from cavin_pyro.features import sample_clouds
-    from cavin_pyro.figures import draw_reconstructions
-    from cavin_pyro.files import output_folder, write_json
-    from cavin_pyro.pretraining import pretrain
-    from cavin_pyro.provenance import provenance
-    from cavin_pyro.runs import write_config
-    from cavin_pyro.settings import data_folders
+    from cavin_pyro.config.parts import check_sizes, construct
+    from cavin_pyro.data.features import sample_clouds
+    from cavin_pyro.storage.checkpoint import save_checkpoint
+    from cavin_pyro.storage.files import output_folder, write_json
+    from cavin_pyro.storage.provenance import provenance
+    from cavin_pyro.storage.run_directory import write_config
+    from cavin_pyro.training.factory import data_folders
+    from cavin_pyro.training.pretraining import pretrain
+    from cavin_pyro.visualization.training import draw_reconstructions
 
-    for name, minimum in (("clouds", 2), ("steps", 1), ("batch_size", 1)):
-        at_least(name, config[name], minimum)
-    if not config.learning_rate > 0:
-        raise UserError(f"learning_rate must be a positive number, not {config.learning_rate}")
-    check_seed(config.seed)
     check_sizes("autoencoder", config.autoencoder)
     torch.manual_seed(config.seed)
     autoencoder = construct(config.autoencoder)
     clouds = sample_clouds(
-        data_folders(config),
+        data_folders(config.data),
         count=config.clouds,
         generator=np.random.default_rng(config.seed),
-        without=config.without,
+        held_out_objects=config.held_out_objects,
     )
     folder = output_folder(config.output)
     settings = write_config(folder, config)

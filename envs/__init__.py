@@ -1,10 +1,11 @@
-"""What is real: the table, the objects on it, the robot that pushes, the camera above, the three tasks."""
+"""What is real: the table, the objects on it, the robot that pushes, the camera above, the tasks."""
 
 import gymnasium
 
-for _task in ("clearing", "insertion", "crossing"):
+from envs.tasks import TASKS
+
+for _name in TASKS:
     gymnasium.register(
-        id=f"cavin/{_task.capitalize()}-v0",
-        entry_point="envs.pushing:PushingEnv",
-        kwargs={"task": _task},
+        id=f"cavin/{_name.capitalize()}-v0", entry_point="envs.pushing:PushingEnv", kwargs={"task": _name}
     )
+gymnasium.register(id="cavin/Pushing-v0", entry_point="envs.pushing:PushingEnv")  # task= as PushingEnv takes it

@@ -1,4 +1,4 @@
-"""What the bodies of a scene look like, as triangles, for those who draw the world in 3D."""
+"""What the bodies of a scene look like, as triangles, for 3D viewers."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ FRAME_STEPS = 10  # physics steps between two frames of a film
 TRAVEL_FRAME_STEPS = 40  # the same while the tool is in the air; an arm travels four fifths of the time
 
 FrameHook = Callable[[], None]
-"""Called a few times during a push, for whoever films it."""
+"""Called a few times during a push, to film it."""
 
 
 def film(robot: Robot, on_frame: FrameHook) -> Callable[[], None]:

@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.layouts import Layout, Tile
-from envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE
+from envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE, Tile
 
-GOAL_COLOR = "#F2C200"  # gold
 LEVEL = 0.002  # metres; the table's top is what lies at most this far from z = 0
 BORDER = 0.003  # metres on either side of a tile's edge that are painted opaque
 
@@ -27,22 +25,6 @@ class TileGroup(NamedTuple):
     color: str
     opacity: float
     tiles: tuple[Tile, ...]
-
-
-_REGIONS = {  # what `Layout.region` means to each task, in the paper's colours, as the colour-blind tell them apart
-    "clearing": ("to clear", "#0072B2", 0.35),
-    "insertion": ("keep out", "#C2272D", 0.40),
-    "crossing": ("bridge", "#5A5A5A", 0.35),
-}
-
-
-def tile_groups(layout: Layout) -> list[TileGroup]:
-    """The task's region, and the goal where there is one; later ones lie on top of earlier ones."""
-    groups = [
-        TileGroup(*_REGIONS[layout.task], layout.region),
-        TileGroup("goal", GOAL_COLOR, 0.70, layout.goal),
-    ]
-    return [group for group in groups if group.tiles]
 
 
 def paint_tiles(

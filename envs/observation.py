@@ -1,4 +1,4 @@
-"""From an image's segmented pixels to what a program knows of the table: one cloud of points per object."""
+"""From an image's segmented pixels to an observation: one point cloud per object."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera import sample_cloud
 from envs.segmentation import Pixels
 from envs.sensors import DepthImage
+from envs.sensors.camera import sample_cloud
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
 MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
@@ -18,12 +18,12 @@ MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
 
 @dataclass(frozen=True)
 class Observation:
-    """What the camera tells of the table, padded to `MAXIMUM_OBJECTS` (M) objects.
+    """An observation of the table, padded to `MAXIMUM_OBJECTS` (M) objects.
 
     Attributes:
         clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of each cloud.
-        mask: [M] bool, True for objects seen at least once.
-        visible: [M] bool, True for objects in this image; an object hidden in it keeps the cloud last seen.
+        mask: [M] bool, True for objects observed at least once.
+        visible: [M] bool, True for objects in this image; a hidden object keeps its latest cloud.
     """
 
     clouds: NDArray[np.float32]
@@ -32,11 +32,11 @@ class Observation:
     visible: NDArray[np.bool_]
 
 
-class LastSeen:
-    """An episode's objects as the camera saw them last.
+class LatestClouds:
+    """The latest point cloud of each of an episode's objects.
 
     Args:
-        generator: draws each cloud's points from its pixels.
+        generator: samples each cloud's points from its pixels.
     """
 
     def __init__(self, generator: np.random.Generator) -> None:
@@ -45,7 +45,7 @@ class LastSeen:
         self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
 
     def update(self, image: DepthImage, found: Sequence[Pixels]) -> Observation:
-        """Take in one more image and the pixels that each object has in it; the first is the target."""
+        """Update with an image and the pixels that each object has in it; the first object is the target."""
         visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
         for slot, (rows, columns) in enumerate(found):
             if len(rows) >= MINIMUM_PIXELS:

@@ -15,7 +15,7 @@ from envs.observation import Observation
 from envs.robots import STICK_RADIUS
 from envs.workspace import normalised_push, push_endpoints
 
-CANDIDATES = 2048  # pushes drawn at once
+CANDIDATES = 2048  # pushes sampled at once
 SPREAD = np.radians(45.0)  # radians; how far a push may turn from the base angle, either way
 NOISE = 0.3  # on each normalised motion component
 START_CLEARANCE = 0.05  # metres from every object's centre to a push's start
@@ -25,12 +25,12 @@ CENTRAL_FRACTION = 0.7  # of pushes aim at the middle of the target; the others 
 CENTRAL = 0.03  # metres between a push's path and the target's centre that count as aiming at its middle
 COMPARED = 8  # passing pushes, at most, of which the one is made that goes farthest after it meets the target
 PERTURBATION = 0.04  # metres; standard deviation, on each axis, of how far a perturbed push's start is moved
-REDRAWS = 20  # targets and angles tried before a uniformly random push is made instead
+PROPOSALS = 20  # targets and angles tried before a uniformly random push is made instead
 
 
 @dataclass
 class Intent:
-    """What a run of pushes holds on to, so that they add up to one effect.
+    """What a series of pushes shares, so that they add up to one effect.
 
     target: number of the object, -1 for a push at random that has none. angle: radians.
     """
@@ -40,37 +40,40 @@ class Intent:
 
 
 class HeuristicPushingPolicy:
-    """Pushes one object in about one direction for `hold` pushes, then chooses another object and direction.
+    """Pushes one object in about one direction for `intent_length` pushes, then chooses another object and direction.
 
     Args:
-        generator: all of the policy's randomness. hold: pushes that share a target and a base angle.
-        perturbed: share of the pushes whose start is moved at random, so that many of them come down on an
-            object, graze one or miss. A planner picks among thousands of pushes those of which the dynamics
-            model promises most; unless the model has seen such pushes fail, it will promise too much of them.
+        generator: all of the policy's randomness. intent_length: pushes that share a target and a base angle.
+        perturbation_rate: fraction of pushes whose start is moved at random, so that many of them come down on an
+            object, graze one or miss. A planner picks, among thousands of pushes, those with the best prediction;
+            a dynamics model that has never been trained on failing pushes predicts too much of them.
     """
 
-    def __init__(self, generator: np.random.Generator, *, hold: int = 5, perturbed: float = 0.0) -> None:
-        self._generator, self._hold, self._perturbed = generator, hold, perturbed
+    def __init__(
+        self, generator: np.random.Generator, *, intent_length: int = 5, perturbation_rate: float = 0.0
+    ) -> None:
+        self._generator = generator
+        self._intent_length, self._perturbation_rate = intent_length, perturbation_rate
         self._left = 0
         self.intent = Intent(0, 0.0)
 
     def act(self, observation: Observation) -> NDArray[np.float64]:
-        """Choose the next normalised push [4] from what the camera sees."""
+        """Choose the next normalised push [4] from an observation."""
         if self._left == 0:
             self._new_intent(observation)
-        for _ in range(REDRAWS):
+        for _ in range(PROPOSALS):
             action = self._propose(observation)
             if action is not None:
                 self._left -= 1
-                return self._perturb(action) if self._perturbed > 0.0 else action
+                return self._perturb(action) if self._perturbation_rate > 0.0 else action
             self._new_intent(observation)
         action = self._generator.uniform(-1.0, 1.0, size=4)
         self.intent, self._left = Intent(-1, float(np.arctan2(action[3], action[2]))), 0
         return action
 
     def _perturb(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The action, or with probability `perturbed` the same motion from another start."""
-        if self._generator.random() >= self._perturbed:
+        """The action, or with probability `perturbation_rate` the same motion from another start."""
+        if self._generator.random() >= self._perturbation_rate:
             return action
         start, _ = push_endpoints(action)
         moved = start + self._generator.normal(scale=PERTURBATION, size=2)
@@ -80,7 +83,7 @@ class HeuristicPushingPolicy:
     def _new_intent(self, observation: Observation) -> None:
         target = int(self._generator.choice(np.flatnonzero(observation.mask)))
         self.intent = Intent(target, float(self._generator.uniform(-np.pi, np.pi)))
-        self._left = self._hold
+        self._left = self._intent_length
 
     def _propose(self, observation: Observation) -> NDArray[np.float64] | None:
         generator, target = self._generator, self.intent.target
@@ -101,7 +104,7 @@ class HeuristicPushingPolicy:
         close = clear & (_distance_to_path(center, start, end) <= (CENTRAL if central else extent + reach))
         scene = observation.clouds[observation.mask][:, ::4, :2].reshape(-1, 2)
         wanted, travels = int(generator.integers(1, COMPARED + 1)), {}
-        for candidate in np.flatnonzero(close):  # in the order drawn: the first that pass are fair draws
+        for candidate in np.flatnonzero(close):  # in the order sampled: the first that pass are fair samples
             path = start[None, candidate], end[None, candidate]
             touches = _distance_to_path(cloud[:, None], *path).min() <= reach
             safe = np.linalg.norm(scene - start[candidate], axis=-1).min() >= STICK_RADIUS + CLOUD_CLEARANCE

@@ -1,7 +1,7 @@
 """Where every random number of an episode comes from: streams with a purpose, all derived from one seed.
 
 A stream is a `numpy.random.Generator` known by its entropy and its spawn key (numpy's `SeedSequence`). Streams of
-different keys are independent, so that drawing more or fewer numbers for one purpose changes no other purpose:
+different keys are independent, so that sampling more or fewer numbers for one purpose changes no other purpose:
 planners and policies are compared on the very same scenes.
 
 | purpose | of what | entropy | spawn key |
@@ -10,14 +10,14 @@ planners and policies are compared on the very same scenes.
 | layout | of that reset, where the layout is random | `seed` | `(k, LAYOUT)` |
 | scene | one collected episode: how many objects, and where | `[seed, episode]` | `(0,)` |
 | policy | of that episode: the heuristic's pushes | `[seed, episode]` | `(1,)` |
-| objects | the a-th scene drawn until one is acceptable: shapes, masses, poses | as its scene | `(*scene, 2 a)` |
+| objects | the a-th scene sampled until one is acceptable: shapes, masses, poses | as its scene | `(*scene, 2 a)` |
 | points | of that scene: which pixels make a cloud, over the whole episode | as its scene | `(*scene, 2 a + 1)` |
 | sensor | of that scene: the camera's pose and noise | as its scene | `(*points, SENSOR)` |
 | planner | one episode: one word of it seeds torch's generator | `[seed, 1]` | none |
 
 `LAYOUT` and `SENSOR` are larger than any number that `Generator.spawn` counts to, so that asking for them changes
-neither the streams that are spawned nor their order. The table is a promise: published success rates and the
-collected data hang on it, so that purposes may be added, but none may be derived in another way.
+neither the streams that are spawned nor their order. Published success rates and collected data depend on this table:
+purposes may be added, but none may be derived in another way.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def layout_stream(scene: np.random.Generator) -> np.random.Generator:
     return named_stream(scene, LAYOUT)
 
 
-def next_draw_streams(scene: np.random.Generator) -> tuple[np.random.Generator, np.random.Generator]:
-    """Streams of the objects and of the points for the next draw of a scene."""
+def next_sample_streams(scene: np.random.Generator) -> tuple[np.random.Generator, np.random.Generator]:
+    """Streams of the objects and of the points for the next sample of a scene."""
     objects, points = scene.spawn(2)
     return objects, points
 

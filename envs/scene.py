@@ -1,4 +1,4 @@
-"""A table with objects, a robot that pushes them and a camera that looks: the world without any task.
+"""A table with objects, a robot that pushes them and a camera above: the world without any task.
 
 Data flows one way: poses in the simulator, a depth image, segmented points, an `Observation`.
 """
@@ -15,23 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.camera import Camera
 from envs.filming import FrameHook, film
 from envs.markings import LEVEL, TileGroup, paint_tiles
-from envs.object_sets import BuiltinObjects, ObjectSet
-from envs.objects import Area, ObjectParameters, ObjectRanges, draw_objects
-from envs.observation import MINIMUM_PIXELS, LastSeen, Observation
+from envs.objects.object_sets import BuiltinObjects, ObjectSet
+from envs.objects.sampling import Area, ObjectParameters, ObjectRanges, sample_objects
+from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from envs.physics import PhysicsWorld, Poses
-from envs.randomness import next_draw_streams, sensor_stream
+from envs.randomness import next_sample_streams, sensor_stream
 from envs.robots import Stopped, push, robot_maker, settle
 from envs.segmentation import Pixels, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
+from envs.sensors.camera import Camera
 from envs.workspace import MAXIMUM_OBJECTS, push_endpoints
 
 MOVED = 0.005  # metres; less motion than this counts as none
 TURNED = 0.1  # radians
 FALLEN = -0.02  # metres; an object whose centre is lower has left the table
-DRAWS = 50  # scenes drawn before giving up on an acceptable one
+SCENE_SAMPLES = 50  # scenes sampled, at most, to find an acceptable one
 
 # The target is orange; obstacles are cool colours.
 COLORS = ((0.93, 0.42, 0.10), *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in (0.58, 0.45, 0.72, 0.33)))
@@ -55,13 +55,13 @@ class PushReport:
 
 
 class Scene:
-    """One world in which scenes are drawn, pushed and looked at.
+    """One simulated world: sample scenes in it, push, and observe.
 
     Args:
         camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
         segmentation: a name in `envs.segmentation.SEGMENTERS`.
         object_set: what the objects' names mean, the builtin shapes by default.
-        on_frame: called a few times during every push, for whoever films it.
+        on_frame: called a few times during every push, to film it.
         robot: what pushes, one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
 
     Raises:
@@ -79,7 +79,7 @@ class Scene:
         assets: str | Path | None = None,
     ) -> None:
         self.sensor = sensor_of(camera)
-        self.segmenter = segmenter_of(segmentation, self.truth)
+        self.segmenter = segmenter_of(segmentation, self.true_masks)
         self.object_set = object_set or BuiltinObjects()
         self._make_robot = robot_maker(robot, assets)
         self.on_frame = on_frame
@@ -99,7 +99,7 @@ class Scene:
         """Free the simulator. Closing twice is harmless."""
         self.world.close()
 
-    def draw(
+    def sample(
         self,
         areas: Sequence[Area],
         ranges: ObjectRanges,
@@ -107,7 +107,7 @@ class Scene:
         *,
         acceptable: Callable[[Observation], bool] = lambda observation: True,
     ) -> Observation:
-        """Draw scenes until one settles with every object on the table, in view and acceptable.
+        """Sample scenes until one settles with every object on the table, in view and acceptable.
 
         Args:
             areas: where each object may start; the first is the target.
@@ -116,17 +116,17 @@ class Scene:
         Raises:
             ValueError: the areas hold no such scene.
         """
-        for _ in range(DRAWS):
-            scene_generator, point_generator = next_draw_streams(generator)
-            observation = self.reset(draw_objects(areas, ranges, scene_generator, self.object_set), point_generator)
+        for _ in range(SCENE_SAMPLES):
+            scene_generator, point_generator = next_sample_streams(generator)
+            observation = self.reset(sample_objects(areas, ranges, scene_generator, self.object_set), point_generator)
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
         raise ValueError(
-            f"no room for {len(areas)} objects: none of {DRAWS} scenes drawn on the layout's start tiles could be used"
+            f"no room for {len(areas)} objects: none of {SCENE_SAMPLES} scenes sampled on its start tiles is usable"
         )
 
     def reset(self, objects: Sequence[ObjectParameters], point_generator: np.random.Generator) -> Observation:
-        """Build a scene, let it settle, and look at it.
+        """Build a scene, let it settle, and observe it.
 
         Raises:
             ValueError: no object, or more than `MAXIMUM_OBJECTS`.
@@ -140,7 +140,7 @@ class Scene:
         self.robot = self._make_robot(self.world)
         settle(self.world, self.robot, self.bodies, limit=720)
         self.sensor.reset(sensor_stream(point_generator))
-        self._last_seen = LastSeen(point_generator)
+        self._latest_clouds = LatestClouds(point_generator)
         self.seconds["physics"] += time.process_time() - began
         return self._observe(first=True)
 
@@ -187,7 +187,7 @@ class Scene:
         began = time.process_time()
         if not self.robot.clear_of_view(self.camera):
             raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
-        image = self.look()
+        image = self.capture()
         rendered = time.process_time()
         if first:
             found = self.segmenter.start(image, self.point_at_target(image))
@@ -195,24 +195,24 @@ class Scene:
         else:
             found = self.segmenter.follow(image)
         segmented = time.process_time()
-        observation = self._last_seen.update(image, found)
+        observation = self._latest_clouds.update(image, found)
         self.seconds["rendering"] += rendered - began
         self.seconds["segmentation"] += segmented - rendered
         self.seconds["points"] += time.process_time() - segmented
         return observation
 
-    def look(self) -> DepthImage:
-        """Take a depth image, and leave the clouds of the last observation as they are; `truth` then tells of it."""
-        image, self._seen = self.sensor.look(self.world.render)
+    def capture(self) -> DepthImage:
+        """Take a depth image without updating the observation's clouds; `true_masks` then refers to this image."""
+        image, self._body_image = self.sensor.capture(self.world.render)
         return image
 
-    def truth(self) -> list[NDArray[np.bool_]]:
-        """The simulator's word on the latest image: the pixels [height, width] of each body. No robot has it."""
-        return [self._seen == body for body in self.bodies]
+    def true_masks(self) -> list[NDArray[np.bool_]]:
+        """Ground truth of the latest image: the pixels [height, width] of each body. No robot has it."""
+        return [self._body_image == body for body in self.bodies]
 
     def point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
-        """What a person does once, before an episode: point at the target in the image."""
-        rows, columns = np.nonzero(self.truth()[0] & (image.depth > 0.0))
+        """A pixel (row, column) on the target, as a person points it out before an episode; None if it is hidden."""
+        rows, columns = np.nonzero(self.true_masks()[0] & (image.depth > 0.0))
         if len(rows) < MINIMUM_PIXELS:
             return None
         # Of its pixels the one nearest to their middle, which need not lie on the object itself.
@@ -220,10 +220,10 @@ class Scene:
         return int(rows[nearest]), int(columns[nearest])
 
     def _put_in_order(self, found: list[Pixels]) -> None:
-        """Number the bodies as the segmentation numbers what it found: bookkeeping for reports, which tell of both."""
+        """Number the bodies as the segmentation numbers its objects, so that reports can refer to both."""
         named: list[int] = []
         for pixels in found[: len(self.bodies)]:
-            counts = np.bincount(self._seen[pixels] + 1, minlength=1)
+            counts = np.bincount(self._body_image[pixels] + 1, minlength=1)
             body = int(counts.argmax()) - 1
             named.append(body if body in self.bodies and body not in named else -1)
         left = iter([body for body in self.bodies if body not in named])

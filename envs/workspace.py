@@ -22,6 +22,9 @@ TILE_SIDE = 0.15  # metres
 TILE_ORIGIN = (0.295, -0.485)  # metres; the centre of tile (0, 0)
 TILE_COUNT = (5, 7)  # whole tiles on the table along x and y
 
+Tile = tuple[int, int]
+"""A tile's numbers (i, j) along x and y."""
+
 MAXIMUM_OBJECTS = 5
 POINTS_PER_OBJECT = 256
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pyro
+from torch import Tensor
 
 from guides.guide import Guide
 from guides.networks import effect_inference, motion_inference
 from models.cascaded import CascadedModel
-from models.plate import counted_sequences, windows_plate
+from models.plate import sequence_mask, windows_plate
 from models.state import Window
 
 
@@ -29,12 +30,12 @@ class CascadedGuide(Guide):
         self.effect_inference = effect_inference(model, width=width)
         self.motion_inference = motion_inference(model, width=width, reads_effect=True)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
-        """`window: [B]`. Codes are inferred from the window, also where the model goes on to generate."""
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
+        """`window: [B]`. It infers the codes from the window, also where the model then generates."""
         first, last = window.first, window.last
-        encoded = self.model.encode(window, generate, for_guide=True)[:, 0]
+        encoded = self.model.encode(window, generate) if encoded is None else encoded
 
-        with windows_plate(window), counted_sequences(window):
+        with windows_plate(window), sequence_mask(window):
             effect_code = pyro.sample("effect_code", self.effect_inference(first, last))
-            motion = self.motion_inference(encoded, first.mask, window.actions, effect_code)
+            motion = self.motion_inference(encoded[:, 0], first.mask, window.actions, effect_code)
             pyro.sample("motion_code", motion)

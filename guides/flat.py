@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pyro
+from torch import Tensor
 
 from guides.guide import Guide
 from guides.networks import motion_inference
 from models.flat import FlatModel
-from models.plate import counted_sequences, windows_plate
+from models.plate import sequence_mask, windows_plate
 from models.state import Window
 
 
@@ -27,10 +28,10 @@ class FlatGuide(Guide):
         super().__init__(model)
         self.motion_inference = motion_inference(model, width=width, reads_effect=False)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
-        """`window: [B]`. The code is inferred from the window, also where the model goes on to generate."""
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
+        """`window: [B]`. It infers the code from the window, also where the model then generates."""
         first = window.first
-        encoded = self.model.encode(window, generate, for_guide=True)[:, 0]
+        encoded = self.model.encode(window, generate) if encoded is None else encoded
 
-        with windows_plate(window), counted_sequences(window):
-            pyro.sample("motion_code", self.motion_inference(encoded, first.mask, window.actions))
+        with windows_plate(window), sequence_mask(window):
+            pyro.sample("motion_code", self.motion_inference(encoded[:, 0], first.mask, window.actions))

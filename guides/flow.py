@@ -1,4 +1,4 @@
-"""The cascaded guide with normalising flows in the place of its Gaussians."""
+"""The cascaded guide with normalizing flows in the place of its Gaussians."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
-from models.flows import CodeFlow
+from models.networks.flows import CodeFlow
 
 
 class FlowCode(nn.Module):
@@ -26,21 +26,21 @@ class FlowCode(nn.Module):
 
 
 class FlowGuide(CascadedGuide):
-    """Infers the two codes of each window, the motion given the effect, without the assumption that they are Gaussian.
+    """Infers the two codes of each window, the motion given the effect, by posteriors that need not be Gaussian.
 
     c ~ flow over q_h(c | s, s')      # effect_code
     z ~ flow over q_g(z | s, a, c)    # motion_code
 
-    The flows begin as the identity: before training this is the guide that it extends.
+    The flows start as the identity, so before training this guide equals the one that it extends.
     """
 
     def __init__(self, model: CascadedModel, *, width: int = 64, flow_width: int = 32, transforms: int = 4) -> None:
-        """`flow_width` is that of the hidden layer in each of the `transforms` couplings of a flow.
+        """`flow_width` is the width of the hidden layer in each of the `transforms` couplings of a flow.
 
         Raises `ValueError` for a model that this guide does not fit.
         """
         super().__init__(model, width=width)
-        # Around the Gaussians that are there, so that equal seeds give both guides equal weights to begin with.
+        # Around the existing Gaussians, so that equal seeds give both guides equal initial weights.
         for inference, dimension in (
             (self.effect_inference, model.effect_dimension),
             (self.motion_inference, model.motion_dimension),

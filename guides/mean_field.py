@@ -1,18 +1,19 @@
-"""A guide for `models/cascaded.py` whose codes do not see one another: an ablation of the cascade."""
+"""A guide for `models/cascaded.py` whose codes are independent given the window: an ablation of the cascade."""
 
 from __future__ import annotations
 
 import pyro
+from torch import Tensor
 
 from guides.guide import Guide
 from guides.networks import effect_inference, motion_inference
 from models.cascaded import CascadedModel
-from models.plate import counted_sequences, windows_plate
+from models.plate import sequence_mask, windows_plate
 from models.state import Window
 
 
 class MeanFieldGuide(Guide):
-    """Infers the two codes of each window apart, the motion without the effect.
+    """Infers the two codes of each window independently, the motion without the effect.
 
     c ~ q_h(c | s, s')      # effect_code
     z ~ q(z | s, a)         # motion_code
@@ -29,11 +30,11 @@ class MeanFieldGuide(Guide):
         self.effect_inference = effect_inference(model, width=width)
         self.motion_inference = motion_inference(model, width=width, reads_effect=False)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
-        """`window: [B]`. Codes are inferred from the window, also where the model goes on to generate."""
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
+        """`window: [B]`. It infers the codes from the window, also where the model then generates."""
         first, last = window.first, window.last
-        encoded = self.model.encode(window, generate, for_guide=True)[:, 0]
+        encoded = self.model.encode(window, generate) if encoded is None else encoded
 
-        with windows_plate(window), counted_sequences(window):
+        with windows_plate(window), sequence_mask(window):
             pyro.sample("effect_code", self.effect_inference(first, last))
-            pyro.sample("motion_code", self.motion_inference(encoded, first.mask, window.actions))
+            pyro.sample("motion_code", self.motion_inference(encoded[:, 0], first.mask, window.actions))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from torch import Tensor
+
 from guides.guide import Guide
 from models.state import Window
 
 
 class NoGuide(Guide):
-    """Infers nothing: the model has no codes, and the bound on its evidence is the evidence."""
+    """Infers nothing: the model has no codes, and the bound equals the evidence."""
 
     fits = ("dynamics",)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """No site."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pyro
+from torch import Tensor
 
 from guides.guide import Guide
 from guides.networks import effect_inference
-from models.plate import counted_sequences, windows_plate
+from models.plate import sequence_mask, windows_plate
 from models.single_latent import SingleLatentModel
 from models.state import Window
 
@@ -16,8 +17,8 @@ class SingleLatentGuide(Guide):
 
     c ~ q_h(c | s, s')      # effect_code
 
-    As SeCTAR's encoder, which sees states only, and as the cascade's effect inference network, which has no
-    layer that this model would not use. With `reads_actions` it is q(c | s, s', a), since c decodes them too.
+    Like SeCTAR's encoder it reads states only, through the cascade's effect inference network. With `reads_actions` it
+    is q(c | s, s', a): c decodes the actions too.
     """
 
     fits = ("single_latent",)
@@ -30,7 +31,7 @@ class SingleLatentGuide(Guide):
         super().__init__(model)
         self.effect_inference = effect_inference(model, width=width, reads_actions=reads_actions)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
-        """`window: [B]`. The code is inferred from the window, also where the model goes on to generate."""
-        with windows_plate(window), counted_sequences(window):
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
+        """`window: [B]`. It infers the code from the window, also where the model then generates."""
+        with windows_plate(window), sequence_mask(window):
             pyro.sample("effect_code", self.effect_inference(window.first, window.last, window.actions))

@@ -6,13 +6,14 @@ from typing import Any
 
 import pyro
 from pyro.distributions import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 
-from models.action_generator import ActionGenerator
-from models.dynamics import MetaDynamics
 from models.model import Model
-from models.plate import counted_sequences, windows_plate
-from models.priors import StandardPrior
+from models.networks.action_generator import ActionGenerator
+from models.networks.dynamics import MetaDynamics
+from models.plate import sequence_mask, windows_plate
+from models.priors.prior import Prior
+from models.priors.standard import StandardPrior
 from models.state import State, Window
 from models.transitions import sample_subgoal
 
@@ -27,18 +28,19 @@ class CascadedModel(Model):
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
     The first four lines count where `sequence_mask` is set, pair t of the last where `transition_mask` is.
-    Objects count that are real in both states of a term. Padding is finite and otherwise ignored.
+    Objects count that are real in both states of a term. Padding must be finite and is otherwise ignored.
     """
 
     name = "cascaded"
+    codes = ("effect_code", "motion_code")
 
     def __init__(
         self,
         *,
         effect_dimension: int = 16,
         motion_dimension: int = 16,
-        effect_prior: nn.Module | None = None,
-        motion_prior: nn.Module | None = None,
+        effect_prior: Prior | None = None,
+        motion_prior: Prior | None = None,
         **shared: Any,
     ) -> None:
         """`shared` are the arguments of `Model`."""
@@ -54,26 +56,29 @@ class CascadedModel(Model):
         self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
         self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` only the first states are read; subgoals, actions and next states are drawn
-        instead of observed (next states push by push, see `models/transitions.py`).
+        With `generate=True` it reads the first states only; it samples subgoals, actions and next states instead of
+        observing them (next states push by push, see `models/transitions.py`). `encoded` is what `encode` returns.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
-        # Reading a network off the program may announce its parameters to Pyro: read each once.
-        meta_dynamics, scales = self.meta_dynamics, self.scales
-        encoded, first = self.encode(window, generate), window.first
+        encoded = self.encode(window, generate) if encoded is None else encoded
+        first = window.first
 
         with windows_plate(window):
-            with counted_sequences(window):
+            with sequence_mask(window):
                 effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
-                effect = meta_dynamics.effect(encoded[:, 0], effect_code)
-                sample_subgoal(scales, meta_dynamics(first, effect), window, generate)
+
+                effect = self.meta_dynamics.effect(encoded[:, 0], effect_code)
+                sample_subgoal(self.scales, self.meta_dynamics(first, effect), window, generate)
+
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first, effect_code))
+
                 mean = self.action_generator(effect, first.mask, motion_code)
                 observed = None if generate else window.actions
-                actions = pyro.sample("actions", scales.actions(mean), obs=observed)
+                actions = pyro.sample("actions", self.scales.actions(mean), obs=observed)
+
             self.sample_transitions(window, encoded, actions, generate)
 
     def effect_prior(self, state: State) -> TorchDistribution:
@@ -86,8 +91,7 @@ class CascadedModel(Model):
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
         """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T pushes ahead."""
-        meta_dynamics = self.meta_dynamics
-        return meta_dynamics(state, meta_dynamics.effect(self.encoder(state), effect_code))
+        return self.meta_dynamics(state, self.meta_dynamics.effect(self.encoder(state), effect_code))
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
         """Mean of g: `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]` -> `[..., T, 4]`."""

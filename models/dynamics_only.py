@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from torch import Tensor
+
 from models.model import Model
 from models.plate import windows_plate
 from models.state import Window
@@ -16,13 +18,15 @@ class DynamicsModel(Model):
     """
 
     name = "dynamics"
+    codes = ()
 
-    def forward(self, window: Window, generate: bool = False) -> None:
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` only the first states and the actions are read; next states are drawn.
+        With `generate=True` it reads the first states and the actions only and samples the next states. `encoded` is
+        what `encode` returns.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
-        encoded = self.encode(window, generate)
+        encoded = self.encode(window, generate) if encoded is None else encoded
         with windows_plate(window):
             self.sample_transitions(window, encoded, window.actions, generate)

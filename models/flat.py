@@ -6,13 +6,14 @@ from typing import Any
 
 import pyro
 from pyro.distributions import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 
-from models.action_generator import ActionGenerator
-from models.dynamics import EffectTrunk
 from models.model import Model
-from models.plate import counted_sequences, windows_plate
-from models.priors import StandardPrior
+from models.networks.action_generator import ActionGenerator
+from models.networks.dynamics import EffectTrunk
+from models.plate import sequence_mask, windows_plate
+from models.priors.prior import Prior
+from models.priors.standard import StandardPrior
 from models.state import State, Window
 
 
@@ -27,12 +28,13 @@ class FlatModel(Model):
     """
 
     name = "flat"
+    codes = ("motion_code",)
 
     def __init__(
         self,
         *,
         motion_dimension: int = 32,
-        motion_prior: nn.Module | None = None,
+        motion_prior: Prior | None = None,
         **shared: Any,
     ) -> None:
         """`shared` are the arguments of `Model`."""
@@ -44,20 +46,23 @@ class FlatModel(Model):
         )
         self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` only the first states are read; all else is drawn.
+        With `generate=True` it reads the first states only and samples all else. `encoded` is what `encode` returns.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
-        encoded, first = self.encode(window, generate), window.first
+        encoded = self.encode(window, generate) if encoded is None else encoded
+        first = window.first
 
         with windows_plate(window):
-            with counted_sequences(window):
+            with sequence_mask(window):
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first))
+
                 mean = self.action_generator(self.trunk(encoded[:, 0]), first.mask, motion_code)
                 observed = None if generate else window.actions
                 actions = pyro.sample("actions", self.scales.actions(mean), obs=observed)
+
             self.sample_transitions(window, encoded, actions, generate)
 
     def motion_prior(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:

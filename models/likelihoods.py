@@ -15,7 +15,7 @@ from models.state import State
 
 
 class Scales:
-    """Likelihoods around the networks' means, for whoever has standard deviations of these names."""
+    """Base class of likelihood scales: the likelihoods around the networks' means, from four standard deviations."""
 
     center: float | Tensor  # metres
     feature: float | Tensor  # of a vector of unit length
@@ -41,7 +41,7 @@ class Scales:
 
 @dataclass(frozen=True)
 class LikelihoodScales(Scales):
-    """Fixed standard deviations; they take the place of loss weights (the paper's and the default choice)."""
+    """Fixed standard deviations, which take the place of loss weights (the paper's choice and the default)."""
 
     center: float = 0.01  # metres
     feature: float = 0.1  # of a vector of unit length
@@ -55,7 +55,7 @@ class LearnedScales(Scales, nn.Module):
     def __init__(
         self, *, center: float = 0.01, feature: float = 0.1, start: float = 0.077, motion: float = 0.245
     ) -> None:
-        """Values to begin with. Raises `ValueError` for one that is not positive."""
+        """Initial values. Raises `ValueError` for one that is not positive."""
         super().__init__()
         for name, value in (("center", center), ("feature", feature), ("start", start), ("motion", motion)):
             if not value > 0:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
+from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from models.dynamics import Dynamics
-from models.encoder import StateEncoder
-from models.encoding import SharedEncoding
 from models.likelihoods import LikelihoodScales, Scales
+from models.networks.dynamics import Dynamics
+from models.networks.encoder import StateEncoder
 from models.program import Program
 from models.state import State, Window
 from models.transitions import generate_transitions, observe_transitions
@@ -18,22 +19,32 @@ from models.transitions import generate_transitions, observe_transitions
 class Model(Program):
     """A process that generates windows of experience, with the dynamics f as its last line.
 
-    A model's `forward(window, generate=False)` runs its process for `window: [B]`. With `generate=True` only
-    the first states are read (and the actions, by a model that has none of its own); all else is drawn.
+    A model's `forward(window, generate=False, encoded=None)` runs its process for `window: [B]`. With `generate=True`
+    it reads the first states only (and the actions, if it has none of its own) and samples everything else. `encoded`
+    is what `encode(window, generate)` returns: who runs a guide and a model encodes once and hands it to both.
 
-    A planner calls, by these names and keywords, those of the following that a model has:
+    `codes` declares which latent sites a model has, and so what a planner can call, by these names and keywords:
 
-    `effect_prior(state)`                         p(c | s), batch `[...]`, event `[C]`
-    `motion_prior(state, effect_code)`            p(z | s, c), batch `[...]`, event `[Z]`
-    `subgoal(state, effect_code)`                 mean of h, `State [...]`
-    `actions(state, effect_code, motion_code)`    mean of g, `[..., T, 4]`
-    `next_state(state, action)`                   mean of f, `State [...]`
+    always          `next_state(state, action)`                   mean of f, `State [...]`
+    "effect_code"   `effect_prior(state)`                         p(c | s), batch `[...]`, event `[C]`
+                    `subgoal(state, effect_code)`                 mean of h, `State [...]`
+    "motion_code"   `motion_prior(state, effect_code)`            p(z | s, c), batch `[...]`, event `[Z]`
+    one or both     `actions(state, effect_code, motion_code)`    mean of g, `[..., T, 4]`
 
     with `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]`, `action: [..., 4]`, whose leading
     dimensions broadcast. A model without one of the codes takes the argument all the same, and never reads it.
     """
 
-    name: ClassVar[str]  # what guides say that they fit
+    name: ClassVar[str]  # guides name by it the models that they fit
+    codes: ClassVar[tuple[str, ...]]  # names of the latent sites, in their order
+
+    # Of the models whose `codes` say so:
+    effect_dimension: int  # C
+    motion_dimension: int  # Z
+    effect_prior: Callable[..., TorchDistribution]
+    motion_prior: Callable[..., TorchDistribution]
+    subgoal: Callable[..., State]
+    actions: Callable[..., Tensor]
 
     def __init__(
         self,
@@ -53,16 +64,14 @@ class Model(Program):
         self.scales = scales or LikelihoodScales()
         self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects)
         self.dynamics = Dynamics(feature_dimension=feature_dimension, width=width)
-        self._shared_encoding = SharedEncoding()
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
         return self.dynamics(state, self.encoder(state), action)
 
-    def encode(self, window: Window, generate: bool, *, for_guide: bool = False) -> Tensor:
+    def encode(self, window: Window, generate: bool = False) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 
-        What a guide asks for with `for_guide=True` is kept for the model, which needs the same.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
         if len(window.batch_shape) != 1:
@@ -71,19 +80,12 @@ class Model(Program):
             raise ValueError(
                 f"window has {window.segment_length} pushes; this model was made for {self.segment_length}"
             )
-        encoder = self.encoder
-        if generate:
-            return encoder(window.states.step(slice(0, 1)))
-        kept = None if for_guide else self._shared_encoding.take(encoder, window)
-        encoded = encoder(window.states.step(slice(0, -1))) if kept is None else kept
-        if for_guide:
-            self._shared_encoding.keep(encoder, window, encoded)
-        return encoded
+        return self.encoder(window.states.step(slice(0, 1) if generate else slice(0, -1)))
 
     def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
-        """The sites of f, observed or drawn from the first states on (see `models/transitions.py`).
+        """The sites of f, observed or sampled from the first states on (see `models/transitions.py`).
 
-        `encoded` is what `encode` has returned, `actions: [..., B, T, 4]` what f reads when drawing.
+        `encoded` is what `encode` returns, `actions: [..., B, T, 4]` what f reads when it samples.
         """
         if generate:
             generate_transitions(self.dynamics, self.encoder, self.scales, window.first, actions)

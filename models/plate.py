@@ -1,4 +1,4 @@
-"""Where every program over windows puts its sites: the plate, and what counts in it."""
+"""Where every program over windows puts its sites: the plate, and the mask of the terms with codes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from models.state import Window
 
 
 def windows_plate(window: Window) -> AbstractContextManager:
-    """One independent draw for each window of the batch `window: [B]`."""
+    """Windows of the batch `window: [B]` are independent."""
     return pyro.plate("windows", len(window.actions))
 
 
-def counted_sequences(window: Window) -> AbstractContextManager:
-    """Sites within it count where `sequence_mask: [B]` is set."""
+def sequence_mask(window: Window) -> AbstractContextManager:
+    """Sites within contribute to the loss where `window.sequence_mask: [B]` is set."""
     return poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]

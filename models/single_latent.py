@@ -8,19 +8,20 @@ from typing import Any
 import pyro
 from pyro import poutine
 from pyro.distributions import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 
-from models.action_generator import ActionGenerator
-from models.dynamics import MetaDynamics
 from models.model import Model
-from models.plate import counted_sequences, windows_plate
-from models.priors import StandardPrior
+from models.networks.action_generator import ActionGenerator
+from models.networks.dynamics import MetaDynamics
+from models.plate import sequence_mask, windows_plate
+from models.priors.prior import Prior
+from models.priors.standard import StandardPrior
 from models.state import State, Window
 from models.transitions import sample_subgoal
 
 
 class SingleLatentModel(Model):
-    """Effects that settle the pushes as well, for each window with states s = s_0, ..., s_T = s'.
+    """Effects that determine the pushes as well, for each window with states s = s_0, ..., s_T = s'.
 
     c ~ p(c | s)                     # effect_code
     s' ~ h(s' | s, c)                # subgoal_centers, subgoal_features
@@ -31,12 +32,13 @@ class SingleLatentModel(Model):
     """
 
     name = "single_latent"
+    codes = ("effect_code",)
 
     def __init__(
         self,
         *,
         effect_dimension: int = 32,
-        effect_prior: nn.Module | None = None,
+        effect_prior: Prior | None = None,
         action_weight: float = 1.0,
         **shared: Any,
     ) -> None:
@@ -59,24 +61,27 @@ class SingleLatentModel(Model):
         )
         self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
 
-    def forward(self, window: Window, generate: bool = False) -> None:
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` only the first states are read; all else is drawn.
+        With `generate=True` it reads the first states only and samples all else. `encoded` is what `encode` returns.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
-        meta_dynamics, scales = self.meta_dynamics, self.scales
-        encoded, first = self.encode(window, generate), window.first
+        encoded = self.encode(window, generate) if encoded is None else encoded
+        first = window.first
 
         with windows_plate(window):
-            with counted_sequences(window):
+            with sequence_mask(window):
                 effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
-                effect = meta_dynamics.effect(encoded[:, 0], effect_code)
-                sample_subgoal(scales, meta_dynamics(first, effect), window, generate)
+
+                effect = self.meta_dynamics.effect(encoded[:, 0], effect_code)
+                sample_subgoal(self.scales, self.meta_dynamics(first, effect), window, generate)
+
                 mean = self.action_generator(effect, first.mask)
                 observed = None if generate else window.actions
                 with poutine.scale(scale=self.action_weight):
-                    actions = pyro.sample("actions", scales.actions(mean), obs=observed)
+                    actions = pyro.sample("actions", self.scales.actions(mean), obs=observed)
+
             self.sample_transitions(window, encoded, actions, generate)
 
     def effect_prior(self, state: State) -> TorchDistribution:
@@ -85,8 +90,7 @@ class SingleLatentModel(Model):
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
         """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T pushes ahead."""
-        meta_dynamics = self.meta_dynamics
-        return meta_dynamics(state, meta_dynamics.effect(self.encoder(state), effect_code))
+        return self.meta_dynamics(state, self.meta_dynamics.effect(self.encoder(state), effect_code))
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor | None = None) -> Tensor:
         """Mean of g: `state: [...]`, `effect_code: [..., C]` -> `[..., T, 4]`; no motion code is read."""

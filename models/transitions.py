@@ -5,10 +5,10 @@ from __future__ import annotations
 import pyro
 from torch import Tensor
 
-from models.dynamics import Dynamics
-from models.encoder import StateEncoder
-from models.layers import unit
 from models.likelihoods import Scales
+from models.networks.dynamics import Dynamics
+from models.networks.encoder import StateEncoder
+from models.networks.layers import unit
 from models.state import State, Window, stack_steps
 
 
@@ -16,7 +16,7 @@ def sample_subgoal(scales: Scales, mean: State, window: Window, generate: bool) 
     """s' ~ h(. | s, c) for `window: [B]` around `mean: [..., B]`, observed unless `generate`.
 
     Sites subgoal_centers, event `[M, 3]`, and subgoal_features, event `[M, F]`. Counted are the objects that
-    are real in s and s', or in s alone where s' is drawn.
+    are real in s and s', or in s alone where s' is sampled.
     """
     first, last = window.first, window.last
     counted = first.mask if generate else first.mask & last.mask
@@ -43,19 +43,19 @@ def observe_transitions(dynamics: Dynamics, scales: Scales, window: Window, enco
 def generate_transitions(
     dynamics: Dynamics, encoder: StateEncoder, scales: Scales, state: State, actions: Tensor
 ) -> None:
-    """Draw s_t+1 ~ f(. | s_t, a_t) push by push from `state: [B]` under `actions: [..., B, T, 4]`.
+    """Sample s_t+1 ~ f(. | s_t, a_t) push by push from `state: [B]` under `actions: [..., B, T, 4]`.
 
     Sites next_centers_t and next_features_t for t = 1, ..., T; next_centers and next_features record them
-    together, in the shapes of `observe_transitions`. A drawn feature is scaled to unit length before f reads
-    it, as every observed feature is.
+    together, in the shapes of `observe_transitions`. A sampled feature is scaled to unit length before f reads
+    it, as observed features are.
     """
-    drawn = []
+    samples = []
     for step, action in enumerate(actions.unbind(-2), start=1):
         mean = dynamics(state, encoder(state), action)
         centers = pyro.sample(f"next_centers_{step}", scales.centers(mean, state.mask))
         features = pyro.sample(f"next_features_{step}", scales.features(mean, state.mask))
-        drawn.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
-        state = drawn[-1]._replace(features=unit(features))
-    steps = stack_steps(drawn)
+        samples.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
+        state = samples[-1]._replace(features=unit(features))
+    steps = stack_steps(samples)
     pyro.deterministic("next_centers", steps.centers, event_dim=3)
     pyro.deterministic("next_features", steps.features, event_dim=3)

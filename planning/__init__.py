@@ -1,20 +1,20 @@
 """What is chosen: planners over a learned model and a reward, for many environments at once.
 
-A planner is a composition: what is searched (`planning.levels`: codes at two levels or one, raw pushes), by an
-optimiser (`planning.optimisers`), scored by returns (`planning.rewards`) or aim (`planning.motions`). All of them
-roll out in `planning.candidates`.
+`planning/cavin.py` is Algorithm 1. Its rooms: `rollouts` (candidates, segment by segment), `optimizers` (how candidates
+are searched), `extensions` (our additions), `baselines` (the planners that the paper compares with) and `backends` (how
+inner functions run).
 """
 
+from planning.baselines.cvae_mpc import CvaeMpcPlanner
+from planning.baselines.mpc import MpcPlanner
+from planning.baselines.proposals import PushBox
+from planning.baselines.random_pushes import RandomPlanner
+from planning.baselines.sectar import SectarPlanner
 from planning.cavin import MOTION_HORIZONS, CavinPlanner
-from planning.cvae_mpc import CvaeMpcPlanner
-from planning.mpc import MpcPlanner
+from planning.extensions.perturbed_rollouts import PerturbedRollouts
+from planning.extensions.reachability import Reachability
 from planning.plan import Plan
-from planning.proposals import PushBox
 from planning.protocol import Outcome, Planner, PlanningModel, RewardFunction
-from planning.random_pushes import RandomPlanner
-from planning.reachability import Reachability
-from planning.robustness import Robustness
-from planning.sectar import SectarPlanner
 
 __all__ = [
     "MOTION_HORIZONS",
@@ -22,6 +22,7 @@ __all__ = [
     "CvaeMpcPlanner",
     "MpcPlanner",
     "Outcome",
+    "PerturbedRollouts",
     "Plan",
     "Planner",
     "PlanningModel",
@@ -29,6 +30,5 @@ __all__ = [
     "RandomPlanner",
     "Reachability",
     "RewardFunction",
-    "Robustness",
     "SectarPlanner",
 ]

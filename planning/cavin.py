@@ -1,67 +1,68 @@
-"""Hierarchical planning with cascaded generative processes (paper, section 3.2, Algorithm 1)."""
+"""Algorithm 1 of the paper: hierarchical planning with cascaded generative processes (section 3.2)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from models.state import State
-from planning.bulk import in_bulk
-from planning.candidates import Search
-from planning.effects import choose_effects
-from planning.idle import idle_last
+from planning.backends.chunking import chunked
+from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
+from planning.extensions.idle_pushes import idle_last
+from planning.extensions.perturbed_rollouts import PerturbedRollouts, most_robust
+from planning.extensions.reachability import Reachability, most_reachable
+from planning.extensions.warm_start import warm_start_noise
 from planning.inputs import check_weight
-from planning.levels import EffectLevel, MotionLevel
-from planning.motions import Closeness, choose_motions
-from planning.optimisers import make_optimiser
+from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
-from planning.protocol import PlanningModel, RewardFunction
-from planning.reachability import Reachability, most_reachable
-from planning.robustness import Robustness
-from planning.searching import SearchingPlanner
+from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction
+from planning.rollouts.dynamics import predict_states
+from planning.rollouts.ranking import best_of, squared_distance
+from planning.rollouts.returns import interpolate
+from planning.rollouts.sampling import sample_codes
+from planning.rollouts.segment import Objective, SegmentRollout, select_segment
+from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
+ROBUSTNESS = PerturbedRollouts()
 
 
 class CavinPlanner(SearchingPlanner):
-    """First *what* to achieve (effect codes, ranked by reward), then *how* (motion codes, ranked by aim).
+    """First *what* to achieve (effect codes, ranked by reward), then *how* (motion codes, ranked by tracking cost).
+
+    Without options this is `planner=cavin`, with our additions; `planner=paper` names the options of the paper.
 
     model: h, g, f and their priors.
     reward: the task.
     samples: N, at both levels.
     horizon: H steps, a multiple of the model's T.
-    optimizer: how codes are searched: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution` or `smc`, with
-        `optimizer_options` of its own (see `planning.optimisers`); at both levels, unless `motion_optimizer`, with
-        `motion_optimizer_options`, searches the motions.
+    optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
+        `planning.optimizers.Optimizer`.
+    motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
     stride_limits: metres, two of them; a subgoal towards which every object moves less than the first, or any more
         than the second, ends the plan as a violation does (published implementation: 0.1 and 0.3); None in the paper.
-    motion_horizon: `full_horizon` plans motions for all K segments and compares them with all K subgoals
-        (paper); `first_segment` plans and compares only what is executed before the next plan (published
-        implementation).
-    feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0
-        compares centres only.
-    avoid_failures: our addition to line 10. If true, motion sequences along which f predicts a failure, step
-        by step, lose against those without one; where every sequence fails somewhere, those that fail in the
-        executed segment lose against those that fail later. If false, only the distance counts, as in the
-        paper's text.
-    robustness: our addition to line 10, how the best motions are tried again with displaced pushes; None to take
-        the best at its word, as in the paper.
-    idle_distance: metres; our addition to line 10: of the executed segment, pushes that f predicts to move no object
-        as far come last. 0 leaves g's order, as in the paper.
-    memory: our addition to line 5: what is left of the last plan is among the candidates (`planning.memory`).
-    reachability: our addition to line 7, how the best effects are scored again by what motions do for them; None to
-        take h at its word, as in the paper.
+    motion_horizon: `full_horizon` plans motions for all K segments and compares them with all K subgoals (paper);
+        `first_segment` plans and compares only what is executed before the next plan (published implementation).
+    feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
+        centres only.
+    warm_start: our addition to line 5: the last plan's noise is among the candidates.
+    reachability: our addition to line 7: rescores the best effect codes by f; None trusts h (paper).
+    avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
+    robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
+    idle_distance: metres; our addition to line 11: pushes that f predicts to move no object as far come last; 0 keeps
+        g's order (paper).
+    compile: native code for the inner functions, after one or two minutes of compilation.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
     `reward_at`, limits out of order, and a `feature_weight` or an `idle_distance` that is negative or not finite.
     """
 
-    needs = ("effect_prior", "motion_prior", "subgoal", "actions", "next_state")
-    usual_model = "cascaded"
+    requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "subgoal", "actions", "next_state"))
 
     def __init__(
         self,
@@ -69,70 +70,198 @@ class CavinPlanner(SearchingPlanner):
         reward: RewardFunction,
         samples: int = 1024,
         horizon: int = 30,
-        motion_horizon: str = "full_horizon",
+        motion_horizon: str = "first_segment",
         *,
-        motion_optimizer: str | None = None,
-        motion_optimizer_options: Mapping[str, Any] | None = None,
+        motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
-        robustness: Robustness | None = None,
-        idle_distance: float = 0.0,
+        robustness: PerturbedRollouts | None = ROBUSTNESS,
+        idle_distance: float = 0.01,
         reachability: Reachability | None = None,
         **options: Any,
     ) -> None:
         super().__init__(model, reward, samples, horizon, **options)
+        self.model: PlanningModel = model
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
         check_weight("idle_distance", idle_distance)
-        self.motion_optimiser = self.optimiser
+        self.motion_optimizer = self.optimizer
         if motion_optimizer is not None:
-            self.motion_optimiser = make_optimiser(motion_optimizer, motion_optimizer_options, samples=samples)
+            self.motion_optimizer = make_optimizer(motion_optimizer, samples=samples)
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
         self.robustness = robustness
         self.idle_distance = idle_distance
         self.reachability = reachability
-        self.best_only = reachability is None  # it looks at many
 
-    @in_bulk
+    @chunked
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
-        """Plan for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
+        """Algorithm 1 for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
 
-        `previous`: the last plans of the same episodes, whose first pushes have been executed, for a planner with a
-        memory. An environment's plan depends on its own state, generator and last plan only. For errors see
-        `planning.bulk.in_bulk`.
+        `previous`: the last plans of the same episodes, whose first pushes have been executed, for the warm start. An
+        environment's plan depends on its own state, generator and last plan only. For errors see
+        `planning.backends.chunking.chunked`.
         """
-        # Lines 2, 3, 11 and 12 (repeat until the episode is done, execute, t = t + T) are the caller's.
-        # Line 4, the new s_t, is what it was given.
-        # Lines 5 to 7: choose the effect codes c* and their subgoals.
-        plans = self.search(EffectLevel(self.model), state, generators, previous)
-        chosen = None  # the highest return, as h predicts it
+        reward = self.reward
+        # Line 1 (K = H / T) is in the constructor. Lines 2, 3 and 12, the loop over t, are the caller's.
+        # Line 4: receive the new s_t from the environment.
+        s_t, T = state, self.segment_length
+
+        # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
+        warm_start = warm_start_noise(previous, generators) if self.warm_start else None
+        effect_space, objective = EffectSpace(self.model), self.cumulative_reward()
+        best_only = self.reachability is None
+        effects = self.search(effect_space, objective, s_t, generators, warm_start=warm_start, best_only=best_only)
+
+        # Line 7: choose c* and its subgoals, with the highest cumulative reward.
+        i = best_of(effects.returns, "returns of effect plans")
         if self.reachability is not None:
-            chosen = most_reachable(self.reachability, plans, self.model, self.reward)
-        effects = choose_effects(plans, chosen)
-        # Lines 8 to 10: choose the motion codes z* and their actions.
-        closeness = Closeness(
-            effects, self.reward, feature_weight=self.feature_weight, avoid_failures=self.avoid_failures
+            i = most_reachable(self.reachability, effects, effect_space.predict, self.model, reward)
+        chosen = effects.take(i.unsqueeze(-1))
+        c_star, subgoals = chosen.codes[:, 0], chosen.states.map(lambda field: field[:, 0])
+
+        # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
+        ends = effects.score_state.segments.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
+        tracking_cost: Objective = TrackingCost(subgoals, ends, self.feature_weight)
+        if self.avoid_failures:
+            tracking_cost = AvoidFailures(tracking_cost, ends, reward)
+        motions = self.search(
+            MotionSpace(self.model, c_star),
+            tracking_cost,
+            s_t,
+            generators,
+            optimizer=self.motion_optimizer,
+            segments=self.motion_segments,
         )
-        level, segments = MotionLevel(self.model, effects.codes), self.motion_segments
-        how = Search(level, closeness, state, generators, segments, self.from_noise, engine=self.engine)
-        sequences = self.motion_optimiser.optimise(how, self.samples)
-        motions = choose_motions(sequences, self.model, closeness, self.robustness)
-        motions = idle_last(motions, state, self.segment_length, self.idle_distance)
+
+        # Line 10: choose z* and its actions a*, which lead to the states closest to the subgoals.
+        tracking, scores = motions.score_state, motions.returns
+        if self.avoid_failures:
+            tracking, scores = prefer_no_failure(motions.score_state)
+        j = best_of(scores, "distances of motion plans to the subgoals")
+        if self.robustness is not None:
+            later_cost = tracking.cost - tracking.executed_cost
+            task = self.model, reward, subgoals, self.feature_weight
+            j = most_robust(self.robustness, motions, scores, later_cost, *task)
+        chosen = motions.take(j.unsqueeze(-1))
+        z_star, a_star, path = chosen.codes[:, 0], chosen.actions[:, 0], chosen.path[:, 0]
+        a_star, path = idle_last(a_star, path, s_t, T, self.idle_distance)
+
+        # Line 11: the caller executes the first T actions, or the first of them.
         return Plan(
-            actions=motions.actions[:, : self.segment_length],
-            planned_actions=motions.actions,
-            effect_codes=effects.codes,
-            motion_codes=motions.codes,
-            subgoals=effects.subgoals,
-            segments=effects.segments,
-            predicted_centers=motions.predicted_centers,
-            expected_return=effects.expected_return,
-            expected_success=effects.expected_success,
-            candidate_centers=effects.candidate_centers,
-            noise=effects.noise,
-            candidate_returns=effects.candidate_returns,
+            actions=a_star[:, :T],
+            planned_actions=a_star,
+            effect_codes=c_star,
+            motion_codes=z_star,
+            subgoals=subgoals,
+            predicted_centers=path,
+            **summary(effects, i),
         )
+
+
+class EffectSpace(NamedTuple):
+    """Lines 5 and 6: effect codes, and the subgoals that h predicts from them."""
+
+    model: EffectModel
+
+    @property
+    def dimension(self) -> int:
+        """C."""
+        return self.model.effect_dimension
+
+    def extend(
+        self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
+    ) -> SegmentRollout:
+        """See `planning.rollouts.segment.SearchSpace`."""
+        # Line 5: sample c_k, a segment at a time, since a learned prior p(c | s) depends on the state before it.
+        c = sample_codes(self.model.effect_prior, [plans], noise, generators)
+        return self.predict(here, plans, c)
+
+    def predict(self, here: State, plans: State, c: Tensor) -> SegmentRollout:
+        """`here`: `plans: [B, n]`, or `[B, 1]` where all are in one state; `c: [B, n, C]`."""
+        # Line 6: predict the subgoal by equation 2 ...
+        subgoal = self.model.subgoal(here, c).expand(plans.batch_shape)
+        # ... and interpolate the state trajectory.
+        path = interpolate(plans.centers, subgoal.centers, self.model.segment_length)
+        return SegmentRollout(c, None, subgoal, path)
+
+
+class MotionSpace(NamedTuple):
+    """Lines 8 and 9: motion codes, the actions that g generates from them, and the states that f predicts."""
+
+    model: PlanningModel
+    effect_codes: Tensor  # [B, K, C] c*, with which every sequence is paired
+
+    @property
+    def dimension(self) -> int:
+        """Z."""
+        return self.model.motion_dimension
+
+    def extend(
+        self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
+    ) -> SegmentRollout:
+        """See `planning.rollouts.segment.SearchSpace`."""
+        c = select_segment(self.effect_codes, segment).expand(-1, plans.batch_shape[-1], -1)
+        # Line 8: sample z_k, a segment at a time, as in line 5.
+        z = sample_codes(self.model.motion_prior, [plans, c], noise, generators)
+        # Line 9: generate T actions by equation 3, and predict a state after each by equation 1.
+        a = self.model.actions(here, c, z)
+        states, path = predict_states(self.model, here, a)
+        return SegmentRollout(z, a, states, path)
+
+
+class TrackingState(NamedTuple):
+    """The tracking cost of motion candidates so far; fields `[B, n]`."""
+
+    cost: Tensor  # square metres, summed over the segments
+    executed_cost: Tensor  # of the first segment, which is executed
+    finite: Tensor  # bool: all actions are finite
+
+    @property
+    def returns(self) -> Tensor:
+        """`[B, n]` minus the cost."""
+        return torch.where(self.finite & torch.isfinite(self.cost), -self.cost, -torch.inf)
+
+    @property
+    def failed(self) -> Tensor:
+        """`[B, n]` bool: none, for Algorithm 1 replaces no motions."""
+        return torch.zeros_like(self.finite)
+
+    @property
+    def active(self) -> Tensor:
+        """`[B, n]` bool: all, for line 9 predicts whole sequences."""
+        return torch.ones_like(self.finite)
+
+
+class TrackingCost(NamedTuple):
+    """Line 10: squared distance of the predicted states to the chosen subgoals, at the end of every segment.
+
+    Segments after the end of the chosen effect plan have no subgoal and do not count.
+    """
+
+    subgoals: State  # [B, K, M, .]
+    segments: Tensor  # [B] int64, 1..K: segments until the effect plan ends
+    feature_weight: float
+
+    def start(self, plans: State) -> TrackingState:
+        """Of candidates without a segment, `plans: [B, n]`."""
+        nothing = plans.centers.new_zeros(plans.batch_shape)
+        return TrackingState(nothing, nothing, torch.ones_like(nothing, dtype=torch.bool))
+
+    def advance(self, state: TrackingState, segment: int, before: State, rollout: SegmentRollout) -> TrackingState:
+        """After one more segment from `before: [B, n]`."""
+        counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
+        subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
+        distance = squared_distance(rollout.states, subgoal, feature_weight=self.feature_weight)
+        cost = state.cost + torch.where(counts, distance, 0.0)
+        executed = torch.as_tensor(segment == 0, device=counts.device)
+        assert rollout.actions is not None
+        finite = state.finite & (torch.isfinite(rollout.actions).all(-1).all(-1) | ~counts)
+        return TrackingState(cost, torch.where(executed, cost, state.executed_cost), finite)
+
+    def early_stopped(self, state: TrackingState) -> Tensor:
+        """`[B]` bool: nowhere, for no sequence ends before the others."""
+        return torch.zeros_like(state.finite[:, 0])

@@ -10,8 +10,8 @@ import torch
 from models.state import State
 
 
-class HopelessEnvironmentError(ValueError):
-    """There is nothing to choose for one environment of a batch; `what` says why."""
+class NoFiniteCandidateError(ValueError):
+    """No candidate of one environment of a batch is finite; `what` says which numbers are not."""
 
     def __init__(self, environment: int, what: str) -> None:
         super().__init__(f"environment {environment}: {what}")

@@ -10,9 +10,9 @@ from models.state import State
 
 
 class Plan(NamedTuple):
-    """The chosen plan of every environment, and what was considered on the way (for drawing).
+    """The chosen plan of every environment, and what was considered (for drawing).
 
-    S is the number of segments with motions: K, or 1 where only the first one is planned at the motion level.
+    S is the number of segments with motions: K, or 1 where only the first one is planned at the motion space.
     C and Z are the codes' numbers. What a planner does not have is empty: without effect codes K = 0 for these and
     the subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for
     its pushes, and no codes, states or candidates.
@@ -28,5 +28,5 @@ class Plan(NamedTuple):
     expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
     expected_success: Tensor  # [B] bool: the chosen plan reaches the goal
     candidate_centers: Tensor  # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies
-    noise: Tensor  # [B, K, D] what the searched codes or pushes were made of, or [B, 0, 0]; see `planning.memory`
+    noise: Tensor  # [B, K, D] of the searched codes or pushes, or [B, 0, 0]; see `extensions.warm_start`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite

@@ -1,13 +1,14 @@
 """What planning needs of a model and of a task, and what it offers: structural types, not to be inherited.
 
-Letters used in all of `planning`: B environments, N plan samples, K segments of T steps each, H = K T steps
+Letters used in all of `planning`: B environments, N candidates, K segments of T steps each, H = K T steps
 of horizon, M objects (padding included).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -17,41 +18,101 @@ from models.state import State
 from planning.plan import Plan
 
 
-class PlanningModel(Protocol):
-    """The cascaded generative process (paper, equations 1 to 3): its priors, and the means of h, g and f.
+class DynamicsModel(Protocol):
+    """The dynamics f alone (paper, equation 1), of which planners take the mean.
 
     Leading dimensions `[...]` of the arguments broadcast: planners hand over states `[B, 1]` with codes or
-    actions `[B, N]` where all plans are in one state, else `[B, N]` for all. Priors are asked for `[N]`, an
-    environment at a time. Planners name in `needs` what they ask for; a model without effects takes its motion code by
-    keyword, one without motions is given none.
+    actions `[B, N]` where all candidates are in one state, else `[B, N]` for all. Priors are asked for `[N]`, an
+    environment at a time.
     """
 
     @property
     def segment_length(self) -> int:
         """`T`, the number of pushes that lead from a state to its subgoal."""
 
+    def next_state(self, state: State, action: Tensor) -> State:
+        """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., 4]`."""
+
+
+class EffectModel(DynamicsModel, Protocol):
+    """A model with effect codes: their prior, and the meta-dynamics h (paper, equation 2)."""
+
     @property
     def effect_dimension(self) -> int:
         """C, the numbers of an effect code."""
+
+    def effect_prior(self, state: State) -> Distribution:
+        """p(c | s), or p(c): batch `[...]`, event `[C]`."""
+
+    def subgoal(self, state: State, effect_code: Tensor) -> State:
+        """Mean of the meta-dynamics h(s' | s, c), the state T steps on: `[...]`; `effect_code: [..., C]`."""
+
+
+class PlanningModel(EffectModel, Protocol):
+    """The cascaded generative process (paper, equations 1 to 3): `model=cascaded`."""
 
     @property
     def motion_dimension(self) -> int:
         """Z, the numbers of a motion code."""
 
-    def effect_prior(self, state: State) -> Distribution:
-        """p(c | s), or p(c): batch `[...]`, event `[C]`."""
-
     def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
         """p(z | s, c), or p(z): batch `[...]`, event `[Z]`; `effect_code: [..., C]`."""
-
-    def subgoal(self, state: State, effect_code: Tensor) -> State:
-        """Mean of the meta-dynamics h(s' | s, c), the state T steps on: `[...]`; `effect_code: [..., C]`."""
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
         """Mean of the action generator g(a | s, c, z): `[..., T, 4]` pushes; codes `[..., C]`, `[..., Z]`."""
 
-    def next_state(self, state: State, action: Tensor) -> State:
-        """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., 4]`."""
+
+class SingleLatentModel(EffectModel, Protocol):
+    """One code for the subgoal and the actions (SeCTAR): `model=single_latent`."""
+
+    def actions(self, state: State, effect_code: Tensor) -> Tensor:
+        """Mean of g(a | s, c): `[..., T, 4]` pushes."""
+
+
+class FlatModel(DynamicsModel, Protocol):
+    """Motion codes without effects (CVAE-MPC): `model=flat`."""
+
+    @property
+    def motion_dimension(self) -> int:
+        """Z, the numbers of a motion code."""
+
+    def motion_prior(self, state: State) -> Distribution:
+        """p(z | s), or p(z): batch `[...]`, event `[Z]`."""
+
+    def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
+        """Mean of g(a | s, z): `[..., T, 4]` pushes."""
+
+
+@dataclass(frozen=True)
+class ModelRequirements:
+    """What a planner asks of its model; a class attribute `requires` of every planner that searches.
+
+    model: the choice of `model=` that was made for the planner. methods: which the model must have. excluded: codes
+    that the planner would not choose, so the model must not have them.
+    """
+
+    model: str
+    methods: tuple[str, ...]
+    excluded: tuple[str, ...] = ()
+
+    def violation(self, model: object) -> str | None:
+        """In words, what `model` lacks or has besides; None if it fits."""
+        missing = [name for name in self.methods if not hasattr(model, name)]
+        superfluous = [name for name in self.excluded if hasattr(model, name)]
+        if missing:
+            return f"has no {' and no '.join(missing)}"
+        return f"has {superfluous[0]} besides" if superfluous else None
+
+
+@runtime_checkable
+class Reparameterized(Protocol):
+    """A distribution that says itself how standard normal noise becomes its samples.
+
+    Torch's normal distributions and their transforms need not: `planning.rollouts.sampling.reparameterize`.
+    """
+
+    def reparameterize(self, noise: Tensor) -> Tensor:
+        """The sample `[..., D]` that `noise: [..., D]` determines."""
 
 
 class Outcome(Protocol):
@@ -80,6 +141,35 @@ class RewardFunction(Protocol):
         """
 
 
+@runtime_checkable
+class BoundedReward(RewardFunction, Protocol):
+    """A reward function that knows an upper bound, which lets searches stop early."""
+
+    @property
+    def maximum_return(self) -> float:
+        """Upper bound on the cumulative reward of any sequence of steps."""
+
+
+@runtime_checkable
+class EpisodicReward(RewardFunction, Protocol):
+    """A reward function that changes from episode to episode."""
+
+    @property
+    def current(self) -> RewardFunction:
+        """The reward of this episode, a pure function of tensors."""
+
+
+@runtime_checkable
+class PathReward(RewardFunction, Protocol):
+    """A reward function that can also judge whole paths, which looks at every state once instead of twice."""
+
+    def along(self, states: Tensor, mask: Tensor, /) -> Outcome:
+        """Judge the T steps of paths `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` bool: fields `[..., T]`.
+
+        The same as calls for one step after another.
+        """
+
+
 class Planner(Protocol):
     """Anything that turns observed states into pushes."""
 
@@ -88,8 +178,7 @@ class Planner(Protocol):
         """T, the number of pushes in a plan's `actions`."""
 
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
-        """Plan for the scenes `state: [B]`, each with its own source of randomness.
+        """Plan for the scenes `state: [B]`, each with its own generator.
 
-        `previous`: the plans whose `actions`, or the first of them, have just been executed, for optimisers that go on
-        from them.
+        `previous`: the plans whose `actions`, or the first of them, have just been executed, for the warm start.
         """

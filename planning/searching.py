@@ -1,60 +1,60 @@
-"""What every planner that searches takes, checked in one place."""
+"""What planners that search have in common: their options, and the search itself."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
+from torch import Tensor
 
 from models.state import State
-from planning.candidates import Candidates, Search
-from planning.compiled import Compiled
-from planning.engine import Engine, directly
+from planning.backends.compiled import Compiled
+from planning.backends.eager import Backend, eager
+from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive
-from planning.memory import hints
-from planning.optimisers import make_optimiser
+from planning.optimizers import Optimizer, make_optimizer, search
 from planning.plan import Plan
-from planning.protocol import PlanningModel, RewardFunction
-from planning.rewards import CumulativeReward, StrideLimits
-from planning.segments import Level
+from planning.protocol import DynamicsModel, EpisodicReward, ModelRequirements, RewardFunction
+from planning.rollouts.candidates import Candidates, SearchProblem
+from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
+from planning.rollouts.segment import Objective, SearchSpace
 
 
 class SearchingPlanner:
-    """N = `samples` plans of K = `horizon` / T segments, searched by an optimiser for the highest cumulative reward.
+    """Searches N = `samples` plans of K = `horizon` / T segments for the highest cumulative reward.
 
-    Algorithm 1, line 1, and the options of the search: see `planning.cavin.CavinPlanner`, which names them all.
+    The options are those of `planning.cavin.CavinPlanner`, which explains them.
     """
 
+    requires: ClassVar[ModelRequirements]  # what a planner asks of its model
     strides: ClassVar[str] = "segments"  # what `stride_limits` limits, or "pushes"
-    best_only = True  # whether of the plans that were considered only the one with the highest return matters
 
     def __init__(
         self,
-        model: PlanningModel,
+        model: DynamicsModel,
         reward: RewardFunction,
         samples: int = 1024,
         horizon: int = 30,
         *,
-        optimizer: str = "shooting",
-        optimizer_options: Mapping[str, Any] | None = None,
+        optimizer: str | Optimizer = "shooting",
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
-        memory: bool = False,
+        warm_start: bool = True,
         compile: bool = False,
     ) -> None:
         """Raises ValueError for counts below 1, a horizon that T does not divide, unknown names, and no compiler."""
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
-        self.optimiser = make_optimiser(optimizer, optimizer_options, samples=samples)
+        self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward = model, reward
         self.reward_at, self.stride_limits = reward_at, stride_limits
-        self.engine: Engine = Compiled() if compile else directly
-        self.from_noise = memory or compile
-        self.score  # noqa: B018 (complains of a name or of limits now, not in the first plan)
-        self.memory = memory
+        self.backend: Backend = Compiled() if compile else eager
+        self.reparameterized = warm_start or compile
+        self.cumulative_reward()  # refuses a name or limits now, not in the first plan
+        self.warm_start = warm_start
         self.samples = samples
-        self.segments = horizon // model.segment_length  # line 1: K = H / T
+        self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
 
     @property
     def segment_length(self) -> int:
@@ -63,34 +63,66 @@ class SearchingPlanner:
 
     @property
     def reward(self) -> RewardFunction:
-        """The task's; of a reward that changes from episode to episode, what it is `now`."""
-        return getattr(self._reward, "now", self._reward)
+        """The task's reward, in this episode."""
+        return self._reward.current if isinstance(self._reward, EpisodicReward) else self._reward
 
-    @property
-    def score(self) -> CumulativeReward:
-        """Of plans in this episode."""
+    def cumulative_reward(self) -> CumulativeReward:
+        """The objective of effect codes and pushes, in this episode."""
         reward, limits = self.reward, self.stride_limits
         return CumulativeReward(
             reward if limits is None else StrideLimits(reward, limits, of=self.strides), self.reward_at
         )
 
     def search(
-        self, level: Level, state: State, generators: Sequence[torch.Generator], previous: Plan | None
+        self,
+        space: SearchSpace,
+        objective: Objective,
+        state: State,
+        generators: Sequence[torch.Generator],
+        *,
+        optimizer: Optimizer | None = None,
+        segments: int | None = None,
+        warm_start: Tensor | None = None,
+        best_only: bool = False,
     ) -> Candidates:
-        """All plans that were considered for the scenes `state: [B]`, with what is left of the `previous` ones.
+        """All candidates `[B, N]` that the optimizer, by default `self.optimizer`, has evaluated.
 
-        Raises ValueError for a memory of codes whose prior is not made of noise (`planning.sampling.code_of`).
+        segments: by default K. warm_start, best_only: see `planning.rollouts.candidates.SearchProblem`.
+        Raises ValueError for codes whose prior cannot be reparameterized, where that is needed.
         """
-        left = hints(previous, generators) if self.memory else None
-        wanted = Search(
-            level,
-            self.score,
+        problem = SearchProblem(
+            space,
+            objective,
             state,
             generators,
-            self.segments,
-            self.from_noise,
-            left,
-            best_only=self.best_only,
-            engine=self.engine,
+            self.segments if segments is None else segments,
+            self.reparameterized,
+            warm_start,
+            best_only,
+            self.backend,
         )
-        return self.optimiser.optimise(wanted, self.samples)
+        return search(optimizer or self.optimizer, problem, self.samples)
+
+    def search_by_reward(
+        self, space: SearchSpace, state: State, generators: Sequence[torch.Generator], previous: Plan | None
+    ) -> Candidates:
+        """Candidates `[B, N]` of K segments, searched by cumulative reward, with a warm start from `previous`."""
+        warm_start = warm_start_noise(previous, generators) if self.warm_start else None
+        return self.search(space, self.cumulative_reward(), state, generators, warm_start=warm_start, best_only=True)
+
+
+def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
+    """What every `Plan` tells of its search: the fields from `segments` to `candidate_returns`.
+
+    candidates: `[B, N]`, evaluated by cumulative reward. best: `[B]` int64, the number of the chosen one.
+    """
+    progress = candidates.score_state
+    environments = torch.arange(len(best), device=best.device)
+    return {
+        "segments": progress.segments[environments, best],
+        "expected_return": progress.returns[environments, best],
+        "expected_success": progress.succeeded[environments, best],
+        "noise": chosen_noise(candidates.take(best.unsqueeze(-1))),
+        "candidate_centers": candidates.centers,
+        "candidate_returns": progress.returns,
+    }

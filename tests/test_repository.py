@@ -110,13 +110,13 @@ def test_licence_and_citation_say_whose_work_it_is() -> None:
 
 def test_every_dependency_is_locked_at_the_version_that_the_project_names() -> None:
     extras = PROJECT["project"]["optional-dependencies"]
-    named = pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"])
+    named = pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"] + extras["docs"])
     locked = lock()
     assert named == {name: locked.get(name) for name in named}
 
 
 def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
-    # What an optional extra brings is imported where it is asked for only: tests/cavin_pyro/test_recording.py.
+    # What an optional extra brings is imported only on request: tests/cavin_pyro/visualization/test_recording.py.
     extras = PROJECT["project"]["optional-dependencies"]
     declared = pins(PROJECT["project"]["dependencies"] + extras["assets"] + extras["viewer"])
     known = {*sys.stdlib_module_names, *PACKAGES}
@@ -130,10 +130,10 @@ def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
 
 
 def test_every_dependency_says_why_it_was_chosen() -> None:
-    text = (ROOT / "docs" / "dependencies.md").read_text()
+    text = (ROOT / "docs" / "reference" / "dependencies.md").read_text()
     reasons = {name for row in re.findall(r"^\| ([^|]+) \|", text, re.MULTILINE) for name in row.split(", ")}
     extras = PROJECT["project"]["optional-dependencies"]
-    assert set(pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"])) <= reasons
+    assert set(pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"] + extras["docs"])) <= reasons
 
 
 def test_every_folder_of_a_package_is_a_package() -> None:
@@ -220,6 +220,6 @@ def test_tests_mirror_the_folders_and_have_names_of_their_own() -> None:
     files = sorted((ROOT / "tests").rglob("*.py"))
     folders = {file.relative_to(ROOT / "tests").parts[0] for file in files if file.parent != ROOT / "tests"}
     names = Counter(file.name for file in files if file.name.startswith("test_"))
-    assert folders <= {*PACKAGES, "benchmarks", "notebooks", "how_to"}
+    assert folders <= {*PACKAGES, "benchmarks", "notebooks", "how_to", "docs"}
     assert not [place(file) for file in files if file.name == "__init__.py"]
     assert not [name for name, count in names.items() if count > 1]

@@ -10,24 +10,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cavin_pyro.collection import CollectionSettings, collect_episode, open_scene
-from cavin_pyro.features import cloud_features
-from models.pointnet import PointNet
+from cavin_pyro.data.collection import CollectionConfig, collect_episode, open_scene
+from cavin_pyro.data.features import cloud_features
+from models.networks.pointnet import PointNet
 from models.state import State
 
-SEED = 2**31  # added to a subject's seed: datasets are collected with small ones, so these episodes are in none
+SEED = 2**31  # added to a context's seed: datasets are collected with small ones, so these episodes are in none
 
 
 class Recording(NamedTuple):
-    """Episodes (E) of S pushes and the states between them, padded with the last thing seen."""
+    """Episodes (E) of S pushes and the states between them, padded with the last observation."""
 
     states: State  # [E, S + 1]
     actions: Tensor  # [E, S, 4] normalised
-    seen: Tensor  # [E, S + 1, M] bool: the episode goes on, and the object is in view
+    observed: Tensor  # [E, S + 1, M] bool: the episode has not ended, and the object is visible
 
 
 def record(
-    pointnet: PointNet, world: CollectionSettings, *, episodes: int, steps: int, objects: int, seed: int
+    pointnet: PointNet, world: CollectionConfig, *, episodes: int, steps: int, objects: int, seed: int
 ) -> Recording:
     """Simulate `episodes` of up to `steps` pushes with at most `objects` objects, by the policy that collects data."""
     settings = replace(world, seed=SEED + seed, steps=steps, maximum_objects=objects)
@@ -38,11 +38,11 @@ def record(
     # A fall ends an episode, and what has fallen is no longer a state of the table.
     fallen = np.pad(arrays["fallen"], ((0, 0), (1, 0)))
     mask = np.broadcast_to(arrays["mask"][:, None], arrays["visible"].shape)
-    seen = arrays["visible"] & mask & (made & ~fallen)[..., None]
+    observed = arrays["visible"] & mask & (made & ~fallen)[..., None]
     state = State(
         torch.from_numpy(arrays["centers"]),
         torch.from_numpy(cloud_features(pointnet, arrays["clouds"])),
         torch.from_numpy(mask.copy()),
     )
     trimmed = State(state.centers[..., :objects, :], state.features[..., :objects, :], state.mask[..., :objects])
-    return Recording(trimmed, torch.from_numpy(arrays["actions"]), torch.from_numpy(seen[..., :objects]))
+    return Recording(trimmed, torch.from_numpy(arrays["actions"]), torch.from_numpy(observed[..., :objects]))

@@ -1,4 +1,4 @@
-"""A guide fitted to each window on its own, to see what sharing one network over all windows costs."""
+"""A guide refined for each window on its own, to measure the amortization gap."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pyro.distributions import transforms
 from pyro.infer.reparam.reparam import Reparam, ReparamResult
 from torch import Tensor
 
-from cavin_pyro.criticism.sampling import draw_guide
-from cavin_pyro.elbo import Program, window_terms
+from cavin_pyro.criticism.statistics.codes import sample_guide
+from cavin_pyro.training.elbo import Program, window_terms
 from models.state import Window
 
-DRAWS_FOR_SPREAD = 64
+SAMPLES_FOR_SPREAD = 64
 
 
 class WindowwiseAffine(Reparam):
@@ -22,12 +22,12 @@ class WindowwiseAffine(Reparam):
 
     `center`, `spread`, `shift`, `stretch`: `[B, D]`. With shift and stretch zero it changes nothing. For a Gaussian
     q(c | window) this is the family of all diagonal Gaussians; of any other guide it moves the whole shape, and of
-    q(z | c, window) it keeps how z hangs on c.
+    q(z | c, window) it keeps how z depends on c.
     """
 
-    def __init__(self, draws: Tensor) -> None:
-        """`draws: [N, B, D]` of the guide, which say where the code of each window is."""
-        self.center, self.spread = draws.mean(0), draws.std(0)
+    def __init__(self, samples: Tensor) -> None:
+        """`samples: [N, B, D]` of the guide, for the location and scale of each window's code."""
+        self.center, self.spread = samples.mean(0), samples.std(0)
         self.shift = torch.zeros_like(self.center, requires_grad=True)
         self.stretch = torch.zeros_like(self.center, requires_grad=True)
 
@@ -56,8 +56,8 @@ def refine(
     Returns:
         A guide for this same `window` and no other.
     """
-    draws = draw_guide(guide, window, DRAWS_FOR_SPREAD)
-    affine = {name: WindowwiseAffine(value) for name, value in draws.items()}
+    samples = sample_guide(guide, window, SAMPLES_FOR_SPREAD)
+    affine = {name: WindowwiseAffine(value) for name, value in samples.items()}
     config: dict[str, Reparam] = {**affine}
     refined = poutine.reparam(guide, config=config)
     free = [tensor for code in affine.values() for tensor in (code.shift, code.stretch)]

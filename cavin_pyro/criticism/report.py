@@ -2,7 +2,7 @@
 
 Keys of report.json:
 
-    about       what was checked: `checkpoint` (path), `weights` (a mark of the file's content), `model`, `guide`,
+    about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`,
                 `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check)
     sections    by name: `title`, `findings` (sentences) and `values`, which the section's function documents
@@ -25,9 +25,10 @@ import jinja2
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from cavin_pyro.criticism.section import Section, Table
-from cavin_pyro.files import replacing, write_json
+from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6
 DOTS_PER_INCH = 150  # of photographs
@@ -56,11 +57,11 @@ def render(section: Section) -> Part:
 
 def write_report(folder: Path, about: Mapping[str, Any], parts: Sequence[Part]) -> None:
     """Write both files, each whole or not at all."""
-    told = plain(about)
+    about = plain(about)
     sections = {part["name"]: {key: part[key] for key in ("title", "findings", "values")} for part in parts}
-    write_json(folder / "report.json", {"about": told, "sections": sections})
-    with replacing(folder / "report.html") as temporary:
-        temporary.write_text(page(told, parts), encoding="utf-8")
+    write_json(folder / "report.json", {"about": about, "sections": sections})
+    with atomic_write(folder / "report.html") as temporary:
+        temporary.write_text(page(about, parts), encoding="utf-8")
 
 
 def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
@@ -70,7 +71,7 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
     )
     source = (resources.files("cavin_pyro.criticism") / "report.html").read_text(encoding="utf-8")
     details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
-    # Old checkpoints may tell less.
+    # Old checkpoints may lack some of these.
     trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
     return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
 
@@ -85,7 +86,7 @@ def plain(value: Any) -> Any:
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
-    if hasattr(value, "tolist"):  # arrays, tensors and their scalars
+    if isinstance(value, np.ndarray | np.generic | Tensor):
         return plain(value.tolist())
     if isinstance(value, float):
         return float(f"{value:.{SIGNIFICANT_DIGITS}g}") if math.isfinite(value) else None

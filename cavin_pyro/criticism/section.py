@@ -1,4 +1,4 @@
-"""What each part of the criticism is given, and what it hands back for the report."""
+"""What a check returns for the report: a section with findings, values, tables and pictures."""
 
 from __future__ import annotations
 
@@ -7,38 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from matplotlib.figure import Figure
-from pyro.nn import PyroModule
-
-from cavin_pyro.collection import CollectionSettings
-from models.pointnet import PointNet
-from models.state import Window
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What is criticised.
-
-    Attributes:
-        model, guide: trained, in evaluation mode, without gradients. pointnet: makes the features of new clouds.
-        training: windows `[B]` that training saw. validation: windows `[B]` of episodes that were held out. In
-            both every window counts for all terms (`sequence_mask` is set everywhere).
-        seed: of everything random. world: in which new episodes are made.
-    """
-
-    model: PyroModule
-    guide: PyroModule
-    pointnet: PointNet
-    training: Window
-    validation: Window
-    seed: int = 0
-    world: CollectionSettings = field(default_factory=CollectionSettings)
-
-    @property
-    def codes(self) -> tuple[str, ...]:
-        """Names of the model's latent sites: effect_code, motion_code, one of them, or none."""
-        return tuple(
-            name for name in ("effect_code", "motion_code") if hasattr(self.model, name.replace("code", "prior"))
-        )
 
 
 @dataclass(frozen=True)
@@ -52,7 +20,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure, and the sentence below it that says what to see in it."""
+    """A figure and its caption."""
 
     name: str  # file name without ending
     caption: str
@@ -61,7 +29,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the report.
+    """One section of the report.
 
     Attributes:
         name: key in report.json. title: heading. explanation: what was measured, on what, and how to read it.

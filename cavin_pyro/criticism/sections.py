@@ -1,4 +1,4 @@
-"""The parts of a criticism by name, and running them one at a time."""
+"""The sections of a report by name, and how to run them."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ from typing import Any
 
 import pyro
 
-from cavin_pyro.building import check_sizes
-from cavin_pyro.criticism.aggregate import assess_aggregate
-from cavin_pyro.criticism.amortisation import assess_amortisation
-from cavin_pyro.criticism.calibration import assess_calibration
-from cavin_pyro.criticism.codes import assess_codes
-from cavin_pyro.criticism.consistency import assess_consistency
-from cavin_pyro.criticism.elbo_section import assess_elbo
-from cavin_pyro.criticism.growth import assess_growth
-from cavin_pyro.criticism.guide_error import assess_guide_error
-from cavin_pyro.criticism.predictive import assess_predictive
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.parts import check_sizes
+from cavin_pyro.criticism.checks.aggregate import assess_aggregate
+from cavin_pyro.criticism.checks.amortization import assess_amortization
+from cavin_pyro.criticism.checks.calibration import assess_calibration
+from cavin_pyro.criticism.checks.codes import assess_codes
+from cavin_pyro.criticism.checks.consistency import assess_consistency
+from cavin_pyro.criticism.checks.elbo import assess_elbo
+from cavin_pyro.criticism.checks.growth import assess_growth
+from cavin_pyro.criticism.checks.guide_error import assess_guide_error
+from cavin_pyro.criticism.checks.predictive import assess_predictive
+from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.report import Part, render
-from cavin_pyro.criticism.section import Section, Subject
-from cavin_pyro.errors import UserError
-from cavin_pyro.files import read_json, write_json
+from cavin_pyro.criticism.section import Section
+from cavin_pyro.storage.files import read_json, write_json
 
-# In the order of the report. Each takes the subject, and what `sizes.<name>` of conf/check.yaml holds; long ones show
+# In the order of the report. Each takes the context, and what `sizes.<name>` holds; long ones show
 # their progress themselves.
 SECTIONS: dict[str, Callable[..., Section]] = {
     "elbo": assess_elbo,
     "guide_error": assess_guide_error,
-    "amortisation": assess_amortisation,
+    "amortization": assess_amortization,
     "codes": assess_codes,
     "aggregate_posterior": assess_aggregate,
     "predictive": assess_predictive,
@@ -55,33 +56,39 @@ def choose_sections(names: str | Sequence[str] | None, sizes: Mapping[str, Mappi
 
 
 def run_sections(
-    names: Sequence[str], subject: Subject, sizes: Mapping[str, Mapping[str, Any]], folder: Path, mark: str
+    names: Sequence[str], context: CheckContext, sizes: Mapping[str, Mapping[str, Any]], folder: Path, fingerprint: str
 ) -> list[Part]:
-    """Run sections, or read those that an earlier run with the same mark has finished.
+    """Run sections, or read those that an earlier run with the same fingerprint has finished.
 
-    Every finished one is a file in `folder / "sections"`, so that a killed check goes on where it stopped. What is
-    random in a section hangs on the subject's seed alone, not on which sections run before it.
+    Every finished one is a file in `folder / "sections"`, so a killed check resumes when it is run again.
+    Random numbers of a section depend on the context's seed alone, not on the sections before it.
     """
     kept = folder / "sections"
     kept.mkdir(exist_ok=True)
     parts = []
     for number, name in enumerate(names, 1):
         print(f"section {number} of {len(names)}: {name}", flush=True)
-        part = _finished(kept / f"{name}.json", mark)
+        part = _finished(kept / f"{name}.json", fingerprint)
         if part is None:
-            pyro.set_rng_seed(subject.seed)
-            part = render(SECTIONS[name](subject, **{str(key): value for key, value in sizes.get(name, {}).items()}))
-            write_json(kept / f"{name}.json", {"mark": mark, "part": part})
+            pyro.set_rng_seed(context.seed)
+            part = render(SECTIONS[name](context, **_arguments(sizes.get(name, {}))))
+            write_json(kept / f"{name}.json", {"fingerprint": fingerprint, "part": part})
         parts.append(part)
     return parts
 
 
-def _finished(path: Path, mark: str) -> Part | None:
+def _arguments(sizes: Mapping[str, Any]) -> dict[str, Any]:
+    return {str(name): value for name, value in sizes.items() if name != "_target_"}
+
+
+def _finished(path: Path, fingerprint: str) -> Part | None:
     if not path.exists():
         return None
     try:
         content = read_json(path)
     except UserError:
         return None  # damaged: run it again
-    same = isinstance(content, dict) and content.get("mark") == mark and isinstance(content.get("part"), dict)
-    return content["part"] if same else None
+    if not isinstance(content, dict) or content.get("fingerprint") != fingerprint:
+        return None
+    part = content.get("part")
+    return part if isinstance(part, dict) else None

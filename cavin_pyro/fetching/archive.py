@@ -1,4 +1,4 @@
-"""Files out of an archive that a stranger has packed: read into memory one by one, never unpacked onto the disk."""
+"""Files of an untrusted archive: each is read into memory, none is unpacked onto the disk."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tarfile
 import zlib
 from pathlib import Path, PurePosixPath
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.config.errors import UserError
 
 LARGEST = 200_000_000  # bytes of one file; no mesh here has a tenth of it
 LARGEST_WHOLE = 2_000_000_000  # bytes of all files
@@ -43,7 +43,7 @@ class Archive:
             UserError: there is no such file.
         """
         if name not in self._files:
-            raise UserError(f"the archive {self.path.name} holds no {name}: it is not the one that was meant")
+            raise UserError(f"the archive {self.path.name} holds no {name}: it is another archive")
         return self._files[name]
 
     def _read_to_the_end(self) -> None:

@@ -1,4 +1,4 @@
-"""Files over HTTP: whole and with the right checksum, or not at all; what broke off is resumed."""
+"""Downloads over HTTP: atomic, checked by checksum, and resumable."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-from cavin_pyro.errors import UserError
-from cavin_pyro.files import PARTIAL, read_json, write_json
-from cavin_pyro.progress import progress_bar
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.files import PARTIAL, read_json, write_json
+from cavin_pyro.storage.progress import progress_bar
 
 TIMEOUT = 30.0  # seconds without an answer
 CHUNK = 1 << 16  # bytes
@@ -21,8 +21,8 @@ CHUNK = 1 << 16  # bytes
 class Checksums:
     """SHA-256 of files by name: those in a lock file, which the first download of each writes.
 
-    No publisher here names a checksum of its files. So the first download is believed if it is a whole archive whose
-    contents stand every check, and all later ones, from whatever mirror, must be the same bytes.
+    The publishers name no checksums. The first download is accepted if it is a complete archive whose contents pass
+    every check; all later ones, from any mirror, must be the same bytes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,7 +32,7 @@ class Checksums:
             raise UserError(f"{path} is damaged: it is no table of checksums; delete it")
 
     def check(self, file: Path) -> None:
-        """Compare a file with what is known of its name.
+        """Compare a file with the checksum that is known for its name.
 
         Raises:
             UserError: it differs; the file is deleted.
@@ -46,7 +46,7 @@ class Checksums:
             )
 
     def record(self, file: Path) -> None:
-        """Remember a file that has proved good."""
+        """Record the checksum of a file that has passed every check."""
         if file.name not in self._known:
             self._known[file.name] = _sha256(file)
             write_json(self.path, self._known)

@@ -1,4 +1,4 @@
-"""The way from a publisher's archives to a folder of assets that is whole or not there."""
+"""Install a publisher's archives as a folder of assets, atomically."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.fetching.archive import Archive
 from cavin_pyro.fetching.download import Checksums, fetch
 from cavin_pyro.fetching.meshes import MissingExtraError
-from cavin_pyro.files import PARTIAL
-from cavin_pyro.progress import progress_bar
+from cavin_pyro.storage.files import PARTIAL
+from cavin_pyro.storage.progress import progress_bar
 
 DONE = ".done"  # a folder with an empty file for every piece that is finished
 
@@ -21,7 +21,7 @@ class Kind(Protocol):
     """One kind of assets.
 
     Attributes:
-        name: its word, and its folder's name. site: the publisher's address.
+        name: of the kind and of its folder. site: the publisher's address.
         pieces: what is made, by name; each from one archive, whose path on the site this maps it to.
         wanted: endings of the files to be taken from an archive.
     """
@@ -101,7 +101,7 @@ def _build(kind: Kind, to: Path, site: str, staging: Path) -> None:
 
 
 def _tidy(*folders: Path) -> None:
-    """Take away those that are empty: a run that failed at once leaves nothing."""
+    """Delete empty folders, so that a run that fails at once leaves nothing."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()

@@ -1,4 +1,4 @@
-"""What turns a scan into something to simulate: fewer faces, convex parts, mass and inertia."""
+"""From a scan to a body for the simulator: fewer faces, convex parts, mass and inertia."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.config.errors import UserError
 
 HULL_FACES = 240  # of a convex part; the simulator's time grows with its corners
 CONVEX = 0.8  # share of its hull that an object fills from which on the hull stands for it

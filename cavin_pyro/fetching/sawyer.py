@@ -9,7 +9,7 @@ from pathlib import Path
 
 import trimesh
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.fetching.archive import Archive
 from cavin_pyro.fetching.meshes import MissingExtraError, decimated
 from envs.robots import STICK_LENGTH, STICK_RADIUS

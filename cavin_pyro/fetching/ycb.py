@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from cavin_pyro.errors import UserError
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.fetching.archive import Archive
 from cavin_pyro.fetching.meshes import (
     convex_parts,
@@ -19,8 +19,8 @@ from cavin_pyro.fetching.meshes import (
     read_parts,
     write_parts,
 )
-from cavin_pyro.files import read_json, write_json
-from envs.scans import SCANS
+from cavin_pyro.storage.files import read_json, write_json
+from envs.objects.scans import SCANS
 
 VISUAL_FACES = 2000
 # Scans are larger than what was measured by hand: an open flap, a bulging bag, a mug's handle.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.camera import FAR, NEAR, Camera
 from envs.physics.bullet import BulletClient, pybullet
+from envs.sensors.camera import FAR, NEAR, Camera
 from envs.sensors.sensor import Rendering
 
 

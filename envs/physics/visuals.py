@@ -1,4 +1,4 @@
-"""What bodies look like and where they are, for those who draw the world themselves."""
+"""What bodies look like and where they are, for other renderers."""
 
 from __future__ import annotations
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera import Camera
 from envs.physics.bullet import BulletClient, connect, pybullet
 from envs.physics.rendering import render
 from envs.physics.visuals import Poses, Visual, link_poses, visuals
+from envs.sensors.camera import Camera
 from envs.sensors.sensor import Rendering
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
@@ -43,7 +43,7 @@ class PhysicsWorld:
 
     def __init__(self) -> None:
         self._bullet = connect()
-        self.on_step: Callable[[], None] | None = None  # called after every step, for whoever films or measures
+        self.on_step: Callable[[], None] | None = None  # called after every step, to film or to measure
         self.reset()
 
     @property

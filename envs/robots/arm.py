@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from envs.camera import Camera
 from envs.physics import TIME_STEP, Arm, ArmDescription, PhysicsWorld
 from envs.robots.reach import InverseKinematics
 from envs.robots.robot import ABOVE_HEIGHT, PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
+from envs.sensors.camera import Camera
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 WAYPOINTS = 11  # along a push, at most 14 mm apart

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera import Camera
+from envs.sensors.camera import Camera
 
 STICK_RADIUS = 0.01  # metres
 STICK_LENGTH = 0.15  # metres

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from envs.camera import Camera
 from envs.physics import TIME_STEP, PhysicsWorld
 from envs.robots.robot import PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
+from envs.sensors.camera import Camera
 
 OFF_STAGE = (0.60, 0.0, 2.0)  # metres, the tool's middle; above the camera, so that no image shows the tool
 _MIDDLE = STICK_LENGTH / 2  # metres above the tip

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from envs.segmentation.clusters import ClusterSegmenter
-from envs.segmentation.mask import MaskSegmenter, Truth
+from envs.segmentation.mask import MaskSegmenter, TrueMasks
 from envs.segmentation.segmenter import Pixels, Segmenter
 
-SEGMENTERS: dict[str, Callable[[Truth], Segmenter]] = {
+SEGMENTERS: dict[str, Callable[[TrueMasks], Segmenter]] = {
     "mask": MaskSegmenter,
-    "clusters": lambda truth: ClusterSegmenter(),  # which has no use for the simulator's word
+    "clusters": lambda true_masks: ClusterSegmenter(),  # which has no use for the simulator's word
 }
 
 
-def segmenter_of(segmentation: str, truth: Truth) -> Segmenter:
+def segmenter_of(segmentation: str, true_masks: TrueMasks) -> Segmenter:
     """The segmenter of a name.
 
     Raises:
@@ -22,7 +22,7 @@ def segmenter_of(segmentation: str, truth: Truth) -> Segmenter:
     """
     if segmentation not in SEGMENTERS:
         raise ValueError(f"unknown segmentation {segmentation!r}: choose from {', '.join(SEGMENTERS)}")
-    return SEGMENTERS[segmentation](truth)
+    return SEGMENTERS[segmentation](true_masks)
 
 
-__all__ = ["SEGMENTERS", "ClusterSegmenter", "MaskSegmenter", "Pixels", "Segmenter", "Truth", "segmenter_of"]
+__all__ = ["SEGMENTERS", "ClusterSegmenter", "MaskSegmenter", "Pixels", "Segmenter", "TrueMasks", "segmenter_of"]

@@ -48,9 +48,9 @@ class Arrangement:
         rows = np.zeros(heights.shape, np.intp)  # of the table
         rows[heights > 0.0] = 1 + np.arange(len(self._occupied))
         self._rows = np.pad(rows, self._border)
-        seen = np.append(0.0, heights[heights > 0.0])
+        observed = np.append(0.0, heights[heights > 0.0])
         levels = LEVEL * np.arange(2 + int(max(shape.patch.max() for shape in shapes) / LEVEL))
-        excess = (np.abs(seen[:, None] - levels) - TOLERANCE) / (CAP - TOLERANCE)
+        excess = (np.abs(observed[:, None] - levels) - TOLERANCE) / (CAP - TOLERANCE)
         self._misfit = (MISFIT * np.clip(excess, 0.0, 1.0)).astype(np.float32)
 
     def lay(self, number: int, pose: Pose | None) -> None:

@@ -1,4 +1,4 @@
-"""From a depth image to a map of the table seen from above: how high something stands on each little cell of it.
+"""From a depth image to a map of the table from above: how high something stands on each little cell of it.
 
 In the image, a tall object leans outwards and hides what is behind it; on the map objects stand apart as they do
 on the table.
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from envs.camera import RAY_COLUMN, RAY_ROW
 from envs.segmentation.segmenter import Pixels
+from envs.sensors.camera import RAY_COLUMN, RAY_ROW
 from envs.sensors.sensor import DepthImage
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
@@ -101,7 +101,7 @@ def fit_table(image: DepthImage) -> NDArray[np.float64]:
     """The plane that most of the image lies in: [3] n such that n . p = 1 for its points p in the image's axes.
 
     Least squares, again and again without what was far from the last plane; the first is level and at the median
-    height. Objects must cover less than half of what is seen.
+    height. Objects must cover less than half of what is observed.
 
     Raises:
         ValueError: the image shows no table.

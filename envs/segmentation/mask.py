@@ -1,4 +1,4 @@
-"""The simulator's own word on which pixel is whose."""
+"""Ground-truth segmentation: the simulator says which pixel is whose."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from numpy.typing import NDArray
 from envs.segmentation.segmenter import Pixels
 from envs.sensors.sensor import DepthImage
 
-Truth = Callable[[], Sequence[NDArray[np.bool_]]]
-"""The simulator's word: for each object, target first, where in the latest image [height, width] it is seen."""
+TrueMasks = Callable[[], Sequence[NDArray[np.bool_]]]
+"""Ground truth: for each object, target first, the pixels [height, width] that show it in the latest image."""
 
 
 class MaskSegmenter:
-    """Passes on what the simulator says, of those pixels that have a measurement.
+    """The true mask of each object, restricted to pixels with a measurement.
 
     Args:
-        truth: asked once per image.
+        true_masks: asked once per image.
     """
 
-    def __init__(self, truth: Truth) -> None:
-        self._truth = truth
+    def __init__(self, true_masks: TrueMasks) -> None:
+        self._true_masks = true_masks
 
     def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
-        """Begin an episode; the simulator needs no telling which object is the target."""
+        """Begin an episode; the simulator knows which object is the target."""
         return self.follow(image)
 
     def follow(self, image: DepthImage) -> list[Pixels]:
         """Pixels of each object, in the simulator's order."""
         measured = image.depth > 0.0
         found = []
-        for mask in self._truth():
+        for mask in self._true_masks():
             rows, columns = np.nonzero(mask & measured)
             found.append((rows, columns))
         return found

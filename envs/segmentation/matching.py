@@ -35,10 +35,10 @@ def match_apart(moved: Mapping[int, Shape], pieces: Sequence[Mask], heights: Hei
     """The piece of each moved object by its number; None if pieces are not one object each."""
     if len(pieces) != len(moved):
         return None
-    seen = [shape_of(piece, heights.filled) for piece in pieces]
-    chosen = _assign(list(moved.values()), seen)
+    observed = [shape_of(piece, heights.filled) for piece in pieces]
+    chosen = _assign(list(moved.values()), observed)
     for shape, column in zip(moved.values(), chosen, strict=True):
-        ratio = seen[column].area / shape.area
+        ratio = observed[column].area / shape.area
         if ratio < REMNANT or (len(moved) > 1 and not ALIKE < ratio < 1.0 / ALIKE):
             return None
     return {number: Match(pieces[column], None) for number, column in zip(moved, chosen, strict=True)}
@@ -86,20 +86,20 @@ def _left_over(
     labels, count = ndimage.label(concerned & ~ndimage.binary_dilation(explained, AROUND), AROUND)
     pieces = [labels == 1 + number for number in range(count)]
     pieces = [piece for piece in pieces if piece.sum() * CELL**2 >= MINIMUM_AREA]
-    seen = [shape_of(piece, heights.filled) for piece in pieces]
-    matched = zip(absent.items(), _assign(list(absent.values()), seen), strict=True)
+    observed = [shape_of(piece, heights.filled) for piece in pieces]
+    matched = zip(absent.items(), _assign(list(absent.values()), observed), strict=True)
     return {
         number: Match(pieces[column], None)
         for (number, shape), column in matched
-        if column >= 0 and seen[column].area >= LEFT_OVER * shape.area
+        if column >= 0 and observed[column].area >= LEFT_OVER * shape.area
     }
 
 
-def _assign(shapes: Sequence[Shape], seen: Sequence[Shape]) -> list[int]:
-    """For each shape the number of what is seen and most probably is that object, -1 for none."""
+def _assign(shapes: Sequence[Shape], observed: Sequence[Shape]) -> list[int]:
+    """For each shape the number of what is observed and most probably is that object, -1 for none."""
     chosen = [-1] * len(shapes)
-    if seen:
-        cost = np.array([[_cost(shape, piece) for piece in seen] for shape in shapes])
+    if observed:
+        cost = np.array([[_cost(shape, piece) for piece in observed] for shape in shapes])
         for row, column in zip(*linear_sum_assignment(cost), strict=True):
             chosen[row] = int(column)
     return chosen

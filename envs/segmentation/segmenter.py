@@ -25,7 +25,7 @@ class Segmenter(Protocol):
 
         Args:
             target: row and column of a pixel on the target, as a person confirms it once; None if it cannot be
-                seen, which leaves the first place empty.
+                observed, which leaves the first place empty.
         """
         ...
 

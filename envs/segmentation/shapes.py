@@ -27,7 +27,7 @@ class Shape:
 
     Attributes:
         patch: [h, w] metres above the table; 0 where the object is not. middle: (row, column) in the patch of the
-            cell that `pose` speaks of. pose: when the object was seen last.
+            cell that `pose` speaks of. pose: when the object was observed last.
     """
 
     patch: NDArray[np.float32]

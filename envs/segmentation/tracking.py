@@ -29,7 +29,7 @@ ALONE = 2  # cells, at least, around an object whose shape is learnt
 
 @dataclass(frozen=True)
 class Track:
-    """What an object looked like when it was last seen.
+    """What an object looked like when it was last observed.
 
     Attributes:
         region: [I, J] its cells. heights: [I, J] the map of that time.
@@ -47,7 +47,7 @@ def begin_track(region: Mask, heights: HeightMap) -> Track:
 
 
 def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Track | None]:
-    """Each track as the new map shows it; None for what is not seen, or has never been."""
+    """Each track as the new map shows it; None for what is not observed, or has never been."""
     known = {number: track for number, track in enumerate(tracks) if track is not None}
     standing = {
         number: Match(track.region & heights.occupied, track.shape)

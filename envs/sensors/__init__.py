@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envs.camera import Camera
+from envs.sensors.camera import Camera
 from envs.sensors.kinect2 import Kinect2
 from envs.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering, SensorMaker
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from envs.camera import KINECT2_HEIGHT, KINECT2_WIDTH, Camera
+from envs.sensors.camera import KINECT2_HEIGHT, KINECT2_WIDTH, Camera
 from envs.sensors.sensor import DepthImage, Renderer
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
@@ -44,7 +44,7 @@ class Perturbation:
     translation: float
     rotation: float
 
-    def draw(self, camera: Camera, generator: np.random.Generator) -> Camera:
+    def sample(self, camera: Camera, generator: np.random.Generator) -> Camera:
         """A camera near `camera`."""
         offsets = np.array(camera.intrinsics_offset) + generator.uniform(-self.intrinsics, self.intrinsics, 4)
         position = np.array(camera.position) + generator.uniform(-self.translation, self.translation, 3)
@@ -82,13 +82,13 @@ class Kinect2:
     def reset(self, generator: np.random.Generator) -> None:
         """Begin an episode with the camera elsewhere."""
         self._generator = generator
-        self.actual = self.viewpoint.draw(self.nominal, generator)
-        self.believed = self.calibration.draw(self.actual, generator)
-        # The table neither moves nor hides behind anything that is not drawn, so that one image serves an episode.
+        self.actual = self.viewpoint.sample(self.nominal, generator)
+        self.believed = self.calibration.sample(self.actual, generator)
+        # The table neither moves nor hides behind anything that is not rendered, so that one image serves an episode.
         self._table = _table_depth(self.actual)
         self._table_noise = axial_noise(self._table, _table_incidence(self.actual))
 
-    def look(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
+    def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         """Take an image."""
         rendering = render(self.actual, table=False)
         drawn = (rendering.bodies >= 0) & (rendering.depth < self._table)
@@ -107,14 +107,14 @@ class Kinect2:
             shift = np.rint(generator.standard_normal((2, len(rows)), dtype=np.float32) * lateral).astype(np.intp)
             from_rows = np.clip(rows + shift[0], 0, camera.height - 1)
             from_columns = np.clip(columns + shift[1], 0, camera.width - 1)
-            seen = depth[from_rows, from_columns]
+            distance = depth[from_rows, from_columns]
             lowest, highest, incidence = _surroundings(depth, from_rows, from_columns, camera)
             edge = highest - lowest > EDGE_JUMP
             fate = generator.random(len(rows), dtype=np.float32)
             share = generator.random(len(rows), dtype=np.float32)
             mixed = edge & (fate >= EDGE_LOSS) & (fate < EDGE_LOSS + EDGE_MIXING)
             # What has an edge for its surroundings has no angle of its own: the smaller one is that of its surface.
-            value = seen + noise[rows, columns] * axial_noise(seen, np.where(edge, 0.0, incidence))
+            value = distance + noise[rows, columns] * axial_noise(distance, np.where(edge, 0.0, incidence))
             # Where there is nothing behind, no light comes back from there and the front is all that is measured.
             behind = np.where(highest > RANGE[1], lowest, highest)
             value = np.where(mixed, lowest + share * (behind - lowest), value)

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.camera import Camera
+from envs.sensors.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Rendering:
 
 
 class Renderer(Protocol):
-    """What draws: `envs.physics.PhysicsWorld.render`."""
+    """A renderer: `envs.physics.PhysicsWorld.render`."""
 
     def __call__(self, camera: Camera, *, table: bool = True) -> Rendering:
         """What `camera` sees, with or without the table."""
@@ -57,10 +57,10 @@ class DepthSensor(Protocol):
         ...
 
     def reset(self, generator: np.random.Generator) -> None:
-        """Begin an episode, whose noise is all drawn from `generator`."""
+        """Begin an episode, whose noise is all sampled from `generator`."""
         ...
 
-    def look(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
+    def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         """Take an image; beside it the simulator's body numbers [height, width], which no sensor has."""
         ...
 
@@ -78,7 +78,7 @@ class IdealSensor:
     def reset(self, generator: np.random.Generator) -> None:
         """Nothing is random here."""
 
-    def look(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
+    def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         """Take an image."""
         rendering = render(self.nominal)
         return DepthImage(rendering.depth, self.nominal), rendering.bodies

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cavin_pyro.collection import CollectionSettings, collect
+from cavin_pyro.data.collection import CollectionConfig, collect
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,23 +37,26 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
     assert all(float(line.split()[5]) > 0.0 for line in (alone, together))
 
 
-def test_ways_to_share_out_tries_are_compared() -> None:
-    lines = run("tries", "--decisions", "1", "--episodes", "1", "--pushes", "1", "--truth", "16").splitlines()
+@pytest.mark.soak
+def test_allocations_of_perturbed_rollouts_are_compared() -> None:
+    lines = run(
+        "perturbed_rollouts", "--problems", "1", "--episodes", "1", "--pushes", "1", "--truth", "16"
+    ).splitlines()
     assert lines[0] == "1 of 2 plans"
     rows = [line.split() for line in lines[2:]]
     assert all(int(row[0]) * int(row[1]) * int(row[2]) == int(row[3]) for row in rows)
     assert all(float(row[4]) >= 0.0 and row[5].endswith("%") for row in rows)
 
 
-def test_collection_tells_where_its_time_goes() -> None:
+def test_collection_reports_where_its_time_goes() -> None:
     printed = run("collection", "--transitions", "12", "--camera", "kinect2")
     shares = [float(share) for share in re.findall(r"([\d.]+) %", printed)]
     # Physics, rendering, segmentation, points, writing, rest.
     assert len(shares) == 6 and sum(shares) == pytest.approx(100, abs=0.5)
 
 
-def test_a_dataset_tells_where_the_time_went_that_it_took(tmp_path: Path) -> None:
-    collect(CollectionSettings(steps=2, episodes_per_shard=2), tmp_path, transitions=6, workers=1)
+def test_a_dataset_reports_where_its_collection_spent_time(tmp_path: Path) -> None:
+    collect(CollectionConfig(steps=2, episodes_per_shard=2), tmp_path, transitions=6, workers=1)
     (tmp_path / "timing.csv").write_text(
         "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
         "0,4,9.0,9.0,0.0,0.0,0.0\n"
@@ -67,17 +70,19 @@ def test_a_dataset_tells_where_the_time_went_that_it_took(tmp_path: Path) -> Non
     assert shares == ["50.0", "25.0", "12.5", "2.5", "10.0"]
 
 
+@pytest.mark.soak
 def test_segmentation_is_judged_in_scenes_and_over_whole_episodes(tmp_path: Path) -> None:
-    few = ["--scenes", "2", "--episodes", "1", "--crowds", "1", "--log", str(tmp_path / "log.jsonl")]
+    few = ["--scenes", "2", "--episodes", "1", "--clutters", "1", "--log", str(tmp_path / "log.jsonl")]
     run("segmentation", *few, "--tasks", "0")
     printed = run("segmentation", *few, "--tasks", "1")  # goes on after what is in the log
     assert re.search(r"right number of objects: [\d.]+ % .*, \d of 2\n", printed)
     assert re.search(r"identities kept over the whole episode: [\d.]+ % .*, [01] of 1\n", printed)
     kinds = [json.loads(line)["kind"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert kinds == ["scene", "scene", "episode", "crowd", "task"]
+    assert kinds == ["scene", "scene", "episode", "clutter", "task"]
 
 
-def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+@pytest.mark.soak
+def test_the_world_survives_adversarial_pushes_and_resumes(tmp_path: Path) -> None:
     words = ["--adversarial", "0.8", "--log", str(tmp_path / "world.jsonl")]
     run("world", "--resets", "2", "--pushes", "10", *words)
     printed = run("world", "--resets", "5", "--pushes", "40", *words)
@@ -88,13 +93,15 @@ def test_the_world_outlives_pushes_that_mean_harm_and_goes_on_where_it_stopped(t
     assert counts == [2, 10, 3, 30]
 
 
-def test_an_arm_outlives_pushes_that_mean_harm_and_its_memory_stays(tmp_path: Path) -> None:
+@pytest.mark.soak
+def test_an_arm_survives_adversarial_pushes_without_growing_memory(tmp_path: Path) -> None:
     words = ["--resets", "4", "--pushes", "12", "--adversarial", "0.7", "--robot", "panda"]
     printed = run("world", *words, "--log", str(tmp_path / "world.jsonl"))
     assert printed.count("0 jumps, 0 looks at an object inside the table") == 2 and "WRONG" not in printed
     assert "12 pushes: " in printed and "heuristic: done" in printed and ": refused" in printed
 
 
+@pytest.mark.soak
 def test_the_robots_pushes_are_compared_with_the_sticks_and_drawn(tmp_path: Path) -> None:
     file, pictures = tmp_path / "robots.json", tmp_path / "pictures"
     run("robots", "--pushes", "5", "--robots", "panda", "--weights", "heavy", "--json", str(file))

@@ -14,22 +14,22 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import hydra
 import pyro
 import pytest
 import torch
 from omegaconf import DictConfig
 
-from cavin_pyro.building import build_guide, build_model
-from cavin_pyro.checkpoint import save_checkpoint
-from cavin_pyro.collection import CollectionSettings, collect
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.data.collection import CollectionConfig, collect
+from cavin_pyro.storage.checkpoint import save_checkpoint
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
-from models.pointnet import PointNet
+from models.networks.pointnet import PointNet
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-PUSHES = CollectionSettings(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
+PUSHES = CollectionConfig(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
 
 # Each case in turn, in one process: a start costs seconds, the case itself milliseconds.
 RUN_IN_TURN = """
@@ -41,7 +41,7 @@ for case in json.load(sys.stdin):
     output, errors, status = io.StringIO(), io.StringIO(), 0
     os.makedirs(case["folder"], exist_ok=True)
     os.chdir(case["folder"])
-    sys.argv = [case["command"], *case["words"]]
+    sys.argv = [case["command"], *case["overrides"]]
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
         try:
             importlib.import_module("cavin_pyro." + case["command"]).main()
@@ -75,19 +75,19 @@ class Case:
     """A command to be run in a folder of its own."""
 
     command: str
-    words: Sequence[str]
+    overrides: Sequence[str]
 
 
-def start_command(command: str, *words: str, folder: Path, quiet: bool = False) -> subprocess.Popen[str]:
+def start_command(command: str, *overrides: str, folder: Path, quiet: bool = False) -> subprocess.Popen[str]:
     """Begin a command as a user does, from the folder; `quiet` for those that are to be killed."""
     pipe = subprocess.DEVNULL if quiet else subprocess.PIPE
-    line = [sys.executable, "-m", f"cavin_pyro.{command}", *words]
+    line = [sys.executable, "-m", f"cavin_pyro.{command}", *overrides]
     return subprocess.Popen(line, cwd=folder, env=ENVIRONMENT, stdout=pipe, stderr=pipe, text=True)
 
 
-def run_command(command: str, *words: str, folder: Path) -> Answer:
+def run_command(command: str, *overrides: str, folder: Path) -> Answer:
     """Run a command as a user does, from the folder."""
-    with start_command(command, *words, folder=folder) as process:
+    with start_command(command, *overrides, folder=folder) as process:
         output, errors = process.communicate(timeout=300)
     return Answer(process.returncode, output, errors)
 
@@ -95,7 +95,7 @@ def run_command(command: str, *words: str, folder: Path) -> Answer:
 def run_in_turn(cases: Mapping[str, Case], folder: Path) -> dict[str, Answer]:
     """Run many commands in one process, each from `folder / its name`."""
     jobs = [
-        {"command": case.command, "words": list(case.words), "folder": str(folder / name)}
+        {"command": case.command, "overrides": list(case.overrides), "folder": str(folder / name)}
         for name, case in cases.items()
     ]
     line = [sys.executable, "-c", RUN_IN_TURN]
@@ -118,7 +118,7 @@ def small_config() -> dict[str, Any]:
     return {
         "model": {"_target_": "models.cascaded.CascadedModel", "segment_length": 3, **sizes},
         "guide": {"_target_": "guides.cascaded.CascadedGuide", "width": 8},
-        "prior": {"_target_": "models.priors.StandardPrior"},
+        "prior": {"_target_": "models.priors.standard.StandardPrior"},
         "scales": {"_target_": "models.likelihoods.LikelihoodScales"},
     }
 
@@ -202,11 +202,10 @@ def checkpoint_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def configure(checkpoint_file: Path) -> Callable[..., DictConfig]:
-    """The configuration of a short evaluation in one process, from further words."""
+    """The configuration of a short evaluation in one process, with further overrides."""
 
-    def compose(*words: str) -> DictConfig:
+    def configuration(*overrides: str) -> DictConfig:
         few = ["maximum_steps=4", "workers=1", "episodes=3", "objects=2", "output=unused"]
-        with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
-            return hydra.compose("evaluate", overrides=[f"checkpoint={checkpoint_file}", *few, *words])
+        return compose("evaluate", f"checkpoint={checkpoint_file}", *few, *overrides)
 
-    return compose
+    return configuration

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from envs.objects import ObjectParameters
+from envs.objects.sampling import ObjectParameters
+from envs.objects.shapes import builtin_shape
 from envs.scene import Scene
-from envs.shapes import builtin_shape
 from envs.workspace import normalised_push
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)

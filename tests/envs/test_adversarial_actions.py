@@ -36,8 +36,8 @@ def test_any_four_numbers_are_carried_out_in_the_reach_or_refused(env: PushingEn
         np.testing.assert_array_equal(env.scene.ground_truth().positions, before)
         assert env._steps == steps
         return
-    seen, reward, terminated, _, info = env.step(action)
-    assert env.observation_space.contains(seen) and np.isfinite(reward)
+    observed, reward, terminated, _, info = env.step(action)
+    assert env.observation_space.contains(observed) and np.isfinite(reward)
     after = env.scene.ground_truth().positions
     on_table = ((after[:, :2] > TABLE_LOW) & (after[:, :2] < TABLE_HIGH)).all(axis=-1)
     assert (after[on_table, 2] > 0.0).all()  # through the table nothing goes

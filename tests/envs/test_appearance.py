@@ -44,8 +44,8 @@ def test_table_and_tool_have_their_sizes() -> None:
     env.close()
 
 
-def test_looking_at_the_world_does_not_change_it() -> None:
-    seen = []
+def test_rendering_the_world_does_not_change_it() -> None:
+    observed = []
     for looked in (False, True):
         env = PushingEnv(task="clearing", objects=3)
         env.reset(seed=1)
@@ -54,6 +54,6 @@ def test_looking_at_the_world_does_not_change_it() -> None:
             links = [(part.body, part.link) for part in parts_of(world)]
             env.scene.on_frame = lambda world=world, links=links: world.link_poses(links)
         pushes = np.random.default_rng(0).uniform(-1, 1, (8, 4)).astype(np.float32)
-        seen.append([env.step(push)[0]["clouds"] for push in pushes])
+        observed.append([env.step(push)[0]["clouds"] for push in pushes])
         env.close()
-    np.testing.assert_array_equal(*seen)
+    np.testing.assert_array_equal(*observed)

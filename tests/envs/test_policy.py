@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs import policy
-from envs.objects import Area, ObjectRanges
+from envs.objects.sampling import Area, ObjectRanges
 from envs.observation import Observation
 from envs.policy import NEAR, NOISE, SPREAD, START_CLEARANCE, HeuristicPushingPolicy
 from envs.robots import STICK_RADIUS
@@ -39,14 +39,14 @@ def blobs(seed: int, count: int = 3) -> Observation:
 @settings(deadline=None, max_examples=30)
 @given(seed=SEEDS, count=st.integers(1, MAXIMUM_OBJECTS))
 def test_pushes_start_clear_of_every_object(seed: int, count: int) -> None:
-    seen = blobs(seed, count)
+    observed = blobs(seed, count)
     policy = HeuristicPushingPolicy(np.random.default_rng(seed))
     for _ in range(6):
-        action = policy.act(seen)
+        action = policy.act(observed)
         assert action.shape == (4,) and (np.abs(action) <= 1).all()
         start, _ = push_endpoints(action)
-        assert np.linalg.norm(seen.centers[:count, :2] - start, axis=1).min() >= START_CLEARANCE == 0.05
-        assert np.linalg.norm(seen.clouds[:count, ::4, :2] - start, axis=-1).min() >= STICK_RADIUS
+        assert np.linalg.norm(observed.centers[:count, :2] - start, axis=1).min() >= START_CLEARANCE == 0.05
+        assert np.linalg.norm(observed.clouds[:count, ::4, :2] - start, axis=-1).min() >= STICK_RADIUS
 
 
 @settings(deadline=None, max_examples=30)
@@ -62,9 +62,9 @@ def test_pushes_point_within_45_degrees_of_the_held_angle_but_for_noise(seed: in
 
 
 def test_pushes_use_the_whole_spread_of_directions() -> None:
-    policy = HeuristicPushingPolicy(np.random.default_rng(0), hold=10_000)
-    seen = blobs(0, 1)
-    actions = np.array([policy.act(seen) for _ in range(150)])
+    policy = HeuristicPushingPolicy(np.random.default_rng(0), intent_length=10_000)
+    observed = blobs(0, 1)
+    actions = np.array([policy.act(observed) for _ in range(150)])
     turns = np.arctan2(actions[:, 3], actions[:, 2]) - policy.intent.angle
     turns = (turns + np.pi) % (2 * np.pi) - np.pi
     assert turns.min() < -0.6 and turns.max() > 0.6
@@ -75,22 +75,22 @@ def test_pushes_use_the_whole_spread_of_directions() -> None:
 @given(SEEDS)
 def test_pushes_bring_the_tool_near_their_target(seed: int) -> None:
     policy = HeuristicPushingPolicy(np.random.default_rng(seed))
-    seen = blobs(seed)
+    observed = blobs(seed)
     for _ in range(6):
-        start, end = push_endpoints(policy.act(seen))
+        start, end = push_endpoints(policy.act(observed))
         path = start + np.linspace(0, 1, 200)[:, None] * (end - start)
-        cloud = seen.clouds[policy.intent.target, :, :2]
+        cloud = observed.clouds[policy.intent.target, :, :2]
         assert np.linalg.norm(cloud[:, None] - path, axis=-1).min() <= STICK_RADIUS + NEAR + 0.001
 
 
-@pytest.mark.parametrize("hold", [1, 3, 5])
-def test_target_and_angle_are_held_for_as_many_pushes_as_asked(hold: int) -> None:
-    policy = HeuristicPushingPolicy(np.random.default_rng(0), hold=hold)
-    seen, intents = blobs(1), []
-    for _ in range(6 * hold):
-        policy.act(seen)
+@pytest.mark.parametrize("length", [1, 3, 5])
+def test_target_and_angle_are_kept_for_the_length_of_an_intent(length: int) -> None:
+    policy = HeuristicPushingPolicy(np.random.default_rng(0), intent_length=length)
+    observed, intents = blobs(1), []
+    for _ in range(6 * length):
+        policy.act(observed)
         intents.append((policy.intent.target, policy.intent.angle))
-    runs = [set(intents[first : first + hold]) for first in range(0, len(intents), hold)]
+    runs = [set(intents[first : first + length]) for first in range(0, len(intents), length)]
     assert all(len(run) == 1 for run in runs)
     assert len(set.union(*runs)) == 6
     assert len({target for target, _ in intents}) > 1
@@ -98,12 +98,12 @@ def test_target_and_angle_are_held_for_as_many_pushes_as_asked(hold: int) -> Non
 
 def test_pushes_that_go_on_after_they_meet_the_target_are_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
     def mean_travel() -> float:
-        rule, travels = HeuristicPushingPolicy(np.random.default_rng(0), hold=1), []
+        rule, travels = HeuristicPushingPolicy(np.random.default_rng(0), intent_length=1), []
         for seed in range(60):
-            seen = blobs(seed, 2)
-            start, end = push_endpoints(rule.act(seen))
+            observed = blobs(seed, 2)
+            start, end = push_endpoints(rule.act(observed))
             path = start + np.linspace(0, 1, 101)[:, None] * (end - start)
-            cloud = seen.clouds[rule.intent.target, :, :2]
+            cloud = observed.clouds[rule.intent.target, :, :2]
             met = np.linalg.norm(cloud[:, None] - path, axis=-1).min(axis=0) <= STICK_RADIUS
             travels.append((1 - met.argmax() / 100) * np.linalg.norm(end - start) if met.any() else 0.0)
         return float(np.mean(travels))
@@ -117,7 +117,7 @@ def test_a_share_of_the_pushes_starts_elsewhere_with_the_same_motion() -> None:
     shifts = []
     for seed in range(100):
         plain, perturbed = (
-            HeuristicPushingPolicy(np.random.default_rng(seed), perturbed=share).act(blobs(seed, 2))
+            HeuristicPushingPolicy(np.random.default_rng(seed), perturbation_rate=share).act(blobs(seed, 2))
             for share in (0.0, 0.4)
         )
         np.testing.assert_array_equal(perturbed[2:], plain[2:])
@@ -129,20 +129,20 @@ def test_a_share_of_the_pushes_starts_elsewhere_with_the_same_motion() -> None:
 
 
 def test_only_known_objects_are_targets() -> None:
-    seen = blobs(2, 4)
+    observed = blobs(2, 4)
     mask = np.array([False, True, False, True, False])
-    seen = Observation(seen.clouds, seen.centers, mask, mask)
-    policy, targets = HeuristicPushingPolicy(np.random.default_rng(0), hold=1), set()
+    observed = Observation(observed.clouds, observed.centers, mask, mask)
+    policy, targets = HeuristicPushingPolicy(np.random.default_rng(0), intent_length=1), set()
     for _ in range(30):
-        policy.act(seen)
+        policy.act(observed)
         targets.add(policy.intent.target)
     assert targets == {1, 3}
 
 
 def test_an_object_out_of_reach_is_answered_with_some_push() -> None:
-    seen = blobs(0, 1)
-    clouds = seen.clouds + np.float32([0.0, 5.0, 0.0])
-    away = Observation(clouds, clouds.mean(axis=1), seen.mask, seen.visible)
+    observed = blobs(0, 1)
+    clouds = observed.clouds + np.float32([0.0, 5.0, 0.0])
+    away = Observation(clouds, clouds.mean(axis=1), observed.mask, observed.visible)
     action = HeuristicPushingPolicy(np.random.default_rng(0)).act(away)
     assert action.shape == (4,) and (np.abs(action) <= 1).all()
 
@@ -162,12 +162,12 @@ def test_most_pushes_move_something_and_few_are_unsafe() -> None:
     scene = Scene()
     reports = []
     for seed in range(12):
-        draw, act = np.random.default_rng(seed).spawn(2)
-        seen = scene.draw([REACHABLE] * 3, ObjectRanges(clearance=0.12), draw)
-        policy = HeuristicPushingPolicy(act)
+        sampling, acting = np.random.default_rng(seed).spawn(2)
+        observed = scene.sample([REACHABLE] * 3, ObjectRanges(clearance=0.12), sampling)
+        policy = HeuristicPushingPolicy(acting)
         for _ in range(5):
-            reports.append(scene.push(policy.act(seen)))
-            seen = scene.observe()
+            reports.append(scene.push(policy.act(observed)))
+            observed = scene.observe()
     scene.close()
     assert len(reports) == 60
     assert np.mean([not report.ineffective for report in reports]) >= 0.6

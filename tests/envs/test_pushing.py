@@ -13,18 +13,26 @@ import torch
 import yaml
 from gymnasium.utils.env_checker import check_env
 
-from envs.layouts import TASK_NAMES, Layout, load_layout
-from envs.objects import ObjectParameters, ObjectRanges
+from envs.layouts import layout_numbers, load_task
+from envs.objects.sampling import ObjectParameters, ObjectRanges
 from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
 from envs.pushing import EPISODE_STEPS, PushingEnv
 from envs.scene import PushReport
-from envs.tasks import TaskReward
+from envs.tasks import TASKS, TaskReward
+from envs.tasks.crossing import Crossing
 from envs.workspace import normalised_push, tile_center
 
 NOTHING = np.array([-1.0, -1.0, 0.0, 0.0], dtype=np.float32)  # in a corner where no builtin task starts objects
 LYING_ALONG_Y = (-0.5, -0.5, -0.5, 0.5)
-BRIDGE = Layout("crossing", ((2, 2), (2, 3), (2, 4)), ((2, 2),), ((2, 4),), ((1, 3), (3, 3)))
+KNOWN_TASKS = ", ".join(TASKS)
+TILES = {
+    "region": [[2, 2], [2, 3], [2, 4]],
+    "goal": [[2, 2]],
+    "target_start": [[2, 4]],
+    "obstacle_start": [[1, 3], [3, 3]],
+}
+BRIDGE = Crossing(**TILES)
 Make = Callable[..., PushingEnv]
 
 
@@ -38,7 +46,9 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
         env = PushingEnv(**options)
         made.append(env)
         if objects:
-            monkeypatch.setattr(env.scene, "draw", lambda *_, **__: env.scene.reset(objects, np.random.default_rng(0)))
+            monkeypatch.setattr(
+                env.scene, "sample", lambda *_, **__: env.scene.reset(objects, np.random.default_rng(0))
+            )
         return env
 
     yield build
@@ -46,8 +56,10 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
         env.close()
 
 
-def observation(seen: dict[str, np.ndarray]) -> Observation:
-    return Observation(seen["clouds"], seen["centers"], seen["mask"].astype(bool), seen["visible"].astype(bool))
+def observation(observed: dict[str, np.ndarray]) -> Observation:
+    return Observation(
+        observed["clouds"], observed["centers"], observed["mask"].astype(bool), observed["visible"].astype(bool)
+    )
 
 
 def assert_equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
@@ -56,19 +68,19 @@ def assert_equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> No
         np.testing.assert_array_equal(one[name], other[name])
 
 
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_finds_nothing_wrong(task: str) -> None:
     env = gymnasium.make(f"cavin/{task.capitalize()}-v0", render_mode="rgb_array")
-    assert isinstance(env.unwrapped, PushingEnv) and env.unwrapped.layout.task == task
+    assert isinstance(env.unwrapped, PushingEnv) and env.unwrapped.task.name == task
     check_env(env.unwrapped)  # what it warns of is an error here
     env.close()
 
 
 def test_environments_can_be_stepped_side_by_side() -> None:
     envs = gymnasium.make_vec("cavin/Insertion-v0", num_envs=2, vectorization_mode="sync", objects=2)
-    seen, _ = envs.reset(seed=0)
-    assert seen["clouds"].shape == (2, 5, 256, 3)
-    assert not np.array_equal(seen["centers"][0], seen["centers"][1])
+    observed, _ = envs.reset(seed=0)
+    assert observed["clouds"].shape == (2, 5, 256, 3)
+    assert not np.array_equal(observed["centers"][0], observed["centers"][1])
     _, reward, terminated, truncated, info = envs.step(np.stack([NOTHING, NOTHING]))
     np.testing.assert_array_equal(reward, [-1, -1])
     assert not terminated.any() and not truncated.any() and info["ineffective"].all()
@@ -80,10 +92,10 @@ def test_environments_can_be_stepped_side_by_side() -> None:
 
 def test_a_step_reports_all_that_happened(make: Make) -> None:
     env = make(objects=2)
-    seen, info = env.reset(seed=1)
-    assert env.observation_space.contains(seen) and info == {"steps": 0, "layout": env.layout}
-    seen, reward, terminated, truncated, info = env.step(NOTHING)
-    assert env.observation_space.contains(seen)
+    observed, info = env.reset(seed=1)
+    assert env.observation_space.contains(observed) and info == {"steps": 0, "task": env.task}
+    observed, reward, terminated, truncated, info = env.step(NOTHING)
+    assert env.observation_space.contains(observed)
     assert set(info) == {"steps", "unsafe", "ineffective", "stopped", "success", "violation", "fall", "terms"}
     assert info["terms"] == {"goal": 0, "violation": 0, "time": -1, "progress": 0}
     assert (reward, terminated, truncated) == (-1, False, False)
@@ -93,55 +105,54 @@ def test_a_step_reports_all_that_happened(make: Make) -> None:
 @pytest.mark.parametrize("objects", range(1, 6))
 def test_one_to_five_objects_can_be_asked_for(make: Make, objects: int) -> None:
     env = make(task="clearing", objects=objects)
-    seen, _ = env.reset(seed=objects)
-    assert seen["mask"].tolist() == seen["visible"].tolist() == [1] * objects + [0] * (5 - objects)
+    observed, _ = env.reset(seed=objects)
+    assert observed["mask"].tolist() == observed["visible"].tolist() == [1] * objects + [0] * (5 - objects)
     assert env.observation_space.contains(env.step(NOTHING)[0])
 
 
-@pytest.mark.parametrize("task", TASK_NAMES)
-@pytest.mark.parametrize("layout", [0, 1, 2])
+@pytest.mark.parametrize(("task", "layout"), [(task, number) for task in TASKS for number in layout_numbers(task)])
 def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(make: Make, task: str, layout: int) -> None:
     env = make(task=task, layout=layout, objects=3)
-    reward = TaskReward(env.layout)
+    reward = TaskReward(env.task)
     for seed in range(3):
-        seen, _ = env.reset(seed=seed)
-        centers = torch.from_numpy(seen["centers"])
-        outcome = reward(centers, centers, torch.from_numpy(seen["mask"] == 1))
+        observed, _ = env.reset(seed=seed)
+        centers = torch.from_numpy(observed["centers"])
+        outcome = reward(centers, centers, torch.from_numpy(observed["mask"] == 1))
         assert not outcome.success and not outcome.failure
-        starts = [env.layout.target_start, env.layout.obstacle_start, env.layout.obstacle_start]
-        for center, tiles in zip(seen["centers"][:3], starts, strict=True):
+        starts = [env.task.target_start, env.task.obstacle_start, env.task.obstacle_start]
+        for center, tiles in zip(observed["centers"][:3], starts, strict=True):
             nearest = min(np.abs(center[:2] - tile_center(tile)).max() for tile in tiles)
             assert nearest < 0.075 + 0.06  # within a tile, and some centimetres of rolling until rest
 
 
-def test_a_scene_in_which_the_target_has_rolled_off_the_bridge_is_drawn_anew(
+def test_a_scene_in_which_the_target_has_rolled_off_the_bridge_is_sampled_anew(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = make(layout=0, objects=1)
-    draws, reset = [], env.scene.reset
-    monkeypatch.setattr(env.scene, "reset", lambda *args: draws.append(reset(*args)) or draws[-1])
-    reward, started = TaskReward(env.layout), 40
+    samples, reset = [], env.scene.reset
+    monkeypatch.setattr(env.scene, "reset", lambda *args: samples.append(reset(*args)) or samples[-1])
+    reward, started = TaskReward(env.task), 40
     for seed in range(started):
         center = torch.from_numpy(env.reset(seed=seed)[0]["centers"][:1])
         assert not reward(center, center, torch.tensor([True])).failure
-    assert started < len(draws) < 2 * started
+    assert started < len(samples) < 2 * started
 
 
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
-def test_the_reward_is_the_task_reward_of_what_was_seen(make: Make, task: str, kind: str) -> None:
+def test_the_reward_is_the_task_reward_of_the_observations(make: Make, task: str, kind: str) -> None:
     env = make(task=task, objects=4, reward=kind, ranges=ObjectRanges(clearance=0.1))
-    imagined = TaskReward(env.layout, reward=kind)
+    imagined = TaskReward(env.task, reward=kind)
     policy = HeuristicPushingPolicy(np.random.default_rng(1))
     changed = 0
-    seen, _ = env.reset(seed=2)
+    observed, _ = env.reset(seed=2)
     for _ in range(10):
-        before = seen
-        seen, reward, terminated, _, info = env.step(policy.act(observation(seen)).astype(np.float32))
+        before = observed
+        observed, reward, terminated, _, info = env.step(policy.act(observation(observed)).astype(np.float32))
         outcome = imagined(
             torch.from_numpy(before["centers"]),
-            torch.from_numpy(seen["centers"]),
-            torch.from_numpy(seen["mask"] == 1),
+            torch.from_numpy(observed["centers"]),
+            torch.from_numpy(observed["mask"] == 1),
         )
         assert reward == pytest.approx(sum(info["terms"].values()))
         if not info["fall"]:  # an object that has fallen is out of sight: only the simulator knows
@@ -150,7 +161,7 @@ def test_the_reward_is_the_task_reward_of_what_was_seen(make: Make, task: str, k
             assert terminated == bool(outcome.success | outcome.failure)
         changed += not info["ineffective"]
         if terminated:
-            seen, _ = env.reset()
+            observed, _ = env.reset()
     assert changed >= 1
 
 
@@ -172,7 +183,7 @@ def test_an_episode_has_sixty_steps_unless_told_otherwise(make: Make) -> None:
 
 def test_pushing_the_target_to_the_goal_ends_the_episode_with_success(make: Make, put: Callable) -> None:
     x, y = tile_center((2, 3))
-    env = make(put("rubiks_cube", x, y - 0.03), layout=BRIDGE, objects=1, reward="dense")
+    env = make(put("rubiks_cube", x, y - 0.03), task=BRIDGE, objects=1, reward="dense")
     env.reset(seed=0)
     push = normalised_push(np.array([x, y + 0.04]), np.array([0.0, -0.1])).astype(np.float32)
     _, reward, terminated, truncated, info = env.step(push)
@@ -183,7 +194,7 @@ def test_pushing_the_target_to_the_goal_ends_the_episode_with_success(make: Make
 
 def test_pushing_the_target_off_the_bridge_ends_the_episode_with_a_violation(make: Make, put: Callable) -> None:
     x, y = tile_center((2, 4))
-    env = make(put("rubiks_cube", x + 0.05, y), layout=BRIDGE, objects=1)
+    env = make(put("rubiks_cube", x + 0.05, y), task=BRIDGE, objects=1)
     env.reset(seed=0)
     push = normalised_push(np.array([x - 0.02, y]), np.array([0.1, 0.0])).astype(np.float32)
     _, reward, terminated, _, info = env.step(push)
@@ -194,26 +205,26 @@ def test_pushing_the_target_off_the_bridge_ends_the_episode_with_a_violation(mak
 def test_an_object_off_the_table_ends_the_episode_with_a_fall(make: Make, put: Callable) -> None:
     x, y = tile_center((2, 3))
     box = put("sugar_box", 0.55, 0.50, orientation=LYING_ALONG_Y)
-    env = make(put("rubiks_cube", x, y), box, layout=BRIDGE, objects=2)
+    env = make(put("rubiks_cube", x, y), box, task=BRIDGE, objects=2)
     env.reset(seed=0)
     infos = []
     for start in (0.39, 0.43, 0.46, 0.49):
         push = normalised_push(np.array([0.55, start]), np.array([0.0, 0.1])).astype(np.float32)
-        seen, reward, terminated, truncated, info = env.step(push)
+        observed, reward, terminated, truncated, info = env.step(push)
         infos.append(info)
         if terminated:
             break
     assert info["fall"] and terminated and not truncated and reward == -101
     assert not info["success"] and not info["violation"]
     assert not any(one["fall"] for one in infos[:-1])
-    assert env.observation_space.contains(seen)
+    assert env.observation_space.contains(observed)
 
 
 @pytest.mark.parametrize(("place", "otherwise"), [((2, 2), "success"), ((4, 4), "violation")])
 def test_a_fall_that_the_camera_cannot_see_outweighs_what_it_sees(
     make: Make, put: Callable, place: tuple[int, int], otherwise: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    env = make(put("rubiks_cube", *tile_center(place)), layout=BRIDGE, objects=1)
+    env = make(put("rubiks_cube", *tile_center(place)), task=BRIDGE, objects=1)
     for fallen in (False, True):
         env.reset(seed=0)
         report = PushReport(False, True, np.zeros(1), fallen)
@@ -226,7 +237,7 @@ def test_a_fall_that_the_camera_cannot_see_outweighs_what_it_sees(
 
 def test_the_last_allowed_step_may_still_succeed(make: Make, put: Callable) -> None:
     x, y = tile_center((2, 3))
-    env = make(put("rubiks_cube", x, y - 0.03), layout=BRIDGE, objects=1, maximum_steps=1)
+    env = make(put("rubiks_cube", x, y - 0.03), task=BRIDGE, objects=1, maximum_steps=1)
     env.reset(seed=0)
     push = normalised_push(np.array([x, y + 0.04]), np.array([0.0, -0.1])).astype(np.float32)
     assert env.step(push)[2:4] == (True, False)
@@ -262,12 +273,12 @@ def test_what_a_caller_does_to_an_observation_changes_no_reward(make: Make) -> N
     rewards = []
     for spoil in (False, True):
         env = make(objects=2, reward="dense")
-        seen, _ = env.reset(seed=0)
+        observed, _ = env.reset(seed=0)
         for _ in range(2):
             if spoil:
-                for array in seen.values():
+                for array in observed.values():
                     array += 1
-            seen, reward, *_ = env.step(NOTHING)
+            observed, reward, *_ = env.step(NOTHING)
         rewards.append(reward)
     assert rewards[0] == rewards[1]
 
@@ -275,17 +286,14 @@ def test_what_a_caller_does_to_an_observation_changes_no_reward(make: Make) -> N
 # Layouts.
 
 
-def test_a_layout_may_be_a_number_a_file_or_an_object(make: Make, tmp_path: Path) -> None:
+def test_a_layout_may_be_a_number_or_a_file_or_belong_to_a_task_that_has_been_built(make: Make, tmp_path: Path) -> None:
     path = tmp_path / "unseen.yaml"
-    tiles = {
-        name: [list(tile) for tile in getattr(BRIDGE, name)] for name in BRIDGE.__dataclass_fields__ if name != "task"
-    }
-    path.write_text(yaml.safe_dump(tiles))
-    layouts = [make(layout=one).layout for one in (BRIDGE, path, str(path))]
-    assert layouts == [BRIDGE] * 3
-    assert make(task="insertion", layout=2).layout == load_layout("insertion", 2)
-    changed = make(task="insertion", layout=2, tiles={"goal": [[3, 3]]}).layout
-    assert changed.goal == ((3, 3),) and changed.region == load_layout("insertion", 2).region
+    path.write_text(yaml.safe_dump(TILES))
+    given = ({"task": BRIDGE}, {"layout": path}, {"layout": str(path)}, {"task": Crossing, "layout": path})
+    assert [make(**options).task for options in given] == [BRIDGE] * 4
+    assert make(task="insertion", layout=2).task == load_task("insertion", 2)
+    changed = make(task="insertion", layout=2, tiles={"goal": [[3, 3]]}).task
+    assert changed.goal.tiles == ((3, 3),) and changed.region == load_task("insertion", 2).region
     env = make(layout=path, objects=2)
     env.reset(seed=0)
     assert env.step(NOTHING)[1] == -1
@@ -302,7 +310,7 @@ def test_a_layout_may_be_a_number_a_file_or_an_object(make: Make, tmp_path: Path
         ({"objects": 2.5}, r"^objects must be a whole number from 1 to 5, not 2.5$"),
         ({"maximum_steps": 0}, r"^maximum_steps must be at least 1, not 0$"),
         ({"render_mode": "human"}, r"^unknown render_mode 'human': choose rgb_array or None$"),
-        ({"task": "juggling"}, r"^unknown task 'juggling': choose from clearing, insertion, crossing$"),
+        ({"task": "juggling"}, rf"^unknown task 'juggling': choose from {KNOWN_TASKS}$"),
         ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
         ({"layout": 3}, r"^unknown layout 3: choose 0, 1, 2, random or the path of a YAML file$"),
         ({"robot": "hand"}, r"^unknown robot 'hand': choose from stick, sawyer, panda$"),
@@ -310,7 +318,7 @@ def test_a_layout_may_be_a_number_a_file_or_an_object(make: Make, tmp_path: Path
         ({"layout": "nowhere.yaml"}, r"^layout nowhere.yaml cannot be read"),
         ({"tiles": {"goal": [[9, 9]]}}, r"goal: tile \[9, 9\] is off the table"),
         ({"tiles": {"bridge": [[1, 1]]}}, r"unknown key 'bridge'"),
-        ({"layout": BRIDGE, "tiles": {"goal": [[2, 3]]}}, r"^tiles replace fields of a layout that is read"),
+        ({"task": BRIDGE, "tiles": {"goal": [[2, 3]]}}, r"^a task that has been built has its layout"),
     ],
 )
 def test_a_bad_argument_gets_its_one_line(options: dict, message: str) -> None:
@@ -320,7 +328,7 @@ def test_a_bad_argument_gets_its_one_line(options: dict, message: str) -> None:
 
 
 def test_a_layout_without_room_is_refused_at_reset(make: Make) -> None:
-    env = make(layout=BRIDGE, objects=5, ranges=ObjectRanges(clearance=0.3))
+    env = make(task=BRIDGE, objects=5, ranges=ObjectRanges(clearance=0.3))
     with pytest.raises(ValueError, match=r"^no room for 5 objects at least 0.3 m apart where the layout starts"):
         env.reset(seed=0)
 

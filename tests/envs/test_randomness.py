@@ -12,7 +12,7 @@ from envs import randomness
 from envs.randomness import (
     collection_streams,
     layout_stream,
-    next_draw_streams,
+    next_sample_streams,
     next_scene_stream,
     planner_seed,
     sensor_stream,
@@ -34,7 +34,7 @@ def test_the_streams_are_those_of_the_table() -> None:
     scenes = [next_scene_stream(environment) for _ in range(2)]
     for reset, scene in enumerate(scenes):
         for attempt in range(2):
-            objects, points = next_draw_streams(scene)
+            objects, points = next_sample_streams(scene)
             assert first(objects) == keyed(7, reset, 2 * attempt)
             assert first(sensor_stream(points)) == keyed(7, reset, 2 * attempt + 1, randomness.SENSOR)
             assert first(points) == keyed(7, reset, 2 * attempt + 1)
@@ -45,8 +45,8 @@ def test_the_streams_are_those_of_the_table() -> None:
     assert planner_seed(7) == SeedSequence([7, 1]).generate_state(1)[0]
 
 
-def test_numbers_that_were_published_with_are_still_drawn() -> None:
-    assert first(next_draw_streams(next_scene_stream(default_rng(0)))[0]) == 5_212_420_523_617_970_750
+def test_numbers_behind_published_results_are_still_sampled() -> None:
+    assert first(next_sample_streams(next_scene_stream(default_rng(0)))[0]) == 5_212_420_523_617_970_750
     assert planner_seed(0) == 3_964_924_996
 
 
@@ -65,7 +65,7 @@ def test_streams_of_all_purposes_differ() -> None:
     numbers = []
     for seed in range(20):
         scene = next_scene_stream(default_rng(seed))
-        objects, points = next_draw_streams(scene)
+        objects, points = next_sample_streams(scene)
         numbers += map(first, (layout_stream(scene), objects, sensor_stream(points), points, scene))
         numbers += [first(default_rng(planner_seed(seed)))]
         numbers += [first(policy) for _, policy in (collection_streams(seed, episode) for episode in range(5))]

@@ -15,7 +15,6 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.camera import Camera
 from envs.physics import PhysicsWorld
 from envs.pushing import PushingEnv
 from envs.robots import ROBOTS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, ArmRobot, push, robot_maker
@@ -24,6 +23,7 @@ from envs.robots.panda import panda
 from envs.robots.robot import ABOVE_HEIGHT
 from envs.robots.sawyer import sawyer
 from envs.scene import Scene
+from envs.sensors.camera import Camera
 from envs.workspace import REACH_HIGH, REACH_LOW
 from tests.real_assets import REAL_ASSETS
 
@@ -43,7 +43,7 @@ def scene_of() -> Callable[[str], Scene]:
         scene.close()
 
 
-def drawn(scene: Scene) -> set[int]:
+def bodies_in_view(scene: Scene) -> set[int]:
     """Bodies that the observing camera sees."""
     return set(np.unique(scene.world.render(scene.camera).bodies).tolist()) - {-1}
 
@@ -113,17 +113,17 @@ def test_the_arm_is_in_the_photograph_of_a_push_and_never_in_the_image_that_is_o
     photographs: list[np.ndarray] = []
 
     def film() -> None:
-        during.append(drawn(scene))
+        during.append(bodies_in_view(scene))
         photographs.append(scene.photograph(scene.camera))
 
     scene = Scene(robot=name, assets=REAL_ASSETS)
     scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
     arm, without = scene.robot.arm.body, scene.photograph(scene.camera)
-    assert arm not in drawn(scene)
+    assert arm not in bodies_in_view(scene)
     for action in (push(0.45, 0.0, 0.0, 0.1), push(0.55, 0.0, 0.0, 0.1), push(0.45, 0.2, 0.08, 0.0)):
         scene.on_frame = film if not during else None
         scene.push(action)
-        assert arm not in drawn(scene)
+        assert arm not in bodies_in_view(scene)
         assert all(scene.robot.clear_of_view(camera) for camera in CAMERAS)
     assert arm in set().union(*during)
     shown = max(np.abs(image.astype(int) - without).max(axis=-1).mean() for image in photographs)
@@ -307,13 +307,13 @@ def test_gymnasium_finds_nothing_wrong_with_an_arm(name: str) -> None:
 
 def episode(name: str) -> bytes:
     """Everything that fixed actions show."""
-    env, seen = PushingEnv(robot=name, assets=REAL_ASSETS, objects=3), b""
+    env, content = PushingEnv(robot=name, assets=REAL_ASSETS, objects=3), b""
     actions = np.random.default_rng(0).uniform(-0.6, 0.6, size=(3, 4)).astype(np.float32)
     first, _ = env.reset(seed=1)
     for observed in (first, *(env.step(action)[0] for action in actions)):
-        seen += b"".join(array.tobytes() for array in observed.values())
+        content += b"".join(array.tobytes() for array in observed.values())
     env.close()
-    return seen
+    return content
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from envs.camera import Camera
-from envs.objects import WHOLE_TABLE, Area, ObjectRanges
+from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
+from envs.objects.shapes import BUILTIN_NAMES
 from envs.physics import PhysicsWorld
 from envs.robots import OFF_STAGE, SETTLED_SPEED, STICK_RADIUS
 from envs.scene import MOVED, TURNED, PushReport, Scene
 from envs.sensors import IdealSensor
-from envs.shapes import BUILTIN_NAMES
+from envs.sensors.camera import Camera
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
 
 ROOT = Path(__file__).parents[2]
@@ -38,20 +38,20 @@ def truth(scene: Scene) -> np.ndarray:
 
 
 def gap(scene: Scene, tool_at: np.ndarray, number: int = 0) -> float:
-    """Metres between the tool, were it at [2], and the nearest point that was seen of an object."""
+    """Metres between the tool, were it at [2], and the nearest point that was observed of an object."""
     cloud = scene.observe().clouds[number, :, :2]
     return float(np.linalg.norm(cloud - tool_at, axis=1).min()) - STICK_RADIUS
 
 
 def history(scene: Scene, seed: int, pushes: int = 4) -> list[np.ndarray]:
     """Everything that a short episode of fixed actions leaves behind."""
-    draw, act = generators(seed)
-    seen = scene.draw([REACHABLE] * 4, RANGES, draw)
-    states = [truth(scene), seen.clouds]
+    sampling, acting = generators(seed)
+    observed = scene.sample([REACHABLE] * 4, RANGES, sampling)
+    states = [truth(scene), observed.clouds]
     for _ in range(pushes):
-        scene.push(act.uniform(-1, 1, size=4))
-        seen = scene.observe()
-        states += [truth(scene), seen.clouds, seen.visible]
+        scene.push(acting.uniform(-1, 1, size=4))
+        observed = scene.observe()
+        states += [truth(scene), observed.clouds, observed.visible]
     return states
 
 
@@ -59,17 +59,17 @@ def history(scene: Scene, seed: int, pushes: int = 4) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_drawn_scene_has_settled_on_the_table(scene: Scene, seed: int) -> None:
-    (draw, _) = generators(seed)
+def test_a_sampled_scene_has_settled_on_the_table(scene: Scene, seed: int) -> None:
+    (sampling, _) = generators(seed)
     count = 1 + seed % MAXIMUM_OBJECTS
-    seen = scene.draw([WHOLE_TABLE] * count, RANGES, draw)
+    observed = scene.sample([WHOLE_TABLE] * count, RANGES, sampling)
     assert scene.world.fastest(scene.bodies) < SETTLED_SPEED
     before = truth(scene)
     assert before.shape == (count, 7) and (before[:, 2] > 0).all()
     for _ in range(240):
         scene.world.step()
     np.testing.assert_allclose(truth(scene)[:, :3], before[:, :3], atol=0.003)
-    assert seen.mask.tolist() == seen.visible.tolist() == [True] * count + [False] * (MAXIMUM_OBJECTS - count)
+    assert observed.mask.tolist() == observed.visible.tolist() == [True] * count + [False] * (MAXIMUM_OBJECTS - count)
 
 
 @pytest.mark.parametrize("name", BUILTIN_NAMES)
@@ -200,12 +200,12 @@ def test_an_object_pushed_off_the_table_has_fallen(scene: Scene, put: Callable, 
     assert scene.ground_truth().positions[1, 2] < -0.5
 
 
-def test_a_fallen_object_keeps_the_cloud_last_seen(scene: Scene, put: Callable, push: Callable) -> None:
+def test_a_fallen_object_keeps_its_latest_cloud(scene: Scene, put: Callable, push: Callable) -> None:
     off_the_edge(scene, put, push)
-    seen = scene.observe()
-    assert seen.visible.tolist() == [True] + [False] * 4
-    assert seen.mask.tolist() == [True, True] + [False] * 3
-    assert np.isfinite(seen.clouds).all() and seen.centers[1, 1] > 0.4
+    observed = scene.observe()
+    assert observed.visible.tolist() == [True] + [False] * 4
+    assert observed.mask.tolist() == [True, True] + [False] * 3
+    assert np.isfinite(observed.clouds).all() and observed.centers[1, 1] > 0.4
     scene.push(EMPTY_CORNER)  # what has fallen does not trouble later pushes
 
 
@@ -213,13 +213,13 @@ def test_a_fallen_object_keeps_the_cloud_last_seen(scene: Scene, put: Callable, 
 
 
 def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scene, put: Callable) -> None:
-    seen = scene.reset([put("mug", 0.5, 0.2), put("banana", 0.6, -0.2)], np.random.default_rng(0))
-    assert seen.clouds.shape == (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
-    assert seen.clouds.dtype == seen.centers.dtype == np.float32
-    np.testing.assert_allclose(seen.centers, seen.clouds.mean(axis=1), atol=1e-6)
-    assert not seen.clouds[2:].any() and not seen.centers[2:].any()
+    observed = scene.reset([put("mug", 0.5, 0.2), put("banana", 0.6, -0.2)], np.random.default_rng(0))
+    assert observed.clouds.shape == (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
+    assert observed.clouds.dtype == observed.centers.dtype == np.float32
+    np.testing.assert_allclose(observed.centers, observed.clouds.mean(axis=1), atol=1e-6)
+    assert not observed.clouds[2:].any() and not observed.centers[2:].any()
     poses = scene.ground_truth().positions
-    np.testing.assert_allclose(seen.centers[:2, :2], poses[:, :2], atol=0.02)  # half of an object is hidden
+    np.testing.assert_allclose(observed.centers[:2, :2], poses[:, :2], atol=0.02)  # half of an object is hidden
 
 
 def test_an_object_out_of_view_keeps_its_last_cloud(put: Callable) -> None:
@@ -234,44 +234,44 @@ def test_an_object_out_of_view_keeps_its_last_cloud(put: Callable) -> None:
     scene.close()
 
 
-def test_an_object_never_seen_is_not_in_the_mask(put: Callable, push: Callable) -> None:
+def test_an_object_never_observed_is_not_in_the_mask(put: Callable, push: Callable) -> None:
     scene = Scene(camera=Camera(position=(0.6, -0.3, 0.4)))
-    seen = scene.reset([put("mug", 0.6, 0.3), put("rubiks_cube", 0.6, -0.3)], np.random.default_rng(0))
-    assert seen.mask.tolist() == seen.visible.tolist() == [False, True, False, False, False]
-    assert not seen.clouds[0].any()
+    observed = scene.reset([put("mug", 0.6, 0.3), put("rubiks_cube", 0.6, -0.3)], np.random.default_rng(0))
+    assert observed.mask.tolist() == observed.visible.tolist() == [False, True, False, False, False]
+    assert not observed.clouds[0].any()
     report = scene.push(push(0.6, 0.5, 0.0, -0.1))
     assert report.moved.shape == (2,)
     scene.close()
 
 
-def test_a_later_look_does_not_change_an_earlier_observation(scene: Scene, put: Callable, push: Callable) -> None:
-    seen = scene.reset([put("mug", 0.55, 0.0)], np.random.default_rng(0))
-    clouds, mask = seen.clouds.copy(), seen.mask.copy()
+def test_a_later_capture_does_not_change_an_earlier_observation(scene: Scene, put: Callable, push: Callable) -> None:
+    observed = scene.reset([put("mug", 0.55, 0.0)], np.random.default_rng(0))
+    clouds, mask = observed.clouds.copy(), observed.mask.copy()
     scene.push(push(0.45, 0.0, 0.1, 0.0))
     scene.observe()
-    np.testing.assert_array_equal(seen.clouds, clouds)
-    np.testing.assert_array_equal(seen.mask, mask)
+    np.testing.assert_array_equal(observed.clouds, clouds)
+    np.testing.assert_array_equal(observed.mask, mask)
 
 
-def test_a_scene_whose_objects_cannot_all_be_seen_is_not_drawn() -> None:
+def test_a_scene_whose_objects_are_not_all_visible_is_not_sampled() -> None:
     scene = Scene(camera=Camera(position=(0.6, -0.3, 0.4)))
     hidden: Area = (((0.5, 0.35), (0.7, 0.45)),)
     with pytest.raises(ValueError, match=r"^no room for 1 objects: none of 50 scenes") as caught:
-        scene.draw([hidden], ObjectRanges(names=("rubiks_cube",)), np.random.default_rng(0))
+        scene.sample([hidden], ObjectRanges(names=("rubiks_cube",)), np.random.default_rng(0))
     assert "\n" not in str(caught.value)
     scene.close()
 
 
-def test_only_acceptable_scenes_are_drawn(scene: Scene) -> None:
+def test_only_acceptable_scenes_are_sampled(scene: Scene) -> None:
     offered: list[float] = []
 
-    def acceptable(seen: object) -> bool:
-        offered.append(float(seen.centers[0, 0]))
+    def acceptable(observed: object) -> bool:
+        offered.append(float(observed.centers[0, 0]))
         return len(offered) == 3
 
-    seen = scene.draw([WHOLE_TABLE], ObjectRanges(), np.random.default_rng(0), acceptable=acceptable)
+    observed = scene.sample([WHOLE_TABLE], ObjectRanges(), np.random.default_rng(0), acceptable=acceptable)
     assert len(offered) == len(set(offered)) == 3
-    assert seen.centers[0, 0] == np.float32(offered[-1])
+    assert observed.centers[0, 0] == np.float32(offered[-1])
 
 
 @pytest.mark.parametrize("count", [0, 6])

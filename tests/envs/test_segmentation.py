@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs.segmentation.clusters as clusters_module
-from envs.camera import Camera
-from envs.objects import ObjectParameters
+from envs.objects.sampling import ObjectParameters
 from envs.pushing import PushingEnv
 from envs.scene import Scene
 from envs.segmentation import SEGMENTERS, ClusterSegmenter, MaskSegmenter, segmenter_of
@@ -26,6 +25,7 @@ from envs.segmentation.regions import split_at_necks
 from envs.segmentation.registration import explain
 from envs.segmentation.shapes import Pose, shape_of
 from envs.sensors import CAMERAS, DepthImage
+from envs.sensors.camera import Camera
 
 ROOT = Path(__file__).parents[2]
 CAMERA = Camera(256, 212, rotation=(0.02, -0.02, 0.01))
@@ -39,7 +39,7 @@ def seen_by_kinect() -> Iterator[Scene]:
 
 
 def table(camera: Camera = CAMERA, *boxes: tuple[float, float, float, float], height: float = 0.05) -> DepthImage:
-    """A table seen without noise, with flat-topped boxes (x, y, half x, half y) on it, metres."""
+    """A table observed without noise, with flat-topped boxes (x, y, half x, half y) on it, metres."""
     rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
     directions = camera.rays(rows, columns) @ camera.axes
     depth = -camera.position[2] / directions[:, 2]
@@ -285,12 +285,12 @@ def test_the_map_covers_the_table() -> None:
 def test_clusters_agree_with_the_mask_on_what_the_kinect_sees(seen_by_kinect: Scene, put: Callable) -> None:
     names = ("mug", "sugar_box", "banana", "gelatin_box")
     objects: list[ObjectParameters] = [put(name, 0.45 + 0.1 * n, -0.35 + 0.22 * n) for n, name in enumerate(names)]
-    seen = seen_by_kinect.reset(objects, np.random.default_rng(0))
-    assert seen.visible.tolist() == [True] * 4 + [False]
+    observed = seen_by_kinect.reset(objects, np.random.default_rng(0))
+    assert observed.visible.tolist() == [True] * 4 + [False]
     assert seen_by_kinect.objects[0].name == "mug"  # confirmed
     by_mask = Scene(camera="kinect2", segmentation="mask")
     expected = by_mask.reset(seen_by_kinect.objects, np.random.default_rng(0))
-    np.testing.assert_allclose(seen.centers[:4], expected.centers[:4], atol=0.012)
+    np.testing.assert_allclose(observed.centers[:4], expected.centers[:4], atol=0.012)
     assert [one.name for one in seen_by_kinect.objects] == [one.name for one in by_mask.objects]
     by_mask.close()
 
@@ -308,10 +308,10 @@ import hashlib, numpy as np
 from envs.pushing import PushingEnv
 env, hashed = PushingEnv(objects=3, camera="kinect2", segmentation="clusters"), hashlib.sha256()
 for run in range({runs}):
-    seen = [env.reset(seed=4)[0]]
-    seen += [env.step(action)[0] for action in np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)]
+    observed = [env.reset(seed=4)[0]]
+    observed += [env.step(action)[0] for action in np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)]
     hashed = hashlib.sha256()
-    for one in seen:
+    for one in observed:
         for name in sorted(one):
             hashed.update(one[name].tobytes())
 print(hashed.hexdigest())

@@ -50,13 +50,13 @@ def test_each_environment_goes_on_as_it_does_alone(mode: str, make: Make) -> Non
     """Over the end of an episode: the step after it resets, as `AutoresetMode.NEXT_STEP` says."""
     envs = make(mode, AutoresetMode.NEXT_STEP)
     alone = [gymnasium.make(NAME, **OPTIONS) for _ in SEEDS]
-    seen, _ = envs.reset(seed=SEEDS)
+    observed, _ = envs.reset(seed=SEEDS)
     for number, env in enumerate(alone):
-        assert_equal(seen, number, env.reset(seed=SEEDS[number])[0])
+        assert_equal(observed, number, env.reset(seed=SEEDS[number])[0])
     ended = [False] * len(SEEDS)
     resets = 0
     for actions in ACTIONS:
-        seen, rewards, terminated, truncated, info = envs.step(actions)
+        observed, rewards, terminated, truncated, info = envs.step(actions)
         for number, env in enumerate(alone):
             if ended[number]:
                 one, reward, ends = env.reset()[0], 0.0, (False, False)
@@ -64,7 +64,7 @@ def test_each_environment_goes_on_as_it_does_alone(mode: str, make: Make) -> Non
             else:
                 one, reward, *ends, told = env.step(actions[number])
                 assert info["unsafe"][number] == told["unsafe"] and info["steps"][number] == told["steps"]
-            assert_equal(seen, number, one)
+            assert_equal(observed, number, one)
             assert (rewards[number], terminated[number], truncated[number]) == (reward, *ends)
             ended[number] = any(ends)
     assert resets >= len(SEEDS)
@@ -80,30 +80,30 @@ def test_the_autoreset_mode_is_named_and_the_last_observation_is_not_lost(mode: 
     envs.reset(seed=SEEDS)
     alone.reset(seed=SEEDS[0])
     for actions in ACTIONS[:2]:
-        seen, _, _, truncated, info = envs.step(actions)
+        observed, _, _, truncated, info = envs.step(actions)
         last, *_ = alone.step(actions[0])
     assert truncated.all() and info["_final_obs"].all()
     for name, array in last.items():
         np.testing.assert_array_equal(info["final_obs"][0][name], array)
-    assert_equal(seen, 0, alone.reset()[0])
+    assert_equal(observed, 0, alone.reset()[0])
     alone.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_environment_tells_its_own_layout(mode: str, make: Make) -> None:
     envs = make(mode, AutoresetMode.DISABLED, layout="random")
-    drawn = set()
+    sampled = set()
     for seed in range(6):
         _, info = envs.reset(seed=[seed, seed + 100])
-        assert list(info["layout"]) == list(envs.get_attr("layout"))
-        drawn |= set(info["layout"])
-    assert len(drawn) > 1
+        assert list(info["task"]) == list(envs.get_attr("task"))
+        sampled |= set(info["task"])
+    assert len(sampled) > 1
 
 
 def test_observations_of_earlier_steps_keep_their_content(make: Make) -> None:
     envs = make("async", AutoresetMode.NEXT_STEP)
-    seen, _ = envs.reset(seed=SEEDS)
-    kept = {name: array.copy() for name, array in seen.items()}
+    observed, _ = envs.reset(seed=SEEDS)
+    kept = {name: array.copy() for name, array in observed.items()}
     envs.step(ACTIONS[0])
     for name, array in kept.items():
-        np.testing.assert_array_equal(seen[name], array)
+        np.testing.assert_array_equal(observed[name], array)

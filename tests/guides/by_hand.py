@@ -194,12 +194,12 @@ def log_weight(
 def loss_of(elbo: Callable[..., Tensor], model: nn.Module, guide: nn.Module, window: Window, *noise: Tensor) -> Tensor:
     """-J_f and, for windows that count, minus what `elbo(w, q, example, *noise)` says of their codes.
 
-    `w` and `q` are the weights of model and guide, `noise: [B, D]` the standard normal draws of each code.
+    `w` and `q` are the weights of model and guide, `noise: [B, D]` the standard normal samples of each code.
     """
     w, q = Weights(model), Weights(guide)
     total = log_transitions(w, window)
     for b in window.sequence_mask.nonzero().flatten().tolist():
-        total = total + elbo(w, q, Example(window, b), *(draws[b] for draws in noise))
+        total = total + elbo(w, q, Example(window, b), *(one[b] for one in noise))
     return -total
 
 

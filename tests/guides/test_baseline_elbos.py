@@ -41,8 +41,8 @@ def check(elbo: Callable[..., Tensor], model: torch.nn.Module, guide: torch.nn.M
     torch.manual_seed(11)
     loss = Trace_ELBO(num_particles=3, vectorize_particles=True, max_plate_nesting=1)(model, guide)(window)
     torch.manual_seed(11)
-    draws = [torch.randn(3, *one.shape, dtype=torch.float64) for one in noise]
-    single = [by_hand.loss_of(elbo, model, guide, window, *(draw[n] for draw in draws)) for n in range(3)]
+    samples = [torch.randn(3, *one.shape, dtype=torch.float64) for one in noise]
+    single = [by_hand.loss_of(elbo, model, guide, window, *(one[n] for one in samples)) for n in range(3)]
     assert loss.item() == pytest.approx(sum(single).item() / 3, rel=1e-9)
 
 

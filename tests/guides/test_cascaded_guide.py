@@ -95,7 +95,9 @@ def test_reordering_objects_leaves_the_loss(model: CascadedModel, random_window:
 
 
 def test_codes_of_a_window_regenerate_it(model: CascadedModel, random_window: Callable[..., Window]) -> None:
-    drawn = Predictive(model, guide=CascadedGuide(model), num_samples=6, parallel=True)(random_window(), generate=True)
-    assert drawn["effect_code"].shape == (6, 4, 5)
-    assert drawn["actions"].shape == (6, 4, 3, 4)
-    assert drawn["next_centers"].shape == (6, 4, 3, 4, 3)
+    sampled = Predictive(model, guide=CascadedGuide(model), num_samples=6, parallel=True)(
+        random_window(), generate=True
+    )
+    assert sampled["effect_code"].shape == (6, 4, 5)
+    assert sampled["actions"].shape == (6, 4, 3, 4)
+    assert sampled["next_centers"].shape == (6, 4, 3, 4, 3)

@@ -89,7 +89,7 @@ def test_every_weight_of_the_flows_learns(model: CascadedModel, guide: FlowGuide
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
 
 
-def test_the_mean_field_objective_falls_back_to_draws(model: CascadedModel, guide: FlowGuide, window: Window) -> None:
+def test_the_mean_field_objective_falls_back_to_samples(model: CascadedModel, guide: FlowGuide, window: Window) -> None:
     stir(guide)
     losses = []
     for objective in (Trace_ELBO(), TraceMeanField_ELBO()):

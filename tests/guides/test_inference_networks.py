@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from guides.inference import EffectInference, MotionInference
-from models.layers import SCALE_FLOOR, GaussianCode
+from guides.networks import EffectInference, MotionInference
+from models.networks.layers import SCALE_FLOOR, GaussianCode
 from models.state import State, Window
 
 

@@ -11,20 +11,21 @@ from torch import Tensor, nn
 
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
-from models.learned_priors import ConditionalPrior, FlowPrior
+from models.priors.conditional import ConditionalPrior
+from models.priors.flow import FlowPrior
 from models.state import Window
 
 SIZES = {"effect_dimension": 5, "motion_dimension": 4, "feature_dimension": 6, "width": 8}
 each_prior = pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior])
 
 
-def programs(kind: type, *, stirred: bool = True) -> tuple[CascadedModel, CascadedGuide]:
+def programs(kind: type, *, randomized: bool = True) -> tuple[CascadedModel, CascadedGuide]:
     model = CascadedModel(
         **SIZES,
         effect_prior=kind(dimension=5, feature_dimension=6, width=8),
         motion_prior=kind(dimension=4, feature_dimension=6, effect_dimension=5, width=8),
     )
-    if stirred:
+    if randomized:
         for name, parameter in model.named_parameters():
             if name.startswith("prior"):
                 nn.init.normal_(parameter, std=0.3)
@@ -43,7 +44,7 @@ def loss_of(objective: Trace_ELBO, pair: tuple[CascadedModel, CascadedGuide], wi
 
 @each_prior
 def test_before_training_the_loss_is_that_of_the_standard_prior(kind: type, window: Window) -> None:
-    model, guide = programs(kind, stirred=False)
+    model, guide = programs(kind, randomized=False)
     standard = CascadedModel(**SIZES).double()
     standard.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith("prior")})
     same = CascadedGuide(standard, width=8).double()
@@ -66,7 +67,7 @@ def test_codes_of_the_guide_count_under_the_learned_prior(kind: type, window: Wi
         for parameter in getattr(pair[0], part).parameters():
             nn.init.zeros_(parameter)
         if kind is ConditionalPrior:
-            getattr(pair[0], part).code.begin_at_standard()
+            getattr(pair[0], part).code.initialize_standard()
     expected = loss_of(Trace_ELBO(), pair, window) + ((standard - terms) * window.sequence_mask).sum()
     assert learned.item() == pytest.approx(expected.item(), rel=1e-9)
 
@@ -89,25 +90,25 @@ def test_the_mean_field_objective_has_the_divergences_in_closed_form(window: Win
     difference = torch.zeros(4, dtype=torch.float64)
     for site, p in zip((c, z), priors, strict=True):
         q = site["fn"]
-        drawn = q.log_prob(site["value"]) - p.log_prob(site["value"])
+        sampled = q.log_prob(site["value"]) - p.log_prob(site["value"])
         squares = (q.variance + (q.mean - p.mean) ** 2) / (2 * p.variance)
         closed = (p.stddev.log() - q.stddev.log() + squares - 0.5).sum(-1)
-        difference = difference + closed - drawn
+        difference = difference + closed - sampled
     expected = loss_of(Trace_ELBO(), pair, window) + (difference * window.sequence_mask).sum()
     assert loss_of(TraceMeanField_ELBO(), pair, window).item() == pytest.approx(expected.item(), rel=1e-9)
 
 
-def test_the_mean_field_objective_falls_back_to_draws_under_a_flow(window: Window) -> None:
+def test_the_mean_field_objective_falls_back_to_samples_under_a_flow(window: Window) -> None:
     pair = programs(FlowPrior)
     expected = loss_of(Trace_ELBO(), pair, window)
     assert loss_of(TraceMeanField_ELBO(), pair, window).item() == pytest.approx(expected.item(), rel=1e-12)
 
 
 @each_prior
-def test_particles_and_draws_run_in_parallel(kind: type, window: Window) -> None:
+def test_particles_and_samples_run_in_parallel(kind: type, window: Window) -> None:
     pair = programs(kind)
     many = Trace_ELBO(num_particles=8, vectorize_particles=True, max_plate_nesting=1)
     assert loss_of(many, pair, window).isfinite()
-    drawn = Predictive(pair[0], num_samples=6, parallel=True)(window, generate=True)
-    assert drawn["effect_code"].shape == (6, 4, 5)
-    assert drawn["motion_code"].shape == (6, 4, 4)
+    sampled = Predictive(pair[0], num_samples=6, parallel=True)(window, generate=True)
+    assert sampled["effect_code"].shape == (6, 4, 5)
+    assert sampled["motion_code"].shape == (6, 4, 4)

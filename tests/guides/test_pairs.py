@@ -44,7 +44,7 @@ def test_a_guide_samples_exactly_the_codes_of_its_model(pair: Pair, random_windo
     in_model, in_guide = (poutine.trace(program).get_trace(window) for program in (model, guide))
     codes = [name for name in in_model.stochastic_nodes if name != "windows"]
     assert codes == [name for name in in_guide.stochastic_nodes if name != "windows"]
-    assert set(codes) == {f"{kind}_code" for kind in ("effect", "motion") if hasattr(model, f"{kind}_dimension")}
+    assert codes == list(model.codes)
     for name in codes:
         assert in_guide.nodes[name]["fn"].shape() == in_model.nodes[name]["fn"].shape() == (4, DIMENSION[name])
 
@@ -150,8 +150,8 @@ def test_padding_leaves_the_loss(pair: Pair, number: float, kept: bool, random_w
 @every_pair
 def test_codes_of_a_window_regenerate_it(pair: Pair, random_window: Callable[..., Window]) -> None:
     model, guide = make(*pair)
-    drawn = Predictive(model, guide=guide, num_samples=6, parallel=True)(random_window(), generate=True)
-    assert drawn["next_centers"].shape == (6, 4, 3, 4, 3)
-    assert drawn["next_centers"].isfinite().all()
-    assert ("actions" in drawn) == hasattr(model, "actions")
-    assert ("subgoal_centers" in drawn) == hasattr(model, "subgoal")
+    sampled = Predictive(model, guide=guide, num_samples=6, parallel=True)(random_window(), generate=True)
+    assert sampled["next_centers"].shape == (6, 4, 3, 4, 3)
+    assert sampled["next_centers"].isfinite().all()
+    assert ("actions" in sampled) == bool(model.codes)
+    assert ("subgoal_centers" in sampled) == ("effect_code" in model.codes)

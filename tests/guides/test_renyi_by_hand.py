@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from types import SimpleNamespace
 
-import hydra
 import pytest
 import torch
 from torch import Tensor
 
-from cavin_pyro.building import build_objective
+from cavin_pyro.config.composition import compose
+from cavin_pyro.training.factory import build_objective
 from guides.cascaded import CascadedGuide
 from guides.guide import Guide
 from guides.joint import JointGuide
@@ -49,8 +49,7 @@ def programs(request: pytest.FixtureRequest) -> tuple[CascadedModel, Guide]:
 
 def loss_in_training(programs: tuple[CascadedModel, Guide], window: Window) -> Tensor:
     """What `train objective=iwae` minimises."""
-    with hydra.initialize_config_module("cavin_pyro.conf", version_base="1.3"):
-        config = hydra.compose("train", overrides=["objective=iwae", f"objective.elbo.num_particles={K}"])
+    config = compose("train", "objective=iwae", f"objective.elbo.num_particles={K}")
     return build_objective(config, programs[0]).bind(*programs)(window, 0)
 
 
@@ -65,8 +64,8 @@ def by_hand_in_full(programs: tuple[CascadedModel, Guide], window: Window, noise
     for b in window.sequence_mask.nonzero().flatten().tolist():
         example, weights = Example(window, b), []
         for k in range(K):
-            draws = [code[k, b] for code in noise]
-            weights.append(by_hand.log_weight(w, q, example, *draws, **READS[type(guide)]))
+            own = [one[k, b] for one in noise]
+            weights.append(by_hand.log_weight(w, q, example, *own, **READS[type(guide)]))
         largest = max(weights).detach()
         scaled = [torch.exp(weight - largest) for weight in weights]
         bound = bound + largest + torch.log(sum(scaled) / K)

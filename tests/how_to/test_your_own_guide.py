@@ -1,4 +1,4 @@
-"""docs/how-to-your-own-guide.md: its code and its commands, taken from the page and run in a folder of a user's."""
+"""docs/how-to/your-own-guide.md: its code and its commands, taken from the page and run in a folder of a user's."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from types import ModuleType
 import pytest
 import torch
 
-from cavin_pyro.errors import UserError
-from cavin_pyro.pairs import check_pair
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.training.compatibility import check_compatibility
 from models.cascaded import CascadedModel
 from models.state import State, Window
 from tests.cavin_pyro.conftest import ROOT, Answer, run_command
 
-PAGE = (ROOT / "docs" / "how-to-your-own-guide.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "how-to" / "your-own-guide.md").read_text(encoding="utf-8")
 CODE = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
 FOLLOWS = " ..."  # in the page's table: the line goes on
@@ -126,14 +126,18 @@ def window() -> Window:
 
 def test_the_guide_of_the_page_fits(window: Window) -> None:
     model = CascadedModel(width=8)
-    check_pair(model, module_of(CODE[0]).MyGuide(model), window)
+    check_compatibility(model, module_of(CODE[0]).MyGuide(model), window)
 
 
-SAMPLE = "with windows_plate(window), counted_sequences(window)"
+SAMPLE = "with windows_plate(window), sequence_mask(window)"
 MISTAKES = {
     "misspelt": {'pyro.sample("effect_code"': 'pyro.sample("efect_code"'},
-    "no plate": {SAMPLE: "with counted_sequences(window)"},
+    "no plate": {SAMPLE: "with sequence_mask(window)"},
     "not masked": {SAMPLE: "with windows_plate(window)"},
+    "without features": {
+        "generate=False, encoded=None):": "generate=False):",
+        "if encoded is None else encoded": "",
+    },
     "wrong size": {
         "model.effect_dimension *": "3 *",
         "window.actions, effect_code)": "window.actions, effect_code.repeat(1, 6)[:, :16])",
@@ -149,5 +153,5 @@ def test_sites_that_do_not_fit_are_told_as_the_page_says(mistake: str, window: W
         code = code.replace(right, wrong)
     model = CascadedModel(width=8)
     with pytest.raises(UserError) as caught:
-        check_pair(model, module_of(code).MyGuide(model), window)
+        check_compatibility(model, module_of(code).MyGuide(model), window)
     assert is_told(str(caught.value)), str(caught.value)

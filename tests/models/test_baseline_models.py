@@ -78,16 +78,16 @@ def test_generation_reads_only_first_states_and_given_actions(
     for name, shape in SITES[kind].items():
         assert tuple(traced.nodes[name]["value"].shape) == shape
         assert traced.nodes[name]["value"].isfinite().all()
-    assert set(traced.observation_nodes) == set(TRANSITIONS)  # records of what was drawn push by push
+    assert set(traced.observation_nodes) == set(TRANSITIONS)  # records of what was sampled push by push
 
 
-def test_the_dynamics_alone_draw_what_the_given_pushes_do(random_window: Callable[..., Window]) -> None:
+def test_the_dynamics_alone_sample_the_outcomes_of_given_pushes(random_window: Callable[..., Window]) -> None:
     window = random_window()
     model = DynamicsModel(**SIZES, scales=LikelihoodScales(center=1e-6))
-    drawn = trace(model, window, generate=True).nodes["next_centers"]["value"]
+    sampled = trace(model, window, generate=True).nodes["next_centers"]["value"]
     expected = model.next_state(window.first, window.actions[:, 0]).centers
     real = window.first.mask
-    assert torch.allclose(drawn[:, 0][real], expected[real], atol=1e-5)
+    assert torch.allclose(sampled[:, 0][real], expected[real], atol=1e-5)
 
 
 @every_model
@@ -128,7 +128,7 @@ def codes_of(model: Model, state: State) -> dict[str, Any]:
 )
 @settings(max_examples=8)
 @given(batch=st.lists(st.integers(1, 3), min_size=1, max_size=3), order=st.permutations(range(4)))
-def test_planning_broadcasts_and_knows_no_order_of_objects(
+def test_planning_broadcasts_and_ignores_the_order_of_objects(
     random_state: Callable[..., State], kind: type[Model], answers: set[str], batch: list[int], order: list[int]
 ) -> None:
     model = kind(segment_length=2, **SIZES).double()

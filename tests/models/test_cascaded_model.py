@@ -12,7 +12,7 @@ from pyro.infer import Predictive
 from torch import nn
 
 from models.cascaded import CascadedModel
-from models.priors import StandardPrior
+from models.priors.standard import StandardPrior
 from models.state import State, Window
 
 SIZES = {"effect_dimension": 5, "motion_dimension": 4, "feature_dimension": 6, "width": 8}
@@ -78,7 +78,7 @@ def with_other_padding(window: Window) -> Window:
     return window._replace(states=other)
 
 
-def test_what_stands_in_padding_changes_nothing(model: CascadedModel, random_window: Callable[..., Window]) -> None:
+def test_the_content_of_padding_changes_nothing(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     window = random_window()
     torch.manual_seed(3)
     expected = trace(model, window)
@@ -125,12 +125,12 @@ def test_generated_windows_score_the_same_when_observed(
     assert torch.allclose(trace(model, observed).nodes["next_centers"]["log_prob"], sum(steps), rtol=1e-10)
 
 
-def test_predictive_draws_many_at_once(model: CascadedModel, random_window: Callable[..., Window]) -> None:
+def test_predictive_samples_in_parallel(model: CascadedModel, random_window: Callable[..., Window]) -> None:
     window = random_window()
-    drawn = Predictive(model, num_samples=6, parallel=True)(window, generate=True)
+    sampled = Predictive(model, num_samples=6, parallel=True)(window, generate=True)
     for name, shape in SHAPES.items():
-        assert drawn[name].shape == (6, *shape)
-    assert drawn["subgoal_centers"].std(0).min() > 1e-3
+        assert sampled[name].shape == (6, *shape)
+    assert sampled["subgoal_centers"].std(0).min() > 1e-3
 
 
 @settings(max_examples=10, deadline=None)

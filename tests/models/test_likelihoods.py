@@ -8,7 +8,6 @@ from pyro import distributions
 
 from models.isotropic_normal import IsotropicNormal
 from models.likelihoods import LikelihoodScales
-from models.priors import StandardPrior
 from models.state import State
 
 
@@ -31,13 +30,13 @@ def test_isotropic_normal_equals_a_normal_of_independent_components() -> None:
     expanded = ours.expand((4, 2, 5))
     assert torch.allclose(expanded.log_prob(value), theirs.log_prob(value).expand(4, 2, 5), rtol=1e-12)
     torch.manual_seed(1)
-    drawn = ours.rsample((7,))
+    sampled = ours.rsample((7,))
     torch.manual_seed(1)
-    assert torch.allclose(drawn, theirs.rsample((7,)), rtol=1e-12)
+    assert torch.allclose(sampled, theirs.rsample((7,)), rtol=1e-12)
     assert IsotropicNormal(torch.zeros(3), 0.3).sample((20_000,)).std().item() == pytest.approx(0.3, rel=0.02)
 
 
-def test_isotropic_normal_refuses_what_makes_no_sense() -> None:
+def test_isotropic_normal_refuses_invalid_scales_and_values() -> None:
     with pytest.raises(ValueError, match="scale must be positive, not 0"):
         IsotropicNormal(torch.zeros(3), 0.0)
     with pytest.raises(ValueError):
@@ -65,14 +64,3 @@ def test_starts_are_weighted_more_than_motions() -> None:
     peak = likelihood.log_prob(torch.zeros(3, 4))
     assert torch.allclose(peak - likelihood.log_prob(start), torch.full((2,), 0.5), atol=1e-5)
     assert torch.allclose(peak - likelihood.log_prob(motion), torch.full((2,), 0.5), atol=1e-5)
-
-
-def test_standard_prior_has_the_batch_of_state_and_code(random_state: Callable[..., State]) -> None:
-    prior = StandardPrior(dimension=5)
-    effects = prior(random_state(2, 3))
-    assert (effects.batch_shape, effects.event_shape) == ((2, 3), (5,))
-    motions = prior(random_state(2, 1), torch.zeros(2, 3, 7))
-    assert (motions.batch_shape, motions.event_shape) == ((2, 3), (5,))
-    value = torch.randn(2, 3, 5)
-    assert torch.allclose(effects.log_prob(value), distributions.Normal(0, 1).log_prob(value).sum(-1))
-    assert effects.sample().std() > 0

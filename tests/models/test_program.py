@@ -24,14 +24,14 @@ class Nothing(Program):
         pass
 
 
-def announced(local: bool) -> list[str]:
+def registered(local: bool) -> list[str]:
     with pyro.settings.context(module_local_params=local):
         return poutine.trace(Coin()).get_trace(Tensor([1.0, 2.0])).param_nodes
 
 
-def test_parameters_are_announced_unless_they_are_module_local() -> None:
-    assert announced(local=False) == ["network$$$weight", "network$$$bias"]
-    assert announced(local=True) == []
+def test_parameters_are_registered_unless_they_are_module_local() -> None:
+    assert registered(local=False) == ["Coin$$$network.weight", "Coin$$$network.bias"]
+    assert registered(local=True) == []
 
 
 def test_svi_with_the_global_store_trains_the_networks() -> None:

@@ -47,7 +47,7 @@ def test_the_kernel_is_the_interpreter_of_the_tests(kernel: AsyncKernelManager) 
 
 
 @every_notebook
-def test_a_notebook_is_kept_without_results(path: Path) -> None:
+def test_a_notebook_is_stored_without_outputs(path: Path) -> None:
     notebook = read(path)
     nbformat.validate(notebook)
     assert notebook.metadata.kernelspec.name == KERNEL

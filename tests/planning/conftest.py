@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -12,9 +12,11 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from models.state import State
-from planning import bulk
-from planning.sampling import noise_each
-from planning.segments import Stretch
+from planning import CavinPlanner
+from planning.backends import chunking
+from planning.protocol import PlanningModel, RewardFunction
+from planning.rollouts.sampling import noise_each
+from planning.rollouts.segment import SegmentRollout
 
 REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1
 
@@ -108,19 +110,19 @@ class Listed(Distribution):
 
 
 class Placed:
-    """A level whose plans are wherever two numbers of noise per segment say: x and y of the target, in metres."""
+    """A search space whose noise, two numbers per segment, is x and y of the target in metres."""
 
     dimension = 2
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
-    ) -> Stretch:
+    ) -> SegmentRollout:
         if noise is None:
             noise = noise_each((plans.batch_shape[-1], 2), generators)
         centers = plans.centers.clone()
         centers[..., 0, :2] = noise
         states = plans._replace(centers=centers)
-        return Stretch(noise, None, states, centers.unsqueeze(-3))
+        return SegmentRollout(noise, None, states, centers.unsqueeze(-3))
 
 
 class Judgement(NamedTuple):
@@ -140,7 +142,7 @@ class GoalDisc:
         dense: bool = False,
     ) -> None:
         self.goal, self.radius, self.forbidden_below, self.dense = goal, radius, forbidden_below, dense
-        self.most = torch.inf if dense else 99.0
+        self.maximum_return = torch.inf if dense else 99.0
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
         success = self.distance(centers) <= self.radius
@@ -198,14 +200,27 @@ def generators(*seeds: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
+def plain(
+    model: PlanningModel,
+    reward: RewardFunction,
+    samples: int = 1024,
+    horizon: int = 30,
+    motion_horizon: str = "full_horizon",
+    **options: object,
+) -> CavinPlanner:
+    """Algorithm 1 that avoids failures, with those of our additions that the options name."""
+    without: dict[str, Any] = {"robustness": None, "idle_distance": 0.0, "warm_start": False}
+    return CavinPlanner(model, reward, samples, horizon, motion_horizon, **{**without, **options})
+
+
 @pytest.fixture(autouse=True)
 def environments_in_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plan all environments of a test in one chunk, so that what is computed for several at once is tested."""
-    monkeypatch.setattr(bulk, "ENVIRONMENTS_ON_PROCESSOR", 1000)
+    monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", 1000)
 
 
 @pytest.fixture
 def toy() -> SimpleNamespace:
     worlds: list[Callable] = [PointMass, Flat, Tabled, Placed, GoalDisc, Hill, Line, Judgement]
-    names = [*worlds, move, scenes, generators]
+    names = [*worlds, plain, move, scenes, generators]
     return SimpleNamespace(**{name.__name__: name for name in names}, REACH=REACH)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning import CavinPlanner, Outcome, Plan, RewardFunction
+from planning import Outcome, Plan, RewardFunction
 
 START = (0.0, 0.02)  # metres; close above the forbidden half-plane y < 0 of `near_the_edge`
 
@@ -20,7 +20,7 @@ def near_the_edge(toy: SimpleNamespace) -> RewardFunction:
 
 def test_dense_reward_leads_to_the_known_optimum(toy: SimpleNamespace) -> None:
     # A goal too far to reach, straight ahead: the best is to go 0.15 m its way in each of two segments.
-    planner = CavinPlanner(toy.PointMass(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=4096, horizon=6)
+    planner = toy.plain(toy.PointMass(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=4096, horizon=6)
     plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), toy.generators(0, 1, 2, 3))
     progress = plan.expected_return + 6  # without the costs of six steps
     assert (progress <= 0.3).all()
@@ -30,7 +30,7 @@ def test_dense_reward_leads_to_the_known_optimum(toy: SimpleNamespace) -> None:
 
 def test_sparse_reward_leads_to_the_known_optimum(toy: SimpleNamespace) -> None:
     # 0.2 m to the disc at no more than 0.05 m a step (and no chance of exactly that): five steps, 100 - 5.
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=4096, horizon=12)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=4096, horizon=12)
     plan = planner.plan(toy.scenes([[START]] * 4), toy.generators(0, 1, 2, 3))
     assert plan.expected_return.tolist() == [95.0] * 4
     assert plan.expected_success.all()
@@ -42,11 +42,11 @@ def test_replanning_in_closed_loop_reaches_the_goal_and_never_the_forbidden_part
     toy: SimpleNamespace, motion_horizon: str
 ) -> None:
     model, reward = toy.PointMass(), near_the_edge(toy)
-    planner = CavinPlanner(model, reward, samples=512, horizon=12, motion_horizon=motion_horizon)
-    state, sources = toy.scenes([[START]] * 8), toy.generators(*range(8))
+    planner = toy.plain(model, reward, samples=512, horizon=12, motion_horizon=motion_horizon)
+    state, generators = toy.scenes([[START]] * 8), toy.generators(*range(8))
     reached = torch.zeros(8, dtype=torch.bool)
     for _ in range(3):
-        for push in planner.plan(state, sources).actions.unbind(1):
+        for push in planner.plan(state, generators).actions.unbind(1):
             state = model.next_state(state, push)
             outcome = reward(state.centers, state.centers, state.mask)
             reached = reached | outcome.success
@@ -55,27 +55,27 @@ def test_replanning_in_closed_loop_reaches_the_goal_and_never_the_forbidden_part
 
 
 def test_motions_aim_at_the_subgoals(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=1024, horizon=6)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=1024, horizon=6)
     plan = planner.plan(toy.scenes([[START]] * 4), toy.generators(0, 1, 2, 3))
     error = (plan.predicted_centers[:, [2, 5]] - plan.subgoals.centers).norm(dim=-1)
     assert (error < 0.025).all()  # metres; pushes are off by 0.035 m per segment and axis before choosing
 
 
 def test_dead_plans_are_replaced_by_copies_of_living_ones(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=256, horizon=12)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=256, horizon=12)
     plan = planner.plan(toy.scenes([[START]]), toy.generators(0))
     firsts = plan.candidate_centers[0, :, 0, 0]
     assert (firsts[:, 1] >= 0.0).all()  # about half of the first subgoals were not
     assert len(firsts.unique(dim=0)) < 256
-    # After the last segment nobody replaces the dead: the drawing shows them.
+    # After the last segment failed candidates stay: the drawing shows them.
     assert (plan.candidate_returns < -100).any()
 
 
 def test_codes_traced_back_through_copies_replay_to_the_recorded_subgoals(toy: SimpleNamespace) -> None:
     # At the edge of the forbidden half-plane half of the plans die at once, so that chosen plans go through
-    # copies. A goal out of reach keeps the living ones going.
+    # copies. A goal out of reach keeps the active ones going.
     model, reward = toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=0.0)
-    planner = CavinPlanner(model, reward, samples=64, horizon=15)
+    planner = toy.plain(model, reward, samples=64, horizon=15)
     start = toy.scenes([[(0.0, 0.0), (0.1, 0.5)]] * 16, gains=(1.0, 0.5))
     plan = planner.plan(start, toy.generators(*range(16)))
     shared = plan.candidate_centers[:, :, 0, 0] == plan.subgoals.centers[:, :1, 0]
@@ -90,19 +90,19 @@ def test_codes_traced_back_through_copies_replay_to_the_recorded_subgoals(toy: S
 
 
 def test_no_randomness_is_shared_between_environments(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     state = toy.scenes([[START], [(0.0, 0.5)], [(0.2, 0.0)]])  # some plans die, none die, it is (almost) done
-    sources = toy.generators(7, 8, 9)
-    together = planner.plan(state, sources)
+    generators = toy.generators(7, 8, 9)
+    together = planner.plan(state, generators)
     for index, seed in enumerate((7, 8, 9)):
         source = toy.generators(seed)
         alone = planner.plan(state.scene(slice(index, index + 1)), source)
         assert_same_plans(together, alone, index)
-        assert torch.equal(source[0].get_state(), sources[index].get_state())
+        assert torch.equal(source[0].get_state(), generators[index].get_state())
 
 
 def test_the_same_seed_gives_the_same_plan_and_another_seed_another(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     state, before = toy.scenes([[START]]), torch.get_rng_state()
     first, again, other = (planner.plan(state, toy.generators(seed)) for seed in (1, 1, 2))
     assert_same_plans(first, again, 0)
@@ -111,7 +111,7 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another(toy: SimpleN
 
 
 def test_padding_leaves_plans_alone(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     bare = toy.scenes([[START, (0.4, 0.3)]], gains=(1.0, 0.5))
     padded = toy.scenes([[START, (0.4, 0.3), (-5.0, -5.0), (0.0, float("nan"))]], gains=(1.0, 0.5, 7.0, 1.0))
     padded.mask[:, 2:] = False
@@ -123,7 +123,7 @@ def test_padding_leaves_plans_alone(toy: SimpleNamespace) -> None:
 
 
 def test_the_order_of_obstacles_leaves_plans_alone(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     places, gains, order = [START, (0.4, 0.3), (0.1, 0.06)], [1.0, 0.5, 0.25], [0, 2, 1]
     one = planner.plan(toy.scenes([places], gains), toy.generators(0))
     shuffled = toy.scenes([[places[i] for i in order]], [gains[i] for i in order])
@@ -135,9 +135,7 @@ def test_the_order_of_obstacles_leaves_plans_alone(toy: SimpleNamespace) -> None
 def test_a_plan_has_the_shapes_that_it_promises(toy: SimpleNamespace) -> None:
     state = toy.scenes([[START, (0.4, 0.3)]] * 3, gains=(1.0, 0.5))
     for motion_horizon, segments in (("full_horizon", 4), ("first_segment", 1)):
-        planner = CavinPlanner(
-            toy.PointMass(), near_the_edge(toy), samples=8, horizon=12, motion_horizon=motion_horizon
-        )
+        planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=8, horizon=12, motion_horizon=motion_horizon)
         plan = planner.plan(state, toy.generators(0, 1, 2))
         assert plan.actions.shape == (3, 3, 4)
         assert plan.planned_actions.shape == (3, 3 * segments, 4)
@@ -158,7 +156,7 @@ def test_subgoals_that_are_not_finite_never_win(toy: SimpleNamespace) -> None:
             return subgoal._replace(centers=torch.where(broken, torch.nan, subgoal.centers))
 
     # The goal lies where only broken subgoals lead, and no comparison with NaN counts as a failure.
-    planner = CavinPlanner(Breaking(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=64, horizon=6)
+    planner = toy.plain(Breaking(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=64, horizon=6)
     plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
     assert plan.expected_return.isfinite().all()
     assert (plan.effect_codes[..., 0] <= 0).all()
@@ -173,7 +171,7 @@ def test_pushes_that_are_not_finite_never_win_even_if_the_dynamics_ignore_it(toy
             pushes[..., :2] = torch.where(motion_code[..., :1, None] > -1.0, torch.nan, pushes[..., :2])
             return pushes
 
-    planner = CavinPlanner(Unstarted(), near_the_edge(toy), samples=64, horizon=3)
+    planner = toy.plain(Unstarted(), near_the_edge(toy), samples=64, horizon=3)
     plan = planner.plan(toy.scenes([[START]] * 4), toy.generators(0, 1, 2, 3))
     assert plan.planned_actions.isfinite().all()
 
@@ -186,7 +184,7 @@ def test_rewards_see_unbroken_trajectories(toy: SimpleNamespace) -> None:
     goal = toy.GoalDisc(goal=(9.0, 9.0))
     segments: list[tuple[Tensor, Tensor]] = []
     start = toy.scenes([[START]])
-    CavinPlanner(toy.PointMass(), recording, samples=4, horizon=9).plan(start, toy.generators(0))
+    toy.plain(toy.PointMass(), recording, samples=4, horizon=9).plan(start, toy.generators(0))
     assert len(segments) == 2 * 3  # once per segment at both levels
     for level in (segments[:3], segments[3:]):
         before = start.centers.expand(4, 1, 3)
@@ -197,7 +195,7 @@ def test_rewards_see_unbroken_trajectories(toy: SimpleNamespace) -> None:
 
 
 def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=8, horizon=3)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=8, horizon=3)
     state = toy.scenes([[START], [(0.0, float("nan"))]])
     with pytest.raises(ValueError, match=r"^environment 1: none of the 8 returns of effect plans is finite; .*$"):
         planner.plan(state, toy.generators(0, 1))
@@ -219,15 +217,15 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
 )
 def test_bad_options_are_one_clear_line(toy: SimpleNamespace, options: dict, message: str) -> None:
     with pytest.raises(ValueError) as error:
-        CavinPlanner(toy.PointMass(), near_the_edge(toy), **options)
+        toy.plain(toy.PointMass(), near_the_edge(toy), **options)
     assert str(error.value) == message
 
 
 def test_bad_scenes_are_one_clear_line(toy: SimpleNamespace) -> None:
-    planner = CavinPlanner(toy.PointMass(), near_the_edge(toy), samples=4, horizon=3)
+    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=4, horizon=3)
     two = toy.scenes([[START], [START]])
     same = toy.generators(0)[0]
-    for state, sources, message in (
+    for state, generators, message in (
         (two, toy.generators(0), "one generator per environment: 2 needed, 1 given"),
         (two, [same, same], "one generator per environment: the same generator was given twice"),
         (
@@ -237,7 +235,7 @@ def test_bad_scenes_are_one_clear_line(toy: SimpleNamespace) -> None:
         ),
     ):
         with pytest.raises(ValueError) as error:
-            planner.plan(state, sources)
+            planner.plan(state, generators)
         assert str(error.value) == message
 
 

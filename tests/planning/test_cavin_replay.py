@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from torch import Tensor
 
-from planning import CavinPlanner, Plan
+from planning import Plan
+from planning.optimizers import Shooting
 
 # Segment 1, from x = 0: plan 0 dies at its second step (-0.75), plan 1 gets to 0.5, plan 2 dies at its first
 # step (-1.0). So plans 0 and 2 become copies of plan 1, and segment 2 starts at x = 0.5 for all: plan 0
@@ -27,7 +28,7 @@ MOTIONS = [[0.25, 0.125, 0.0], [-0.25, 0.0, 0.5]]
 
 
 def replay(toy: SimpleNamespace, effects: list, motions: list, **options: Any) -> Plan:
-    planner = CavinPlanner(toy.Tabled(effects, motions), toy.Line(), samples=3, horizon=4, **options)
+    planner = toy.plain(toy.Tabled(effects, motions), toy.Line(), samples=3, horizon=4, **options)
     return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
 
 
@@ -56,7 +57,7 @@ def test_motion_level_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> No
 
 def test_without_replacement_the_dead_stay_dead(toy: SimpleNamespace) -> None:
     # Plans 0 and 2 end in segment 1, as above, and only plan 1 goes on, to 0.75: c = (0.5, 0.25).
-    plan = replay(toy, EFFECTS, MOTIONS, optimizer_options={"replacement": False})
+    plan = replay(toy, EFFECTS, MOTIONS, optimizer=Shooting(replacement=False))
     assert plan.candidate_returns.tolist() == [[-102.0, -4.0, -101.0]]
     assert plan.candidate_centers[0, :, :, 0, 0].tolist() == [[-0.75, -0.75], [0.5, 0.75], [-2.0, -2.0]]
     assert plan.effect_codes[0, :, 0].tolist() == [0.5, 0.25]

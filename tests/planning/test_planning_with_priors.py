@@ -1,4 +1,4 @@
-"""Planning draws from whatever prior the model has, with no change to the planner."""
+"""Planning samples whatever prior the model has, with no change to the planner."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import torch
 from torch import nn
 
 from models.cascaded import CascadedModel
-from models.learned_priors import ConditionalPrior, FlowPrior
-from models.priors import StandardPrior
+from models.priors.conditional import ConditionalPrior
+from models.priors.flow import FlowPrior
+from models.priors.standard import StandardPrior
 from models.state import State
 from planning import CavinPlanner
-from planning.sampling import codes_each, noise_each, sample_each
+from planning.rollouts.sampling import noise_each, reparameterize_each, sample_each
 
 each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior])
 
@@ -40,7 +41,7 @@ def scenes(toy: SimpleNamespace) -> State:
 
 def planner(toy: SimpleNamespace, kind: type, horizon: str = "first_segment") -> CavinPlanner:
     reward = toy.GoalDisc((0.8, 0.0))
-    return CavinPlanner(model_with(kind), reward, samples=32, horizon=9, motion_horizon=horizon)
+    return toy.plain(model_with(kind), reward, samples=32, horizon=9, motion_horizon=horizon)
 
 
 @each_prior
@@ -59,18 +60,18 @@ def test_a_plan_comes_out_and_again_from_the_same_seed(kind: type, horizon: str,
 @each_prior
 def test_noise_stands_for_the_code_that_the_prior_draws_with_it(kind: type, toy: SimpleNamespace) -> None:
     model, state = model_with(kind), scenes(toy).expand_plans(6)
-    effects = codes_each(model.effect_prior, [state], noise_each((6, 5), toy.generators(3, 4)))
+    effects = reparameterize_each(model.effect_prior, [state], noise_each((6, 5), toy.generators(3, 4)))
     torch.testing.assert_close(effects, sample_each(model.effect_prior, [state], toy.generators(3, 4)))
-    motions = codes_each(model.motion_prior, [state, effects], noise_each((6, 4), toy.generators(5, 6)))
+    motions = reparameterize_each(model.motion_prior, [state, effects], noise_each((6, 4), toy.generators(5, 6)))
     torch.testing.assert_close(motions, sample_each(model.motion_prior, [state, effects], toy.generators(5, 6)))
 
 
 @pytest.mark.parametrize("optimizer", ["cem", "icem", "mppi", "smc"])
 @each_prior
-def test_every_optimiser_searches_codes_of_every_prior(kind: type, optimizer: str, toy: SimpleNamespace) -> None:
+def test_every_optimizer_searches_codes_of_every_prior(kind: type, optimizer: str, toy: SimpleNamespace) -> None:
     reward = toy.GoalDisc((0.8, 0.0), dense=True)
     one, again = (
-        CavinPlanner(model_with(kind), reward, samples=32, horizon=9, optimizer=optimizer).plan(
+        toy.plain(model_with(kind), reward, samples=32, horizon=9, optimizer=optimizer).plan(
             scenes(toy), toy.generators(3, 4)
         )
         for _ in range(2)

@@ -12,8 +12,8 @@ from pyro import distributions
 from pyro.nn import PyroModule
 from torch import Tensor
 
-from cavin_pyro.criticism.section import Subject
-from models.pointnet import PointNet
+from cavin_pyro.criticism.context import CheckContext
+from models.networks.pointnet import PointNet
 from models.state import State, Window
 
 NOISE = 0.5
@@ -33,8 +33,7 @@ class LinearModel(PyroModule):
     x and y are the starts and the motions of a window's first push.
     """
 
-    def effect_prior(self) -> None: ...
-    def motion_prior(self) -> None: ...
+    codes = ("effect_code", "motion_code")
 
     def forward(self, window: Window) -> None:
         x, y = window.actions[:, 0].split(2, -1)
@@ -48,7 +47,7 @@ class LinearModel(PyroModule):
 class OneCodeModel(PyroModule):
     """c ~ N(0, I), x ~ N(c, 0.25 I)."""
 
-    def effect_prior(self) -> None: ...
+    codes = ("effect_code",)
 
     def forward(self, window: Window) -> None:
         x = window.actions[:, 0, :2]
@@ -59,6 +58,8 @@ class OneCodeModel(PyroModule):
 
 class NoCodeModel(PyroModule):
     """x ~ N(0, 1.25 I)."""
+
+    codes = ()
 
     def forward(self, window: Window) -> None:
         x = window.actions[:, 0, :2]
@@ -128,7 +129,7 @@ def evidence(window: Window) -> Tensor:
 
 
 def linear_windows(batch: int, seed: int = 0) -> Window:
-    """Windows `[B]` drawn from `LinearModel`."""
+    """Windows `[B]` sampled from `LinearModel`."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(batch, 4, generator=generator, dtype=torch.float64)
     actions = (noise @ torch.linalg.cholesky(covariance()).T).unsqueeze(1).expand(batch, 3, 4)
@@ -137,9 +138,9 @@ def linear_windows(batch: int, seed: int = 0) -> Window:
     return Window(state, actions.clone(), seen, seen[:, 0].clone())
 
 
-def linear_subject(guide: PyroModule, *, model: PyroModule | None = None, batch: int = 200) -> Subject:
+def linear_context(guide: PyroModule, *, model: PyroModule | None = None, batch: int = 200) -> CheckContext:
     pointnet = PointNet(feature_dimension=2)
-    return Subject(model or LinearModel(), guide, pointnet, linear_windows(batch, 1), linear_windows(batch, 2))
+    return CheckContext(model or LinearModel(), guide, pointnet, linear_windows(batch, 1), linear_windows(batch, 2))
 
 
 @pytest.fixture(scope="session")
@@ -151,15 +152,15 @@ def linear() -> SimpleNamespace:
         evidence=evidence,
         guide=LinearGuide,
         model=LinearModel,
-        no_code=lambda: linear_subject(NoGuide(), model=NoCodeModel()),
-        one_code=lambda: linear_subject(OneCodeGuide(), model=OneCodeModel()),
-        subject=linear_subject,
+        no_code=lambda: linear_context(NoGuide(), model=NoCodeModel()),
+        one_code=lambda: linear_context(OneCodeGuide(), model=OneCodeModel()),
+        context=linear_context,
         windows=linear_windows,
     )
 
 
 @pytest.fixture
-def cascade(small: SimpleNamespace) -> Subject:
+def cascade(small: SimpleNamespace) -> CheckContext:
     """An untrained cascade of width 8 with random windows, in float64."""
     parts = small.parts()
     model, guide = parts["model"].double().requires_grad_(False), parts["guide"].double().requires_grad_(False)
@@ -172,4 +173,4 @@ def cascade(small: SimpleNamespace) -> Subject:
         seen = torch.ones(batch, 3, dtype=torch.bool)
         return Window(State(centers, features, mask), actions, seen, seen[:, 0].clone())
 
-    return Subject(model, guide, parts["pointnet"], windows(12), windows(14))
+    return CheckContext(model, guide, parts["pointnet"], windows(12), windows(14))

@@ -1,0 +1,33 @@
+"""`python -m cavin_pyro`: the commands, with one line each."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+from cavin_pyro import __version__
+
+ORDER = ("demo", "plan", "evaluate", "collect", "pretrain", "train", "check", "assets")
+
+
+def main() -> None:
+    """List the commands."""
+    if "--version" in sys.argv[1:]:
+        print(f"cavin_pyro {__version__}")
+        return
+    print(f"cavin_pyro {__version__}: the CAVIN planner as modular probabilistic programs\n")
+    for name in ORDER:
+        print(f"  python -m cavin_pyro.{name:<10}{purpose(name)}")
+    print("\n`python -m cavin_pyro.COMMAND --help` lists a command's options, with examples.")
+
+
+def purpose(name: str) -> str:
+    """The first sentence of a command's docstring."""
+    tree = ast.parse((Path(__file__).parent / f"{name}.py").read_text(encoding="utf-8"))
+    (body,) = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "main")
+    return " ".join((ast.get_docstring(body) or "").split("\n\n")[0].split()).rstrip(".")
+
+
+if __name__ == "__main__":
+    main()

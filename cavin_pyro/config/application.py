@@ -1,0 +1,116 @@
+"""What all commands share: Hydra for the options, one line for bad input, exit status 2.
+
+@command("plan")
+def main(config: DictConfig) -> None: ...
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn, TypeVar
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from cavin_pyro import __version__
+from cavin_pyro.config.errors import UserError
+
+PACKAGES = ("models", "guides", "planning", "envs")
+BAD_INPUT = 2  # exit status
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
+
+T = TypeVar("T")
+Body = Callable[[DictConfig], None]
+
+
+def command(name: str) -> Callable[[Body], Callable[[], None]]:
+    """Make a Hydra application of `body`, with the options of `cavin_pyro.config.commands.COMMANDS[name]`."""
+
+    def decorate(body: Body) -> Callable[[], None]:
+        def main() -> None:
+            # Third parties' deprecations are for developers, whose tests turn them into errors.
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            if "--version" in sys.argv[1:]:
+                print(f"cavin_pyro {__version__}")
+                return
+            guarded(check_packages)
+            if guarded(lambda: _help_or_check(name, body.__doc__ or "")):
+                return
+            hydra.main(version_base="1.3", config_path=None, config_name=name)(
+                lambda config: guarded(lambda: _run(name, body, config))
+            )()
+
+        main.__doc__ = body.__doc__
+        return main
+
+    return decorate
+
+
+def guarded(action: Callable[[], T]) -> T:
+    """Run; bad input, a full or forbidden disk and an interruption end in one line instead of a traceback."""
+    try:
+        return action()
+    except UserError as error:
+        _stop(str(error), BAD_INPUT)
+    except OSError as error:
+        if error.errno not in _DISK_ERRORS:
+            raise
+        where = f" at {error.filename}" if error.filename else ""
+        _stop(
+            f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR",
+            2,
+        )
+    except KeyboardInterrupt:
+        _stop("interrupted; where the command can resume, the same command goes on", 130)
+
+
+def _stop(line: str, status: int) -> NoReturn:
+    print(f"error: {' '.join(line.split())}", file=sys.stderr, flush=True)
+    raise SystemExit(status)
+
+
+def _help_or_check(name: str, purpose: str) -> bool:
+    """Check the overrides of the command line before Hydra's own application reads them; whether help was all."""
+    from cavin_pyro.config.command_line import read
+    from cavin_pyro.config.composition import check_overrides, presets_by_name, sweeps
+
+    sys.argv[1:] = presets_by_name(sys.argv[1:])
+    line = read(sys.argv[1:])
+    for overrides in sweeps(line.overrides) if line.multirun else [line.overrides]:
+        config = check_overrides(name, overrides, line.config_dir)
+    if line.help:
+        from cavin_pyro.config.help import help_page
+
+        print(help_page(name, purpose, config))
+    return line.help
+
+
+def _run(name: str, body: Body, config: DictConfig) -> None:
+    from cavin_pyro.config.composition import resolved
+    from cavin_pyro.config.output import with_output
+
+    body(with_output(name, resolved(config), HydraConfig.get()))
+
+
+def check_packages() -> None:
+    """Make sure that the packages with common names are ours.
+
+    Raises:
+        UserError: a foreign package of the same name comes first on the path.
+    """
+    home = Path(__file__).resolve().parents[2]
+    for package in PACKAGES:
+        found = importlib.util.find_spec(package)
+        places = [] if found is None else list(found.submodule_search_locations or [found.origin or ""])
+        if not any(Path(place).resolve() == home / package for place in places):
+            where = places[0] if places else "nowhere"
+            raise UserError(
+                f"the package {package!r} of this program is hidden by {where}: "
+                "run from another folder, or rename or uninstall that package"
+            )

@@ -1,0 +1,45 @@
+"""Options of the command collect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.commands.world import WorldConfig, collection_world
+from cavin_pyro.config.options import option, seed_option
+from envs.workspace import MAXIMUM_OBJECTS
+
+
+@dataclass
+class CollectionOptions:
+    """What decides the episodes that are collected, apart from their world."""
+
+    seed: int = seed_option("root of all randomness", group="run")
+    steps: int = option(10, "pushes per episode", minimum=1, group="data")
+    intent_length: int = option(
+        5, "pushes in a row that share a target object and a direction", minimum=1, group="data"
+    )
+    perturbation_rate: float = option(
+        0.3, "fraction of pushes whose start is moved at random", minimum=0, maximum=1, group="data"
+    )
+    minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
+    maximum_objects: int = option(MAXIMUM_OBJECTS, "objects on the table, at most", group="data")
+    episodes_per_shard: int = option(50, "episodes per file, the unit of resuming", minimum=1, group="data")
+
+
+@dataclass
+class CollectConfig(CollectionOptions):
+    """Options of `python -m cavin_pyro.collect`."""
+
+    defaults: list[Any] = field(default_factory=lambda: ["_self_", {"env/ranges": "paper"}, "base"])
+    transitions: int = option(
+        100_000, "pushes to collect, at least; whole files of episodes are written", minimum=1, group="data"
+    )
+    output: str | None = option(
+        None,
+        "folder for the dataset, where an unfinished one is resumed; by default data/pushes, or beside it",
+        group="run",
+    )
+    workers: int = option(2, "processes; the data do not depend on it", minimum=1, group="run")
+    repair: bool = option(False, "collect missing or corrupt files again", group="run")
+    env: WorldConfig = field(default_factory=collection_world)

@@ -1,0 +1,37 @@
+"""Options of the command check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands.training import DATA
+from cavin_pyro.config.commands.world import WorldConfig, collection_world
+from cavin_pyro.config.options import option, seed_option
+
+
+@dataclass
+class CheckConfig:
+    """Options of `python -m cavin_pyro.check`."""
+
+    defaults: list[Any] = field(
+        default_factory=lambda: ["_self_", {"sizes": "default"}, {"env/ranges": "paper"}, "base"]
+    )
+    checkpoint: str = option(
+        DEFAULT_CHECKPOINT,
+        "a shipped one (cavin, kinect, held_out), or the path of what train has written",
+        group="model",
+    )
+    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
+    data: Any = option("data/pushes", f"{DATA}; best what the model was trained on", group="data")
+    output: str | None = option(
+        None,
+        "folder for the report, where an unfinished check is resumed; by default runs/check, or beside it",
+        group="run",
+    )
+    seed: int = seed_option(group="run")
+    windows: int = option(1000, "held-out windows, and as many of those that training saw", minimum=1, group="data")
+    sections: Any = option(None, "sections of the report, [elbo,consistency]; by default all", group="run")
+    sizes: Any = None
+    env: WorldConfig = field(default_factory=collection_world)

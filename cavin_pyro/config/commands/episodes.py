@@ -1,0 +1,109 @@
+"""Options of the commands that run episodes: plan, evaluate and demo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
+from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
+from envs.workspace import MAXIMUM_OBJECTS
+
+DEFAULT_CHECKPOINT = "cavin"
+DEFAULTS: list[Any] = ["_self_", {"task": ENVIRONMENT["task"]}, {"planner": "cavin"}, {"env/ranges": "paper"}, "base"]
+
+
+@dataclass
+class TilesConfig:
+    """Fields of the layout to replace, for example `tiles.goal=[[1,2]]` (section `tiles`)."""
+
+    region: Any = option(None, "tiles of the region", group="task")
+    goal: Any = option(None, "tiles of the goal", group="task")
+    target_start: Any = option(None, "tiles where the target may start", group="task")
+    obstacle_start: Any = option(None, "tiles where the other objects may start", group="task")
+
+
+@dataclass
+class EpisodeConfig:
+    """What commands share that run episodes."""
+
+    defaults: list[Any] = field(default_factory=lambda: [*DEFAULTS])
+    task: Any = None
+    layout: int | str = option(
+        ENVIRONMENT["layout"],
+        "number of one of the task's layouts, random (one per episode), or the path of a YAML file",
+        group="task",
+    )
+    tiles: TilesConfig = field(default_factory=TilesConfig)
+    reward: str = option(ENVIRONMENT["reward"], "reward", choices=("dense", "sparse"), group="task")
+    objects: int = option(
+        ENVIRONMENT["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS, group="task"
+    )
+    maximum_steps: int = option(ENVIRONMENT["maximum_steps"], "pushes per episode, at most", minimum=1, group="task")
+    planner: Any = None
+    pushes_per_plan: int | None = option(
+        1, "pushes made before the next plan; null makes all T (paper, Algorithm 1, line 11)", group="planning"
+    )
+    margin: float = option(
+        0.02,
+        "by how much the planner's reward is stricter than the task's; predictions err by about that much",
+        unit="metres",
+        minimum=0,
+        group="planning",
+    )
+    matmul_precision: str = option(
+        "bfloat16",
+        "precision to which a plan's matrix products round their factors",
+        choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
+        group="planning",
+    )
+    checkpoint: str = option(
+        DEFAULT_CHECKPOINT,
+        "a shipped one (cavin, kinect, held_out), or the path of what train has written",
+        group="model",
+    )
+    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
+    env: WorldConfig = field(default_factory=WorldConfig)
+    seed: int = seed_option("seed of the scene and of the planner", group="run")
+
+
+@dataclass
+class PlanConfig(EpisodeConfig):
+    """Options of `python -m cavin_pyro.plan`."""
+
+    output: str | None = option(None, "folder for the results; by default one of its own in runs/plan", group="run")
+    video: bool = option(True, "write a video of the episode", group="run")
+    viewer: str | None = option(
+        None, "rerun: a recording in 3D as well, episode.rrd; needs the extra of that name, .[viewer]", group="run"
+    )
+
+
+@dataclass
+class EvaluateConfig(EpisodeConfig):
+    """Options of `python -m cavin_pyro.evaluate`."""
+
+    output: str | None = option(
+        None,
+        "folder for the results, where an unfinished evaluation is resumed; by default one of its own in runs/evaluate",
+        group="run",
+    )
+    episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1, group="run")
+    workers: int = option(
+        2, "processes; results do not depend on it, apart from planning times", minimum=1, group="run"
+    )
+    compare: str | None = option(
+        None, "folder of another evaluation of the same scenes, to compare episode by episode", group="run"
+    )
+
+
+@dataclass
+class DemoConfig(EpisodeConfig):
+    """Options of `python -m cavin_pyro.demo`."""
+
+    output: str | None = option(
+        None, "folder for the results, with one in it per task; by default runs/demo", group="run"
+    )
+    tasks: list[str] = option(
+        ["clearing", "insertion", "crossing"], "tasks to run", choices="envs.tasks.TASKS", group="task"
+    )
+    seed: int = option(1, "seed of the scenes and of the planner", minimum=0, maximum=MAXIMUM_SEED, group="run")

@@ -1,0 +1,142 @@
+"""Options of the commands that train: train and pretrain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.options import option, seed_option
+
+SCHEDULES = ("constant", "cosine")
+BATCHES = ("mixed", "bucketed")
+DATA = "folder that collect has written, or several: data=[data/one,data/two]"
+
+
+@dataclass
+class TrainerConfig:
+    """How to train (section `trainer`)."""
+
+    steps: int = option(1_000_000, "gradient steps, at most", minimum=1, group="trainer")
+    batch_size: int = option(64, "windows per step", minimum=1, group="trainer")
+    learning_rate: float = option(1e-4, "Adam's", above=0, group="trainer")
+    schedule: str = option(
+        "constant", "of the learning rate; cosine ends at a hundredth of it", choices=SCHEDULES, group="trainer"
+    )
+    batches: str = option(
+        "mixed",
+        "bucketed: every batch has windows with one number of objects, which saves the work on padding",
+        choices=BATCHES,
+        group="trainer",
+    )
+    matmul_precision: str = option(
+        "float32",
+        "precision to which matrix products round their factors",
+        choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
+        group="trainer",
+    )
+    clip_norm: float = option(
+        250.0,
+        "largest norm of the gradient of the mean loss per window; published: 25 on a loss ten times smaller",
+        above=0,
+        group="trainer",
+    )
+    validate_every: int = option(
+        1000, "steps between validations, where a run that was killed resumes", minimum=1, group="trainer"
+    )
+    validation_windows: int = option(4096, "windows per validation, at most", minimum=1, group="trainer")
+    patience: int = option(20, "validations without a new best before training stops", minimum=1, group="trainer")
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step, from 0."""
+        if self.schedule == "constant":
+            return self.learning_rate
+        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / self.steps)))
+
+
+@dataclass
+class WindowConfig:
+    """Which windows and transitions teach what (section `windows`; the published implementation)."""
+
+    validation_fraction: float = option(
+        0.1, "share of the episodes that is held out for validation", minimum=0, maximum=1, group="windows"
+    )
+    maximum_step: float = option(
+        0.2, "a transition counts for f if every object moved less", unit="metres", minimum=0, group="windows"
+    )
+    minimum_move: float = option(
+        0.1, "a window counts for h and g if some object moved farther ...", unit="metres", minimum=0, group="windows"
+    )
+    maximum_move: float = option(
+        0.5, "... none farther than this, and every push was safe", unit="metres", minimum=0, group="windows"
+    )
+    negative_fraction: float = option(
+        0.25,
+        "share of the other windows that is kept, for f to learn what pushes do not do",
+        minimum=0,
+        maximum=1,
+        group="windows",
+    )
+    held_out_objects: list[str] = option(
+        [], "names of objects, [mug,banana]; episodes with one of them do not count", group="windows"
+    )
+
+
+@dataclass
+class TrainConfig:
+    """Options of `python -m cavin_pyro.train`."""
+
+    defaults: list[Any] = field(
+        default_factory=lambda: [
+            "_self_",
+            {"model": "cascaded"},
+            {"guide": "cascaded"},
+            {"prior": "standard"},
+            {"scales": "fixed"},
+            {"objective": "trace_elbo"},
+            "base",
+        ]
+    )
+    data: Any = option("data/pushes", DATA, group="data")
+    output: str | None = option(
+        None,
+        "folder for the results, where an unfinished run is resumed; by default runs/train, or beside it",
+        group="run",
+    )
+    pointnet: str = option(
+        DEFAULT_CHECKPOINT,
+        "whose PointNet gives the features: a shipped checkpoint, or the path of what pretrain has written",
+        group="data",
+    )
+    skip_corrupt: bool = option(
+        False, "leave corrupt files of the dataset out instead of stopping at them", group="data"
+    )
+    model: Any = None
+    guide: Any = None
+    prior: Any = None
+    scales: Any = None
+    objective: Any = None
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    seed: int = seed_option("seed of weights, split, batches and codes", group="run")
+
+
+@dataclass
+class PretrainConfig:
+    """Options of `python -m cavin_pyro.pretrain`."""
+
+    defaults: list[Any] = field(default_factory=lambda: ["_self_", {"autoencoder": "pointnet"}, "base"])
+    data: Any = option("data/pushes", DATA, group="data")
+    output: str | None = option(
+        None,
+        "folder for the results; by default runs/pretrain, or beside it",
+        group="run",
+    )
+    seed: int = seed_option(group="run")
+    clouds: int = option(60_000, "point clouds of the dataset, one in ten for validation", minimum=2, group="data")
+    held_out_objects: list[str] = option([], "names of objects, [mug,banana]; no cloud is of one of them", group="data")
+    steps: int = option(6000, "gradient steps", minimum=1, group="training")
+    batch_size: int = option(128, "clouds per step", minimum=1, group="training")
+    learning_rate: float = option(1e-3, "Adam's", above=0, group="training")
+    autoencoder: Any = None

@@ -1,0 +1,72 @@
+"""The world that an episode takes place in: robot, objects, camera and segmentation."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.options import option
+from envs.objects.sampling import ObjectRanges
+from envs.pushing import PushingEnv
+
+ENVIRONMENT = {name: one.default for name, one in inspect.signature(PushingEnv).parameters.items()}
+COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are packed closer than those of an episode
+
+
+@dataclass
+class RangesConfig:
+    """From where objects and their parameters are sampled (section `env.ranges`; presets `env/ranges=`)."""
+
+    names: list[str] | None = option(None, "objects to sample from; by default all of env.objects", group="objects")
+    target: list[str] | None = option(None, "objects to sample the target from; by default names", group="objects")
+    scale: Any = option(list(ObjectRanges.scale), "factor on size: low, high", group="objects")
+    mass: Any = option(list(ObjectRanges.mass), "factor on each object's own mass: low, high", group="objects")
+    kilograms: Any = option(
+        None, "mass of every object in place of the factor: low, high", unit="kilograms", group="objects"
+    )
+    friction: Any = option(list(ObjectRanges.friction), "Coulomb coefficient: low, high", group="objects")
+    clearance: float = option(
+        ObjectRanges.clearance, "between centres at the start", unit="metres", minimum=0, group="objects"
+    )
+    drop_height: float = option(
+        ObjectRanges.drop_height,
+        "above the table, from which centres fall; 0: just above the table",
+        unit="metres",
+        minimum=0,
+        group="objects",
+    )
+
+
+@dataclass
+class WorldConfig:
+    """The section `env`."""
+
+    robot: str = option(
+        ENVIRONMENT["robot"],
+        "what pushes",
+        choices="envs.robots.ROBOTS",
+        group="world",
+    )
+    objects: str = option(
+        ENVIRONMENT["object_set"], "set of objects", choices="envs.objects.object_sets.OBJECT_SETS", group="world"
+    )
+    camera: str = option(
+        ENVIRONMENT["camera"],
+        "depth camera",
+        choices="envs.sensors.CAMERAS",
+        group="world",
+    )
+    segmentation: str = option(
+        ENVIRONMENT["segmentation"],
+        "how objects are told apart in a depth image",
+        choices="envs.segmentation.SEGMENTERS",
+        group="world",
+    )
+    assets: str | None = option(None, "folder of meshes, for object sets and robots that need one", group="world")
+    ranges: RangesConfig = field(default_factory=RangesConfig)
+
+
+def collection_world() -> WorldConfig:
+    """The world that random pushes are collected in."""
+    return WorldConfig(ranges=RangesConfig(clearance=COLLECTION_CLEARANCE))

@@ -1,0 +1,210 @@
+"""From a command's name and overrides to its configuration, or to one line that says which override is wrong."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException, ValidationError
+
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.constructors import check_parts
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import check_options, kind, shown, types
+from cavin_pyro.config.registration import register
+
+register()
+
+
+def compose(name: str, *overrides: str) -> DictConfig:
+    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for those who call the library from Python.
+
+    Raises:
+        UserError: an override that the command line would refuse.
+    """
+    from cavin_pyro.config.output import with_output
+
+    config = check_overrides(name, presets_by_name(overrides))
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    return with_output(name, resolved(own), config.hydra)
+
+
+def resolved(config: DictConfig) -> DictConfig:
+    """A configuration without interpolations and types, for other processes and files.
+
+    Raises:
+        UserError: an option has no value.
+    """
+    try:
+        # Plain, because Hydra's own interpolations mean nothing in a worker process.
+        plain = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except OmegaConfBaseException as error:
+        raise UserError(f"an option has no value: {str(error).splitlines()[0]}") from error
+    assert isinstance(plain, DictConfig)
+    return plain
+
+
+def check_overrides(name: str, overrides: list[str], config_dir: str | None = None) -> DictConfig:
+    """Compose, and explain in one line what is wrong.
+
+    Args:
+        config_dir: a folder of further presets.
+
+    Returns:
+        The configuration with Hydra's own.
+
+    Raises:
+        UserError: an override that does not parse, an unknown option or preset, or a value out of its range.
+    """
+    if config_dir is not None:
+        overrides = [*overrides, f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"]
+    with _hydra():
+        try:
+            _check_additions(name, overrides)
+            config = hydra.compose(name, overrides=overrides, return_hydra_config=True)
+            plain: Any = OmegaConf.to_container(config, resolve=False)
+            check_parts({key: value for key, value in plain.items() if key != "hydra"})
+            check_options(COMMANDS[name], plain)
+        except MissingConfigException as error:
+            raise UserError(_explain_choice(error)) from error
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
+            raise UserError(_explain_override(name, overrides, error)) from error
+    return config
+
+
+def presets_by_name(overrides: Sequence[str]) -> list[str]:
+    """`planner.optimizer=cem` as `planner/optimizer=cem`, which brings the options of `cem` with it."""
+    return [re.sub(r"^planner\.optimizer=(?!null$)(?=[a-z_,]+$)", "planner/optimizer=", word) for word in overrides]
+
+
+def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
+    """The overrides of every run of a sweep (`-m`): all combinations of the values given."""
+    parsed = OverridesParser.create().parse_overrides(_parsable(overrides))
+    choices = [
+        [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
+        if one.is_sweep_override()
+        else [one.input_line or ""]
+        for one in parsed
+    ]
+    bad = [[word] for word in overrides if not _parsable([word])]
+    yield from (list(one) for one in itertools.product(*choices, *bad))
+
+
+def preset_defaults(name: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """The configuration with the presets that the overrides choose and nothing else, and the usual presets by group."""
+    with _hydra():
+        usual = hydra.compose(name, return_hydra_config=True).hydra.runtime.choices
+        return _defaults(name, overrides), {str(group): str(choice) for group, choice in usual.items()}
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Hydra ready for composition, within a command as well as without one."""
+    running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
+    try:
+        with hydra.initialize(version_base="1.3", config_path=None):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = running
+
+
+def _defaults(name: str, overrides: Sequence[str]) -> DictConfig:
+    """The configuration with the presets that the user chose and no other overrides."""
+    groups = hydra.compose(name, return_hydra_config=True).hydra.runtime.choices
+    chosen = [word for word in overrides if word.partition("=")[0] in groups or word.startswith("hydra.searchpath")]
+    return hydra.compose(name, overrides=chosen)
+
+
+def _check_additions(name: str, overrides: list[str]) -> None:
+    """Refuse `~option`, and `+option` unless it goes to a part, whose class will say whether it knows it."""
+    changes = [one for one in _parsed(overrides) if one.type is not OverrideType.CHANGE]
+    if not changes:
+        return
+    known = _defaults(name, overrides)
+    for one in changes:
+        key = one.key_or_group
+        if key.startswith("hydra"):
+            continue
+        if one.type is OverrideType.DEL:
+            raise UserError(f"{key} cannot be taken away: give it a value as {key}=value")
+        parent: Any = OmegaConf.select(known, key.rpartition(".")[0]) if "." in key else None
+        if not (OmegaConf.is_dict(parent) and "_target_" in parent) and OmegaConf.select(known, key) is None:
+            raise UserError(_unknown(key, known))
+
+
+def _explain_choice(error: MissingConfigException) -> str:
+    group, _, choice = (error.missing_cfg_file or "").rpartition("/")
+    options = ", ".join(error.options or ()) or "none"
+    return f"unknown {group or 'configuration'} {choice!r}: choose from {options}"
+
+
+def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
+    try:
+        known = _defaults(name, overrides)
+    except (HydraException, OmegaConfBaseException, ValueError):
+        known = hydra.compose(name)
+    for override in _parsed(overrides):
+        key = override.key_or_group
+        if (
+            override.package
+            or key.startswith("hydra")
+            or override.type is not OverrideType.CHANGE
+            or set("@/") & set(key)
+        ):
+            continue
+        parent, _, last = key.rpartition(".")
+        if not last.startswith("_") and last not in _names(known, parent):
+            return _unknown(key, known)
+    cause = error.__cause__ or error
+    if isinstance(cause, ValidationError) and cause.full_key:
+        option = re.sub(r"\[.*", "", str(cause.full_key))
+        wanted = kind(types(COMMANDS[name]).get(option))
+        values = [one.value() for one in _parsed(overrides) if one.key_or_group == option]
+        if wanted and values:
+            return f"{option} must be {wanted}, not {shown(values[-1])}"
+    first = str(error).splitlines()[0].rstrip(".")
+    group = re.match(r"Could not override '(\w+)/(\w+)'. No match in the defaults list", first)
+    if group:
+        return f"unknown override '{group[1]}.{group[2]}': the chosen {group[1]} has no {group[2]}"
+    return f"{first}: write overrides as name=value"
+
+
+def _unknown(key: str, known: DictConfig) -> str:
+    parent, _, last = key.rpartition(".")
+    close = difflib.get_close_matches(last, _names(known, parent), n=1)
+    while parent and not _names(known, parent):
+        parent = parent.rpartition(".")[0]
+    valid = f"valid{' under ' if parent else ''}{parent} are {', '.join(_names(known, parent))}"
+    return f"unknown override {key!r}: {f'did you mean {close[0]}? ' if close else ''}{valid}"
+
+
+def _parsed(overrides: Sequence[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(_parsable(overrides))
+
+
+def _parsable(overrides: Sequence[str]) -> list[str]:
+    kept = []
+    for word in overrides:
+        try:
+            OverridesParser.create().parse_override(word)
+        except HydraException:
+            continue
+        kept.append(word)
+    return kept
+
+
+def _names(known: DictConfig, section: str) -> list[str]:
+    """The options of a section, none if there is no such section."""
+    found: Any = OmegaConf.select(known, section) if section else known
+    return sorted(map(str, found)) if OmegaConf.is_dict(found) else []

@@ -1,0 +1,52 @@
+"""Bad input, as opposed to a bug: one clear line, exit status 2."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+
+class UserError(Exception):
+    """What was wrong with the input, where, and what would be right: one line, shown without a traceback."""
+
+
+@contextmanager
+def user_input() -> Iterator[None]:
+    """Turn a ValueError raised while the user's choices are read into a `UserError`.
+
+    Wrap only the building of parts from configuration, so that a ValueError anywhere else stays a bug with a traceback.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
+
+
+def at_least(name: str, value: float, minimum: float) -> None:
+    """Check a number from the command line.
+
+    Raises:
+        UserError: the number is not a number or smaller than the minimum.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value >= minimum:
+        raise UserError(f"{name} must be at least {minimum:g}, not {value}")
+
+
+def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:
+    """Check a count from the command line.
+
+    Raises:
+        UserError: the value is not a whole number from the minimum to the maximum.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
+        raise UserError(f"{name} must be a whole number from {minimum} to {maximum}, not {value}")
+
+
+def one_of(name: str, value: object, choices: Collection[str]) -> None:
+    """Check a name from the command line.
+
+    Raises:
+        UserError: the name is none of the choices, which are named.
+    """
+    if value not in choices:
+        raise UserError(f"unknown {name} {value!r}: choose from {', '.join(choices)}")

@@ -1,0 +1,146 @@
+"""`--help`: what a command does, examples, and every option with its meaning, unit, default and choices."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from importlib import resources
+from typing import Any
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+from cavin_pyro import __version__
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.options import options, shown
+
+WIDTH = 100  # columns
+EXAMPLES = {
+    "collect": ("transitions=100000 workers=2", "env.objects=random output=data/random", "transitions=200000"),
+    "pretrain": ("data=data/pushes", "data=[data/pushes,data/random]", "held_out_objects=[mug,banana]"),
+    "train": ("data=data/pushes", "model=flat guide=flat", "trainer.steps=200000 trainer.batches=bucketed"),
+    "check": ("checkpoint=cavin data=data/pushes", "sections=[elbo,consistency]", "sizes.consistency.scenes=300"),
+    "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner/optimizer=cem env.segmentation=clusters"),
+    "evaluate": (
+        "task=crossing reward=sparse objects=3",
+        "planner=paper compare=runs/evaluate/crossing-sparse-3-cavin-0",
+        "-m task=clearing,insertion,crossing episodes=50",
+    ),
+    "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
+}
+UNREAD = {"demo": ("task", "tiles")}  # options and presets that a command shares with others and does not read
+HEADINGS = {  # of the groups, in the order of the page
+    "task": "Task",
+    "planning": "Planning",
+    "model": "Model",
+    "data": "Data",
+    "training": "Training",
+    "trainer": "Trainer",
+    "windows": "Windows: what is learned from",
+    "world": "World",
+    "objects": "Objects",
+    "run": "Run",
+}
+# "name: what it means" or "one, other: what both mean", up to the next of its kind.
+MEANING = r"(?:(?<=\s)|^)([a-z_]+(?:, [a-z_]+)*): (.+?)(?=\s[a-z_, ]+: |\n\n|$)"
+FLAGS = """
+-m                       one run for each value: -m seed=0,1,2 (Hydra's launchers: hydra/launcher=...)
+--cfg job                print the configuration, run nothing
+--config-dir DIR         a folder of presets of your own
+--version                print the version
+"""
+
+
+def help_page(name: str, purpose: str, config: DictConfig) -> str:
+    """The page of a command.
+
+    Args:
+        purpose: its docstring. config: as composed with Hydra's own, so that the options of chosen presets are shown.
+    """
+    unread = UNREAD.get(name, ())
+    lines = [f"python -m cavin_pyro.{name} [option=value ...]     (cavin_pyro {__version__})", ""]
+    lines += textwrap.wrap(" ".join(inspect.cleandoc(purpose).split()), WIDTH)
+    lines += ["", "Examples"]
+    lines += [f"  python -m cavin_pyro.{name} {words}".rstrip() for words in EXAMPLES[name]]
+    chosen = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
+    own = {group: choice for group, choice in chosen.items() if presets(group) and group not in unread}
+    lines += ["", "Presets: one word for several options, which are listed below"]
+    for group, choice in own.items():
+        lines += _entry(f"{group}={choice}", f"one of {', '.join(presets(group))}")
+    declared = [one for one in options(COMMANDS[name]) if one.name.partition(".")[0] not in unread]
+    for group, heading in HEADINGS.items():
+        grouped = [one for one in declared if one.about.group == group]
+        if grouped:
+            lines += ["", heading]
+        for one in grouped:
+            unit = f", in {one.about.unit}" if one.about.unit else ""
+            choices = f"; one of {', '.join(one.about.names)}" if one.about.names else ""
+            value = OmegaConf.select(config, one.name)
+            lines += _entry(f"{one.name}={_text(value)}", f"{one.about.help}{unit}{choices}")
+    for group in own:
+        section: Any = OmegaConf.select(config, group.replace("/", "."))
+        if OmegaConf.is_dict(section) and "." not in group and "/" not in group:
+            entries = list(_part_entries(group, OmegaConf.to_container(section)))
+            if entries:
+                lines += ["", f"{group.capitalize()}, for {group}={chosen[group]}"]
+            for entry in entries:
+                lines += _entry(*entry)
+    lines += ["", "Flags"]
+    for flag in FLAGS.strip().splitlines():
+        lines += _entry(*(part.strip() for part in re.split(r"  +", flag, maxsplit=1)))
+    return "\n".join(lines)
+
+
+def presets(group: str) -> list[str]:
+    """The words for a group of presets, such as `planner`; none if it is not ours."""
+    folder = resources.files("cavin_pyro.config.presets").joinpath(group)
+    if group.startswith("hydra") or not folder.is_dir():
+        return []
+    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
+
+
+def _part_entries(prefix: str, section: Any) -> Iterator[tuple[str, str]]:
+    """The options of a part and of the parts in it, with what its class says of each."""
+    meanings = _meanings(section.get("_target_"))
+    for name, value in section.items():
+        if isinstance(value, dict):
+            yield from _part_entries(f"{prefix}.{name}", value)
+        elif name == "_target_" and value is not None:
+            yield f"{prefix}._target_={value}", "the class; name one of your own to take its place"
+        elif name != "model_free":
+            yield f"{prefix}.{name}={_text(value)}", meanings.get(name, "")
+
+
+def _meanings(target: str | None) -> Mapping[str, str]:
+    """What the docstrings of a class and of its parents say of its arguments, a sentence each."""
+    if target is None:
+        return {}
+    try:
+        found = get_object(target)
+    except Exception:
+        return {}
+    texts = [vars(one).get("__doc__") or "" for one in getattr(found, "__mro__", [found])]
+    meanings: dict[str, str] = {}
+    for text in map(inspect.cleandoc, filter(None, texts)):
+        for names, said in re.findall(MEANING, text, re.S):
+            sentence = re.split(r"(?<=[^.])\.(?:\s|$)", " ".join(said.split()))[0]
+            for name in names.split(", "):
+                meanings.setdefault(name, sentence)
+    return meanings
+
+
+def _text(value: Any) -> str:
+    if OmegaConf.is_list(value) or isinstance(value, list):
+        return f"[{','.join(str(_text(entry)) for entry in value)}]"
+    return str(shown(value))
+
+
+def _entry(option: str, help: str) -> list[str]:
+    indent = 34
+    wrapped = textwrap.wrap(help, WIDTH - indent) or [""]
+    first = f"  {option}"
+    if len(first) >= indent:
+        return [first, *(" " * indent + line for line in wrapped if line)]
+    return [f"{first:<{indent}}{wrapped[0]}".rstrip(), *(" " * indent + line for line in wrapped[1:])]

@@ -1,0 +1,68 @@
+"""The folder for a run's results where the user names none: another for every other configuration."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from cavin_pyro.config.composition import preset_defaults
+
+# The folder of a run without overrides, and the options that never decide which folder it is: runs that differ in
+# these only are one run, shown or continued otherwise.
+FOLDERS = {
+    "collect": ("data/pushes", ("transitions", "workers", "repair")),
+    "pretrain": ("runs/pretrain", ()),
+    "train": ("runs/train", ()),
+    "check": ("runs/check", ("sections",)),
+    "plan": ("runs/plan/{task}-{reward}-{objects}-{planner}-{seed}", ("video", "viewer")),
+    "evaluate": ("runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}", ("episodes", "workers", "compare")),
+    "demo": ("runs/demo", ()),
+}
+
+
+def with_output(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
+    """The configuration with `output`; in a sweep (`-m`) every run has a folder of its own, in `output` if it is given.
+
+    Args:
+        hydra_config: of the same composition.
+    """
+    pattern, _ = FOLDERS[name]
+    sweep = hydra_config.mode == RunMode.MULTIRUN
+    if config.output is not None and not sweep:
+        return config
+    run = run_name(name, config, hydra_config)
+    folder = f"{pattern.partition('/{')[0]}{'/' if '{' in pattern else ''}{run}"
+    if sweep:
+        folder = f"{config.output or f'runs/{name}/multirun'}/{run.strip('-') or 'defaults'}"
+    return OmegaConf.merge(config, {"output": folder})  # type: ignore[return-value]
+
+
+def run_name(name: str, config: DictConfig, hydra_config: Any) -> str:
+    """What tells a run from others of its command: presets by name, other differences by a hash of them."""
+    pattern, irrelevant = FOLDERS[name]
+    defaults, usual = preset_defaults(name, list(hydra_config.overrides.task))
+    choices = {str(group): choice for group, choice in hydra_config.runtime.choices.items()}
+    values: dict[str, Any] = {**{str(key): value for key, value in config.items()}, **choices}
+    template = pattern.partition("/")[2].partition("/")[2] if "{" in pattern else ""
+    named = template.format(**values)
+    changed = [
+        str(choice)
+        for group, choice in choices.items()
+        if choice != usual.get(group) and not group.startswith("hydra") and f"{{{group}}}" not in pattern
+    ]
+    before, now = (_flat(OmegaConf.to_container(one, resolve=True)) for one in (defaults, config))
+    told = {key for key in now if f"{{{key}}}" in pattern} | {"output", *irrelevant}
+    other = {key: now.get(key) for key in {*now, *before} - told if now.get(key, {}) != before.get(key, {})}
+    digest = hashlib.sha256(json.dumps(other, sort_keys=True).encode()).hexdigest()[:6]
+    return "".join([named, *(f"-{choice}" for choice in changed), f"-{digest}" if other else ""])
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Values by dotted names: {"a": {"b": 1}} -> {"a.b": 1}."""
+    if not isinstance(value, dict):
+        return {prefix.rstrip("."): value}
+    return {key: one for name, entry in value.items() for key, one in _flat(entry, f"{prefix}{name}.").items()}

@@ -1,0 +1,125 @@
+"""From configuration to parts: models, priors, guides and planners, by their `_target_`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any
+
+import hydra
+import yaml
+from hydra.errors import HydraException, InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError, at_least
+from guides.guide import Guide
+from models.model import Model
+
+Config = Mapping[str, Any] | DictConfig
+STANDARD_PRIOR = "models.priors.standard.StandardPrior"
+FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
+
+
+def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
+    """Build the part that a configuration names.
+
+    Raises:
+        UserError: there is no such class, it takes no such argument, or it refuses a value.
+    """
+    if not config.get("_target_"):
+        raise UserError(f"a part has no _target_, the class to build it from: {dict(config)}")
+    try:
+        # In two steps, because Hydra would turn keywords that are dataclasses into configuration.
+        return instantiate(config, _partial_=True, _convert_="all")(*arguments, **keywords)
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
+    except (InstantiationException, TypeError) as error:
+        cause = error.__cause__ or error
+        raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
+
+
+def check_sizes(section: str, config: Config) -> None:
+    """Make sure that every whole number of a section, apart from weights, is at least 1.
+
+    Raises:
+        UserError: one is not.
+    """
+    for name, value in config.items():
+        if type(value) is int and not str(name).endswith("_weight"):
+            at_least(f"{section}.{name!s}", value, 1)
+
+
+def build_model(config: Config) -> Model:
+    """The model program with its priors and likelihood scales, from the sections `model`, `prior` and `scales`.
+
+    A model gets a prior for each of its codes, that is, for each of `effect_dimension` and `motion_dimension`
+    that its section has: `model.prior` where that names a class, else the section `prior`.
+
+    Raises:
+        UserError: a part that cannot be built, or a section that lacks a number.
+    """
+    sizes = dict(config["model"])
+    own_prior = sizes.pop("prior", None) or {}
+    check_sizes("model", sizes)
+    try:
+        prior = own_prior if own_prior.get("_target_") else config["prior"]
+        check_sizes("prior", prior)
+        parts = {
+            name: construct(
+                prior,
+                dimension=sizes[f"{kind}_dimension"],
+                feature_dimension=sizes["feature_dimension"],
+                effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
+            )
+            for name, kind in (("effect_prior", "effect"), ("motion_prior", "motion"))
+            if f"{kind}_dimension" in sizes
+        }
+    except KeyError as error:
+        raise UserError(f"the configuration of the model lacks {error}") from error
+    model = construct(sizes, **parts, scales=construct(config.get("scales") or FIXED_SCALES))
+    if not isinstance(model, Model):
+        raise UserError(f"model {sizes['_target_']} is no model program: derive it from models.model.Model")
+    chosen = own_prior.get("_target_") or config["prior"]["_target_"]
+    if not parts and chosen != STANDARD_PRIOR:
+        raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
+    return model
+
+
+def build_guide(config: Config, model: Model) -> Guide:
+    """The guide program that goes with a model, from the section `guide`.
+
+    Raises:
+        UserError: a guide that cannot be built, or does not fit the model; the guides that do are named.
+    """
+    check_sizes("guide", config["guide"])
+    target, kind = config["guide"].get("_target_"), class_of(config["guide"])
+    if isinstance(kind, type) and not issubclass(kind, Guide):
+        raise UserError(f"guide {target} is no Pyro program: derive it from guides.guide.Guide")
+    if kind is not None and model.name not in kind.fits:
+        choices = ", ".join(_guides_for(model.name)) or "none of ours"
+        raise UserError(
+            f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(kind.fits) or 'none'}): "
+            f"choose guide= from {choices}"
+        )
+    return construct(config["guide"], model)
+
+
+def class_of(config: Config) -> Any:
+    """The class that a part names, None if there is no such class."""
+    try:
+        return hydra.utils.get_class(config["_target_"])
+    except (KeyError, HydraException, ImportError, ValueError):
+        return None  # `construct` says it better
+
+
+def _guides_for(model_name: str) -> list[str]:
+    """Words for `guide=` that fit a model."""
+    words = []
+    presets = resources.files("cavin_pyro.config") / "presets" / "guide"
+    for file in sorted(presets.iterdir(), key=lambda entry: entry.name):
+        if file.name.endswith(".yaml"):
+            guide = class_of(yaml.safe_load(file.read_text(encoding="utf-8")))
+            if model_name in guide.fits:
+                words.append(file.name.removesuffix(".yaml"))
+    return words

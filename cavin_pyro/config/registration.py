@@ -1,0 +1,55 @@
+"""Where Hydra finds the commands' options, and presets with the defaults of the constructors that they name.
+
+A preset says `_target_`, the class, and what differs from the class's own defaults. Hydra gets both, so that every
+option of a part can be changed from the command line and stands in a run's `config.yaml`, and no default is written
+twice.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import OmegaConf
+
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.constructors import with_defaults
+
+SCHEME = "presets"
+
+
+class PresetSource(ImportlibResourcesConfigSource):
+    """Reads a package's YAML files, and adds to each part the defaults of its constructor."""
+
+    @staticmethod
+    def scheme() -> str:
+        """The beginning of the search path's entry."""
+        return SCHEME
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """A preset by its path, such as `planner/cavin`."""
+        result = super().load_config(config_path)
+        given: Any = OmegaConf.to_container(result.config)
+        result.config = OmegaConf.create(with_defaults(given, config_path.partition("/")[0]))
+        return result
+
+
+class PresetPath(SearchPathPlugin):
+    """Puts our presets on Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Called by Hydra for every composition."""
+        search_path.append(provider="cavin_pyro", path=f"{SCHEME}://cavin_pyro.config.presets")
+
+
+def register() -> None:
+    """Tell Hydra of the commands' options and of our presets."""
+    Plugins.instance().register(PresetSource)
+    Plugins.instance().register(PresetPath)
+    for name, schema in COMMANDS.items():
+        ConfigStore.instance().store(name, schema, provider="cavin_pyro")

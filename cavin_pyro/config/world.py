@@ -1,0 +1,88 @@
+"""From the words `env.*` to the parts of the world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from cavin_pyro.config.errors import UserError, user_input
+from envs.layouts import task_class
+from envs.objects.asset import plain_name
+from envs.objects.object_sets import chosen, load_object_set
+from envs.objects.sampling import ObjectRanges
+from envs.robots import robot_maker
+from envs.tasks import Task
+from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
+from planning import PushBox
+
+
+def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
+    """The class that the option `task` names, and what replaces fields of its layout: `task.*` and `tiles.*`.
+
+    Raises:
+        UserError: there is no such class, or it is no task.
+    """
+    fields: Any = OmegaConf.to_container(config.tiles)
+    if isinstance(config.task, str):
+        with user_input():
+            return task_class(config.task), fields
+    section: Any = OmegaConf.to_container(config.task)
+    target = section.pop("_target_", None)
+    try:
+        kind = hydra.utils.get_class(target)
+    except (HydraException, ImportError, ValueError, TypeError) as error:
+        raise UserError(f"task._target_={target} cannot be imported: {' '.join(str(error).split())}") from error
+    if not issubclass(kind, Task):
+        raise UserError(f"task._target_={target} is no task: derive it from envs.tasks.Task")
+    return kind, fields | section
+
+
+def check_world(env: DictConfig) -> None:
+    """Check the parts that have names.
+
+    Raises:
+        UserError: unknown part, the valid ones are named; or a part lacks files, and what to do is said.
+    """
+    with user_input():
+        robot_maker(env.robot, env.assets)
+
+
+def object_ranges(env: DictConfig) -> ObjectRanges:
+    """Object parameters' ranges.
+
+    Raises:
+        UserError: assets that are not there, an unknown object, or a range that is not two increasing positive numbers.
+    """
+    ranges: Any = OmegaConf.to_container(env.ranges)
+    with user_input():
+        objects = load_object_set(env.objects, env.assets)
+    every = tuple(dict.fromkeys(map(plain_name, objects.names)))
+    for word in ("names", "target"):
+        if not isinstance(ranges[word], list | None):
+            raise UserError(f"env.ranges.{word} must be a list of objects, not {ranges[word]}")
+        ranges[word] = tuple(ranges[word] or (every if word == "names" else ()))
+        try:
+            chosen(ranges[word], objects)
+        except ValueError as error:
+            raise UserError(str(error).replace(":", f" in env.ranges.{word}:", 1)) from error
+    for word in ("scale", "mass", "friction", "kilograms"):
+        ranges[word] = _pair(f"env.ranges.{word}", ranges[word]) if ranges[word] or word != "kilograms" else None
+    for word in ("clearance", "drop_height"):
+        if not isinstance(ranges[word], int | float) or not ranges[word] >= 0:
+            raise UserError(f"env.ranges.{word} must be at least 0 metres, not {ranges[word]}")
+    return ObjectRanges(**ranges)
+
+
+def _pair(word: str, value: Any) -> tuple[float, float]:
+    numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
+    if not numbers or not 0 < value[0] <= value[1]:
+        raise UserError(f"{word} must be two positive numbers, low then high, not {value}")
+    return value[0], value[1]
+
+
+def push_box() -> PushBox:
+    """What normalised pushes mean on the table, for planners that propose pushes near objects."""
+    return PushBox(REACH_LOW, REACH_HIGH, MAXIMUM_MOTION)

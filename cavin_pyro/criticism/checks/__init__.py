@@ -1,0 +1,1 @@
+"""One check of a trained model and its guide per file."""

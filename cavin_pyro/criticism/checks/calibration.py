@@ -1,0 +1,135 @@
+"""Calibration of f's and h's predictions on held-out windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.figures.calibration import draw_calibration
+from cavin_pyro.criticism.section import Picture, Section, Table
+from cavin_pyro.criticism.statistics.predictions import (
+    LEVELS,
+    by_group,
+    energy_score,
+    has_subgoals,
+    judge,
+    percentage,
+    predict_steps,
+    predict_subgoals,
+    transform,
+)
+from cavin_pyro.criticism.statistics.windows import seeded
+
+PREDICTORS = {
+    "f": "f, given the state and the push",
+    "h_prior": "h, codes from the prior",
+    "h_guide": "h, codes from the guide",
+}
+TOLERANCE = 0.05  # a 90 % interval that holds this much more or less is called too wide or too narrow
+
+Scores = Mapping[str, Mapping[str, Mapping[str, dict[str, Any]]]]  # predictor, group, coordinate: as of `scores`
+
+EXPLANATION = """
+{samples} samples of each prediction of {windows} held-out windows, in all of which some object moved more than 0.1 m
+and none more than 0.5 m. f predicts the state after each push from the state before it; h the state after the
+segment, with codes from the prior (its mixture p(s' | s) over p(c | s), what can be known before acting) or from the
+guide, which knows the result. Objects that really moved more than 1 cm are kept apart from those that lay still: most
+lie still, and would dominate the numbers. The PIT is where the truth lies among the samples: uniform if the
+prediction is right, heaped at the ends if it is too sure, in the middle if it is too wide. Only where all objects
+count together should it be uniform for a right model, since the groups are chosen by the truth. The stated scale is
+the spread of the samples; for f, and for h with codes from the guide, the RMS error is the scale that would be right.
+CRPS and energy score weigh error and spread in one number, lower is better; the energy score takes all centres of a
+window together.
+"""
+
+
+@torch.no_grad()
+def assess_calibration(context: CheckContext, *, windows: int = 400, samples: int = 200) -> Section:
+    """Coverage, PIT, CRPS and energy scores of f's and h's predictions.
+
+    Args:
+        windows: of `context.validation` at most. samples: of each prediction.
+    """
+    window, model = context.validation.map(lambda field: field[:windows]), context.model
+    energy: dict[str, float] = {}
+    with seeded(context.seed):
+        predictions = {"f": predict_steps(model, window, samples)}
+        if has_subgoals(model, window):
+            predictions["h_prior"] = predict_subgoals(model, window, samples)
+            predictions["h_guide"] = predict_subgoals(model, window, samples, guide=context.guide)
+        transforms = {name: transform(prediction) for name, prediction in predictions.items()}
+    results = {name: judge(prediction, transforms[name]) for name, prediction in predictions.items()}
+    for name, prediction in predictions.items():
+        if name != "f":
+            real, counted = prediction.real_centers, prediction.counted
+            energy[name] = energy_score(prediction.centers, real, counted).mean().item()
+            energy["nothing_moves"] = energy_score(window.first.centers[None], real, counted).mean().item()
+    numbers = {"windows": len(window.actions), "samples": samples}
+    return Section(
+        name="calibration",
+        title="Are the predictions of f and h as sure as they should be?",
+        explanation=" ".join(EXPLANATION.format(**numbers).split()),
+        findings=list(_findings(results, energy)),
+        values={**numbers, "scores": results, "energy_score": energy},
+        tables=_tables(results, energy),
+        pictures=[
+            Picture(
+                "calibration",
+                "PIT histograms of the planar centres (1 is uniform), and how much central intervals hold "
+                "against what they should.",
+                draw_calibration(
+                    {
+                        PREDICTORS[name]: by_group(prediction, transforms[name])
+                        for name, prediction in predictions.items()
+                    }
+                ),
+            )
+        ],
+    )
+
+
+def _tables(results: Scores, energy: Mapping[str, float]) -> list[Table]:
+    rows = [
+        [
+            PREDICTORS[predictor],
+            group,
+            coordinate,
+            *(score[name] for name in ("count", "rms_error", "scale", "crps")),
+            *score["coverage"].values(),
+        ]
+        for predictor, groups in results.items()
+        for group, coordinates in groups.items()
+        for coordinate, score in coordinates.items()
+    ]
+    covered = [f"in {percentage(level)} % interval" for level in LEVELS]
+    tables = [Table(["prediction", "objects", "of", "count", "RMS error", "stated scale", "CRPS", *covered], rows, 4)]
+    if energy:
+        names = PREDICTORS | {"nothing_moves": "nothing moves"}
+        tables.append(Table(["prediction", "energy score (m)"], [[names[key], value] for key, value in energy.items()]))
+    return tables
+
+
+def _findings(results: Scores, energy: Mapping[str, float]) -> Iterator[str]:
+    for predictor, groups in results.items():
+        for group in ("moved", "still"):
+            planar = [groups[group][coordinate] for coordinate in ("x", "y")]
+            if not planar[0]["count"]:
+                continue
+            held = sum(score["coverage"]["90"] for score in planar) / 2
+            error, scale, crps = (sum(score[key] for score in planar) / 2 for key in ("rms_error", "scale", "crps"))
+            verdict = "about right" if abs(held - 0.9) <= TOLERANCE else "too wide" if held > 0.9 else "too narrow"
+            whose = "objects that moved" if group == "moved" else "objects that lay still"
+            yield (
+                f"For {whose}, 90 % intervals of x and y from {PREDICTORS[predictor]}, hold {100 * held:.0f} % "
+                f"({verdict}); stated scale {100 * scale:.2f} cm, RMS error {100 * error:.2f} cm, "
+                f"CRPS {100 * crps:.2f} cm."
+            )
+    if energy:
+        yield (
+            f"The energy score of h is {100 * energy['h_prior']:.1f} cm with codes from the prior and "
+            f"{100 * energy['h_guide']:.1f} cm with codes from the guide; for the guess that nothing moves it is "
+            f"{100 * energy['nothing_moves']:.1f} cm."
+        )

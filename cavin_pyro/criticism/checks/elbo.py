@@ -1,0 +1,87 @@
+"""The ELBO term by term, on training windows and on held-out windows."""
+
+from __future__ import annotations
+
+import torch
+
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.figures.elbo import draw_differences
+from cavin_pyro.criticism.section import Picture, Section, Table
+from cavin_pyro.criticism.statistics.codes import mean_with_error, some_windows
+from cavin_pyro.criticism.statistics.elbo import TOTAL, adjusted_difference, scene_sizes, terms_by_window
+from cavin_pyro.criticism.statistics.windows import seeded
+
+NAME, TITLE = "elbo", "The ELBO, term by term"
+
+
+def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4, batch: int = 256) -> Section:
+    """Each term of -ELBO, per window, on training and on validation windows.
+
+    f sums next_centers and next_features over the T transitions of a window; sites without a label of ours (of a
+    user's own model) stand under their own names. A term of a window is its mean over samples from the guide.
+
+    Args:
+        windows: at most so many of each. batch: bounds the memory.
+    """
+    parts = {
+        name: some_windows(window, windows, context.seed)
+        for name, window in (("training", context.training), ("validation", context.validation))
+    }
+    with seeded(context.seed):
+        terms = {
+            name: terms_by_window(context.model, context.guide, part, samples, batch) for name, part in parts.items()
+        }
+    values = {name: {term: mean_with_error(value) for term, value in found.items()} for name, found in terms.items()}
+    covariates = torch.cat([scene_sizes(part) for part in parts.values()])
+    held_out = torch.arange(len(covariates)) >= len(parts["training"].actions)
+    differences = {
+        term: adjusted_difference(torch.cat([found[term] for found in terms.values()]), held_out, covariates)
+        for term in terms["training"]
+    }
+    counts = {name: len(found[TOTAL]) for name, found in terms.items()}
+    rows = [
+        [term]
+        + [_with_error(values[name][term]) for name in ("training", "validation")]
+        + [_with_error(differences[term])]
+        for term in differences
+    ]
+    explanation = (
+        "Nats per window; every term is minus a log density (or a KL), so smaller is better. Densities are of metres "
+        "and unit vectors, so likelihood terms may be negative: read their differences. ± is one standard error over "
+        "windows; windows of one episode overlap, which makes it a little small. The difference is taken at equal "
+        "numbers of objects (by linear regression), which density terms grow with. "
+        f"{counts['training']} training and {counts['validation']} validation windows."
+    )
+    return Section(
+        NAME,
+        TITLE,
+        explanation,
+        _findings(differences),
+        {**values, "difference": differences, "windows": counts},
+        [Table(["term", "training", "validation", "validation - training"], rows)],
+        [_picture(differences)],
+    )
+
+
+def _with_error(value: dict[str, float]) -> str:
+    return f"{value['mean']:.2f} ± {value['standard_error']:.2f}"
+
+
+def _findings(differences: dict[str, dict[str, float]]) -> list[str]:
+    total = differences[TOTAL]
+    clear = abs(total["mean"]) > 2 * total["standard_error"]
+    worse = "worse" if total["mean"] > 0 else "better"
+    sentences = [
+        f"On validation windows the ELBO is {abs(total['mean']):.1f} ± {total['standard_error']:.1f} nats {worse} than "
+        f"on training windows, {'more' if clear else 'not more'} than chance explains."
+    ]
+    parts = {term: value for term, value in differences.items() if term != TOTAL}
+    term = max(parts, key=lambda name: parts[name]["mean"] / max(parts[name]["standard_error"], 1e-12))
+    if parts[term]["mean"] > 2 * parts[term]["standard_error"]:
+        sentences.append(f"The clearest loss is in {term}: {_with_error(parts[term])} nats per window.")
+    return sentences
+
+
+def _picture(differences: dict[str, dict[str, float]]) -> Picture:
+    caption = "Each term on windows held out, less the same on training windows, with two standard errors."
+    return Picture("elbo_terms", caption, draw_differences(differences))

@@ -1,0 +1,162 @@
+"""Load what a check needs, from a checkpoint and datasets, and what the report says about their origin."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import configured
+from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.data.dataset import content_fingerprint, read_metadata, with_current_names
+from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.data.world import collecting_world
+from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
+from cavin_pyro.storage.pointnet import check_fit, pointnet_of
+from cavin_pyro.storage.provenance import provenance
+from cavin_pyro.storage.run_directory import with_fingerprint
+from cavin_pyro.training.factory import data_folders
+from envs.workspace import MAXIMUM_OBJECTS
+from guides.guide import Guide
+from models.model import Model
+from models.state import Window
+
+
+def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
+    """Read what the words `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
+
+    Windows are chosen and held out with the checkpoint's own configuration and seed, so that the held-out episodes are
+    those that its training held out.
+
+    Returns:
+        The context, and `about` for the report (see `cavin_pyro.criticism.report`).
+
+    Raises:
+        UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
+    """
+    world = collecting_world(config.env)
+    path = find_checkpoint(config.checkpoint)
+    checkpoint = load_checkpoint(path, trust=list(config.trust))
+    model, guide = load_programs(checkpoint, path)
+    pointnet = pointnet_of(checkpoint, path)
+    check_fit(model, pointnet, MAXIMUM_OBJECTS)
+    windows, segment_length, split = trained_windows(checkpoint, path)
+    folders = data_folders(config.data)
+    data = [compare_data(folder, checkpoint.provenance) for folder in folders]
+    table = load_windows(folders, pointnet, windows, segment_length=segment_length, seed=split)
+    training, validation = (
+        sample_windows(table, getattr(table, name), config.windows, seed=[config.seed, number])
+        for number, name in enumerate(("training", "validation"))
+    )
+    context = CheckContext(model, guide, pointnet, training, validation, seed=config.seed, world=world)
+    own_prior = (checkpoint.config["model"].get("prior") or {}).get("_target_")
+    about = {
+        "checkpoint": str(path),
+        "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:12],
+        "model": type(model).__name__,
+        "guide": type(guide).__name__,
+        "prior": _last(own_prior or checkpoint.config["prior"].get("_target_")),
+        "objective": _objective(checkpoint.config),
+        "trained": checkpoint.provenance,
+        "data": data,
+        "windows": {"training": len(training.actions), "validation": len(validation.actions)},
+        "seed": config.seed,
+        "run": provenance(),
+    }
+    return context, about
+
+
+def load_programs(checkpoint: Checkpoint, where: str | Path) -> tuple[Model, Guide]:
+    """Model and guide of a checkpoint, in evaluation mode and without gradients.
+
+    Raises:
+        UserError: there is no model or no guide in it, or one of another architecture.
+    """
+    if "model" not in checkpoint.config:
+        raise UserError(f"checkpoint {where} holds no model: give one that train has written")
+    model = build_model(checkpoint.config)
+    checkpoint.load_into("model", model, where)
+    guide = build_guide(checkpoint.config, model) if "guide" in checkpoint.config else None
+    if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in checkpoint.tensors)):
+        raise UserError(f"checkpoint {where} holds no guide: give one that train has written")
+    checkpoint.load_into("guide", guide, where)
+    for program in (model, guide):
+        program.requires_grad_(False).eval()
+    return model, guide
+
+
+def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowConfig, int, int]:
+    """Which windows a checkpoint was trained on: their configuration, T, and the seed of the split.
+
+    Raises:
+        UserError: the checkpoint does not tell them.
+    """
+    try:
+        windows = configured(WindowConfig, checkpoint.config["windows"], "windows")
+        return windows, int(checkpoint.config["model"]["segment_length"]), int(checkpoint.config["seed"])
+    except (AttributeError, KeyError, TypeError) as error:
+        raise UserError(
+            f"checkpoint {where} does not tell which windows its training held out (its configuration lacks "
+            f"{' '.join(str(error).split())}): give one that train has written"
+        ) from error
+
+
+def sample_windows(table: WindowTable, numbers: torch.Tensor, count: int, *, seed: Sequence[int]) -> Window:
+    """At most `count` of the windows with these numbers, among those that count for all terms."""
+    counted = numbers[table.sequence_mask[numbers]]
+    order = np.random.default_rng(list(seed)).permutation(len(counted))[:count]
+    return table.batch(counted[torch.from_numpy(np.sort(order))])
+
+
+def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
+    """Whether a dataset is what a checkpoint says that it was trained on.
+
+    Returns:
+        `folder`, `transitions`, `seed`, `fingerprint`; `same`: true or false, None where it cannot be told; `verdict`.
+
+    Raises:
+        UserError: no dataset.
+    """
+    metadata, fingerprint = read_metadata(folder), content_fingerprint(folder)
+    entries = trained.get("data")
+    same, verdict = _verdict(metadata, fingerprint, entries if isinstance(entries, list) else [])
+    seed = metadata["settings"].get("seed")
+    found = {"folder": str(folder), "transitions": metadata["transitions"], "seed": seed, "fingerprint": fingerprint}
+    return {**found, "same": same, "verdict": verdict}
+
+
+def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[Any]) -> tuple[bool | None, str]:
+    entries = [with_fingerprint(entry) for entry in entries if isinstance(entry, dict)]
+    if not entries:
+        return None, "the checkpoint does not tell what it was trained on"
+    wanted = metadata["settings"]
+    same_settings = [entry for entry in entries if with_current_names(entry.get("settings") or {}) == wanted]
+    if not same_settings:
+        return False, "the model was trained on other data: none of these episodes is known to it"
+    entry = next((entry for entry in same_settings if entry.get("fingerprint") == fingerprint), same_settings[0])
+    grown = (
+        "" if entry.get("transitions") == metadata["transitions"] else f", of which it saw {entry.get('transitions')}"
+    )
+    if entry.get("fingerprint") == fingerprint:
+        return True, f"the model was trained on these{grown}"
+    if "fingerprint" in entry:
+        return False, "collected with the settings of the training data, but by another program: other episodes"
+    return None, f"settings and seed are those of the training data{grown}; whether the content is, it does not tell"
+
+
+def _objective(config: Mapping[str, Any]) -> str | None:
+    """The bound that was trained on, for people: the name of its class."""
+    objective = config.get("objective") or {}
+    return _last((objective.get("elbo") or objective).get("_target_"))
+
+
+def _last(target: str | None) -> str | None:
+    return target and str(target).rpartition(".")[2]

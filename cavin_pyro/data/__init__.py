@@ -1,0 +1,1 @@
+"""Datasets on disk: collection, windows, features, held-out objects, summaries."""

@@ -1,0 +1,266 @@
+"""Collection of episodes by parallel workers; the seed alone determines the data."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavin_pyro import __version__
+from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptions
+from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
+from cavin_pyro.storage.progress import progress_bar
+from envs.objects.object_sets import load_object_set
+from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
+from envs.observation import Observation
+from envs.policy import HeuristicPushingPolicy
+from envs.randomness import collection_streams
+from envs.scene import PushReport, Scene
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+
+CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
+
+
+@dataclass
+class CollectionConfig(CollectionOptions):
+    """What decides the data, and nothing else: equal configurations give equal data.
+
+    Attributes:
+        ranges: object parameters. object_set: where the objects come from. assets: folder of meshes, for a set that
+            needs one; where it lies decides nothing.
+        camera, segmentation: by name, see `envs.scene.Scene`.
+    """
+
+    ranges: ObjectRanges = field(default_factory=lambda: ObjectRanges(clearance=COLLECTION_CLEARANCE))
+    object_set: str = WorldConfig.objects
+    assets: str | None = WorldConfig.assets
+    camera: str = WorldConfig.camera
+    segmentation: str = WorldConfig.segmentation
+
+
+def collect(
+    settings: CollectionConfig,
+    folder: Path,
+    *,
+    transitions: int = CollectConfig.transitions,
+    workers: int = CollectConfig.workers,
+) -> dict[str, Any]:
+    """Collect whole shards until at least `transitions` pushes are on disk; go on where an earlier run stopped.
+
+    Shards are computed in parallel, but committed in order by this process alone: the metadata count a shard only
+    once its file is in place. A run that was killed therefore resumes after the last shard that counts.
+
+    Returns:
+        The dataset's metadata.
+
+    Raises:
+        UserError: the folder holds a dataset of other settings.
+    """
+    metadata = _begin(settings, folder)
+    with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
+        if metadata["transitions"] >= transitions:
+            return metadata
+        for arrays, seconds in _shards(settings, first=metadata["shards"], workers=workers):
+            write_shard(shard_path(folder, metadata["shards"]), arrays)
+            made = int(arrays["length"].sum())
+            metadata["shards"] += 1
+            metadata["episodes"] += len(arrays["length"])
+            metadata["transitions"] += made
+            _write(folder, metadata)
+            _log_time(folder, metadata["shards"] - 1, made, seconds)
+            bar.update(made)
+            if metadata["transitions"] >= transitions:
+                break
+    return metadata
+
+
+def collect_episode(scene: Scene, settings: CollectionConfig, episode: int) -> Arrays:
+    """Collect one episode; arrays as in `cavin_pyro.data.dataset`, without the leading E."""
+    scene_generator, policy_generator = collection_streams(settings.seed, episode)
+    count = int(scene_generator.integers(settings.minimum_objects, settings.maximum_objects + 1))
+    with user_input():
+        observation = scene.sample([clutter_area(scene_generator)] * count, settings.ranges, scene_generator)
+    policy = HeuristicPushingPolicy(
+        policy_generator, intent_length=settings.intent_length, perturbation_rate=settings.perturbation_rate
+    )
+    arrays = _blank(settings, scene)
+    arrays["mask"][:] = observation.mask
+    arrays["episode"] = np.array(episode, np.int64)
+    _record_observation(arrays, 0, observation)
+    for step in range(settings.steps):
+        action = policy.act(observation).astype(np.float32)
+        report = scene.push(action)
+        observation = scene.observe()
+        _record_push(arrays, step, action, report, policy)
+        _record_observation(arrays, step + 1, observation)
+        arrays["length"] = np.array(step + 1, np.int64)
+        if report.fallen:
+            break
+    return arrays
+
+
+def clutter_area(generator: np.random.Generator) -> Area:
+    """A rectangle somewhere on the table: objects near each other are what planning has to deal with."""
+    ((low, high),) = WHOLE_TABLE
+    size = np.minimum(generator.uniform(*CLUTTER_SIDES, size=2), np.subtract(high, low))
+    corner = np.add(low, generator.random(2) * (np.subtract(high, low) - size))
+    return [(tuple(corner), tuple(corner + size))]
+
+
+def _blank(settings: CollectionConfig, scene: Scene) -> Arrays:
+    steps, objects = settings.steps, MAXIMUM_OBJECTS
+    arrays: Arrays = {
+        "centers": np.zeros((steps + 1, objects, 3), np.float32),
+        "clouds": np.zeros((steps + 1, objects, POINTS_PER_OBJECT, 3), np.float16),
+        "visible": np.zeros((steps + 1, objects), np.bool_),
+        "mask": np.zeros(objects, np.bool_),
+        "actions": np.zeros((steps, 4), np.float32),
+        "moved": np.zeros((steps, objects), np.float32),
+        **{name: np.zeros(steps, np.bool_) for name in ("unsafe", "ineffective", "fallen")},
+        "target": np.zeros(steps, np.int8),
+        "angle": np.zeros(steps, np.float32),
+        "shape": np.full(objects, -1, np.int8),
+        **{name: np.zeros(objects, np.float32) for name in ("scale", "mass", "friction")},
+    }
+    for slot, one in enumerate(scene.objects):
+        arrays["shape"][slot] = scene.object_set.names.index(one.name)
+        for name in ("scale", "mass", "friction"):
+            arrays[name][slot] = getattr(one, name)
+    return arrays
+
+
+def _record_observation(arrays: Arrays, step: int, observation: Observation) -> None:
+    arrays["centers"][step] = observation.centers
+    arrays["clouds"][step] = observation.clouds - observation.centers[:, None]
+    arrays["visible"][step] = observation.visible
+
+
+def _record_push(
+    arrays: Arrays, step: int, action: np.ndarray, report: PushReport, policy: HeuristicPushingPolicy
+) -> None:
+    arrays["actions"][step] = action
+    arrays["moved"][step, : len(report.moved)] = report.moved
+    arrays["unsafe"][step], arrays["ineffective"][step] = report.unsafe, report.ineffective
+    arrays["fallen"][step] = report.fallen
+    arrays["target"][step], arrays["angle"][step] = policy.intent.target, policy.intent.angle
+
+
+def open_scene(settings: CollectionConfig) -> Scene:
+    """The world in which episodes of these settings are collected.
+
+    Raises:
+        UserError: it has no such part, or a part lacks its files.
+    """
+    with user_input():
+        return Scene(
+            object_set=load_object_set(settings.object_set, settings.assets),
+            camera=settings.camera,
+            segmentation=settings.segmentation,
+        )
+
+
+@cache
+def _scene(**parts: Any) -> Scene:
+    """One per worker process."""
+    return open_scene(CollectionConfig(**parts))
+
+
+def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str, float]]:
+    settings, shard = job
+    parts = ("object_set", "assets", "camera", "segmentation")
+    scene = _scene(**{name: getattr(settings, name) for name in parts})
+    began = time.process_time()
+    scene.seconds = dict.fromkeys(scene.seconds, 0.0)
+    first = shard * settings.episodes_per_shard
+    episodes = [
+        collect_episode(scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
+    ]
+    arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
+    return arrays, {"cpu": time.process_time() - began, **scene.seconds}
+
+
+def _shards(settings: CollectionConfig, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
+    numbers = (first + number for number in range(10**9))
+    if workers == 1:
+        yield from (_collect_shard((settings, number)) for number in numbers)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        waiting = [pool.apply_async(_collect_shard, ((settings, next(numbers)),)) for _ in range(2 * workers)]
+        while True:
+            # A bounded queue: `imap` would run ahead of the disk without limit.
+            yield waiting.pop(0).get()
+            waiting.append(pool.apply_async(_collect_shard, ((settings, next(numbers)),)))
+
+
+def _begin(settings: CollectionConfig, folder: Path) -> dict[str, Any]:
+    """Metadata of the dataset so far, checked against what is asked for."""
+    wanted, usual = (_plain(asdict(one)) for one in (settings, CollectionConfig()))
+    del wanted["assets"], usual["assets"]
+    if not (folder / "metadata.json").exists():
+        metadata = {
+            "settings": wanted,
+            "shape_names": list(load_object_set(settings.object_set, settings.assets).names),
+            "made_by": f"cavin_pyro {__version__}",
+            "shards": 0,
+            "episodes": 0,
+            "transitions": 0,
+        }
+        return metadata
+    try:
+        metadata = read_metadata(folder)
+    except UserError as error:
+        if "is empty" not in str(error):
+            raise
+        (folder / "metadata.json").unlink()
+        return _begin(settings, folder)
+    stored = usual | metadata["settings"]  # older versions did not write options that came later
+    stored["ranges"] = usual["ranges"] | stored["ranges"]
+    for name, value in wanted.items():
+        if stored[name] != value:
+            raise UserError(
+                f"{folder} holds a dataset with {name}={stored[name]}, not {value}: "
+                "resume with the same settings, or choose another output=DIR"
+            )
+    return metadata
+
+
+def _write(folder: Path, metadata: dict[str, Any]) -> None:
+    write_metadata(folder, {name: value for name, value in metadata.items() if name not in ("format", "version")})
+
+
+def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:
+    """Where the time of each shard went; apart from the data, which must not depend on the machine's speed."""
+    path = folder / "timing.csv"
+    header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
+    row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "segmentation", "points"))
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(f"{header}{shard},{transitions},{row}\n")
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, so that settings compare equal after a round trip through JSON."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+
+
+def repair(settings: CollectionConfig, folder: Path) -> int:
+    """Collect again the shards that are missing or corrupt; returns how many there were."""
+    metadata, repaired = _begin(settings, folder), 0
+    for number in range(metadata["shards"]):
+        try:
+            read_shard(shard_path(folder, number))
+        except UserError as error:
+            print(f"collecting again: {error}", flush=True)
+            arrays, _ = _collect_shard((replace(settings), number))
+            write_shard(shard_path(folder, number), arrays)
+            repaired += 1
+    return repaired

@@ -1,0 +1,152 @@
+"""Collected episodes on disk: a folder of HDF5 files, one per shard of episodes, and a metadata file.
+
+A shard is written under a temporary name and then renamed, so each file is whole or absent; HDF5's Fletcher-32
+checksums find a shard that was damaged later. Letters: E episodes, S pushes, M objects (padded).
+
+    centers [E, S+1, M, 3] metres       clouds [E, S+1, M, 256, 3] metres from the centre, half precision
+    visible [E, S+1, M]                 mask [E, M]
+    actions [E, S, 4] normalised        moved [E, S, M] metres, from the simulator
+    unsafe, ineffective, fallen [E, S]  length [E] pushes made; what follows is padding
+    target [E, S], angle [E, S]         the policy's intent (radians)
+    shape, scale, mass, friction [E, M] object parameters; shape indexes `shape_names` in the metadata
+    episode [E]                         number of the episode, which with the root seed makes its seed
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+from numpy.typing import NDArray
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.files import atomic_write, read_json, write_json
+
+FORMAT = "cavin_pyro episodes"
+FORMAT_VERSION = 1
+RENAMED = {"hold": "intent_length", "perturbed": "perturbation_rate"}  # settings, by their former names
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def shard_path(folder: Path, number: int) -> Path:
+    """Where a shard lies."""
+    return folder / f"episodes-{number:05d}.h5"
+
+
+def write_shard(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write one shard atomically; equal arrays give equal bytes."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(_shard_bytes(arrays))
+
+
+def _shard_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    # Made in memory, because HDF5 on a full disk ends in errors of its own that cannot be caught in one place.
+    with h5py.File("shard", "w", libver="v110", driver="core", backing_store=False) as file:
+        for name in sorted(arrays):
+            file.create_dataset(
+                name,
+                data=arrays[name],
+                chunks=True,
+                compression="gzip",
+                compression_opts=1,
+                shuffle=True,
+                fletcher32=True,
+            )
+        file.flush()
+        return file.id.get_file_image()
+
+
+def read_shard(path: Path, names: tuple[str, ...] | None = None) -> Arrays:
+    """Read one shard, or some of its arrays.
+
+    Raises:
+        UserError: the file is missing, truncated, damaged or not a shard; it is named.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            return {name: file[name][()] for name in (names or sorted(file))}
+    except (OSError, KeyError, RuntimeError) as error:
+        raise UserError(
+            f"shard {path} is missing or corrupt ({str(error).splitlines()[0]}): "
+            "delete it and collect again to rebuild it, or pass skip_corrupt=true to use the rest"
+        ) from error
+
+
+def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:
+    """Write the dataset's metadata atomically."""
+    write_json(folder / "metadata.json", {"format": FORMAT, "version": FORMAT_VERSION, **metadata})
+
+
+def read_metadata(folder: Path) -> dict[str, Any]:
+    """Read and check a dataset's metadata.
+
+    Raises:
+        UserError: there is no dataset, or it has another format or version, or it holds no episode.
+    """
+    path = folder / "metadata.json"
+    if not path.exists():
+        raise UserError(
+            f"no dataset in {folder}: make one with python -m cavin_pyro.collect transitions=100000 output={folder}"
+        )
+    metadata = read_json(path)
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        raise UserError(f"{path} does not describe a dataset of this program")
+    if metadata.get("version") != FORMAT_VERSION:
+        raise UserError(
+            f"dataset {folder} has format version {metadata.get('version')}, this program reads {FORMAT_VERSION}: "
+            "collect it again"
+        )
+    counts = [metadata.get(name) for name in ("shards", "episodes", "transitions")]
+    if not all(type(count) is int for count in counts) or not isinstance(metadata.get("settings"), dict):
+        raise UserError(f"{path} is damaged: settings or counts are missing; collect the dataset again")
+    if metadata["shards"] < 1:
+        raise UserError(
+            f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
+        )
+    return {**metadata, "settings": with_current_names(metadata["settings"])}
+
+
+def with_current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a collection as an older version wrote them, by today's names."""
+    return {RENAMED.get(name, name): value for name, value in settings.items()}
+
+
+def content_fingerprint(folder: Path) -> str:
+    """Twelve hexadecimal digits of the first shard's bytes: equal for equal settings, program and simulator.
+
+    Raises:
+        UserError: the shard cannot be read.
+    """
+    path = shard_path(folder, 0)
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    except OSError as error:
+        raise UserError(f"shard {path} cannot be read ({error.strerror}): collect it again") from error
+
+
+def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
+    """Yield (number, arrays) of a dataset's shards in order.
+
+    Args:
+        names: arrays to read. skip_corrupt: leave corrupt shards out, naming each, instead of stopping at them.
+
+    Raises:
+        UserError: no dataset, a corrupt shard, or none that is whole.
+    """
+    metadata, whole = read_metadata(folder), 0
+    for number in range(metadata["shards"]):
+        try:
+            arrays = read_shard(shard_path(folder, number), names)
+        except UserError as error:
+            if not skip_corrupt:
+                raise
+            print(f"left out: {error}", flush=True)
+            continue
+        whole += 1
+        yield number, arrays
+    if whole == 0:
+        raise UserError(f"dataset {folder} has no usable shard: collect it again")

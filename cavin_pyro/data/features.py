@@ -1,0 +1,94 @@
+"""Geometric features of a dataset, computed once and stored beside it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_shard
+from cavin_pyro.data.held_out import find_held_out
+from models.networks.pointnet import PointNet
+
+BATCH = 4096  # clouds
+
+
+def pointnet_fingerprint(pointnet: PointNet) -> str:
+    """Twelve hexadecimal digits that change when any weight does."""
+    digest = hashlib.sha256()
+    for name, value in sorted(pointnet.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:12]
+
+
+@torch.inference_mode()
+def cloud_features(pointnet: PointNet, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Features [..., 64] of clouds [..., P, 3] metres from their centres."""
+    flat = torch.from_numpy(np.ascontiguousarray(clouds)).flatten(0, -3)
+    parts = [pointnet(batch.float()) for batch in flat.split(BATCH)]
+    return torch.cat(parts).reshape(*clouds.shape[:-2], -1).numpy()
+
+
+def shard_features(folder: Path, number: int, pointnet: PointNet, fingerprint: str) -> NDArray[np.float32]:
+    """Features [E, S+1, M, 64] of one shard, read from beside it if this PointNet made them before.
+
+    Args:
+        fingerprint: of this PointNet, see `pointnet_fingerprint`.
+
+    Raises:
+        UserError: the shard is corrupt.
+    """
+    path = folder / f"features-{fingerprint}" / f"episodes-{number:05d}.h5"
+    if path.exists():
+        try:
+            return read_shard(path)["features"]
+        except UserError:
+            path.unlink()  # a derived file: damaged ones are made again
+    features = cloud_features(pointnet, read_shard(shard_path(folder, number), ("clouds",))["clouds"])
+    try:
+        path.parent.mkdir(exist_ok=True)
+        write_shard(path, {"features": features})
+    except OSError:
+        pass  # a dataset on a read-only or full disk can still be trained on
+    return features
+
+
+def sample_clouds(
+    folders: Sequence[Path], *, count: int, generator: np.random.Generator, held_out_objects: Sequence[str] = ()
+) -> NDArray[np.float32]:
+    """Sample clouds [count, 256, 3] metres from datasets, from as many shards as it takes, real objects only.
+
+    Args:
+        held_out_objects: names of objects that are not to be among them.
+
+    Raises:
+        UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
+    """
+    held_out = find_held_out(held_out_objects, folders, option="held_out_objects")
+    shards = [
+        (folder, number, excluded)
+        for folder, excluded in zip(folders, held_out, strict=True)
+        for number in range(read_metadata(folder)["shards"])
+    ]
+    chosen = generator.permutation(len(shards))[: max(1, min(len(shards), 100))]
+    each = -(-count // len(chosen))
+    sampled = []
+    for folder, number, excluded in [shards[index] for index in sorted(chosen)]:
+        arrays = read_shard(shard_path(folder, number), ("clouds", "visible", "length", *excluded.required_arrays))
+        steps = np.arange(arrays["visible"].shape[1])
+        real = arrays["visible"] & (steps[None, :, None] <= arrays["length"][:, None, None])
+        if excluded.numbers:
+            real &= ~excluded.held_out(arrays)[:, None]
+        clouds = arrays["clouds"][real]
+        sampled.append(clouds[generator.permutation(len(clouds))[:each]].astype(np.float32))
+    clouds = np.concatenate(sampled)[:count]
+    if len(clouds) < min(count, 2):  # one to learn from and one to validate with
+        where = " and ".join(map(str, folders))
+        raise UserError(f"{where}: {len(clouds)} clouds without {', '.join(held_out_objects)}: hold out fewer objects")
+    return clouds

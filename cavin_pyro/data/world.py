@@ -1,0 +1,27 @@
+"""The world that random pushes are collected in."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.world import check_world, object_ranges
+from cavin_pyro.data.collection import CollectionConfig
+
+
+def collecting_world(env: DictConfig) -> CollectionConfig:
+    """How episodes are collected in the world of `env.*`, with the usual numbers.
+
+    Raises:
+        UserError: as `check_world` and `object_ranges`, or another robot than the stick.
+    """
+    check_world(env)
+    if env.robot != "stick":
+        raise UserError(f"random pushes are made with env.robot=stick, not {env.robot}: it pushes alike in less time")
+    return CollectionConfig(
+        ranges=object_ranges(env),
+        object_set=env.objects,
+        assets=env.assets,
+        camera=env.camera,
+        segmentation=env.segmentation,
+    )

@@ -1,0 +1,1 @@
+"""Closed-loop episodes: rollout, evaluation over seeds, comparison, statistics of rates."""

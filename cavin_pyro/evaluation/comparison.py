@@ -1,0 +1,93 @@
+"""Paired comparison of two evaluations on the same scenes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from scipy.stats import binomtest
+from yaml import YAMLError
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.run_directory import flat_options, stored_options
+
+SAME_SCENES = ("task", "layout", "tiles", "objects", "maximum_steps", "env")  # options, or sections of them
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Numbers of scenes that both methods solve, only the one, only the other, or neither, and a test.
+
+    p_value: of the exact two-sided McNemar test on the scenes that only one method solves.
+    """
+
+    both: int
+    one_alone: int
+    other_alone: int
+    neither: int
+    p_value: float
+
+    @property
+    def episodes(self) -> int:
+        """Scenes in the comparison."""
+        return self.both + self.one_alone + self.other_alone + self.neither
+
+
+def compare(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]) -> Comparison:
+    """Compare rows as of `evaluation.episode_row` where both have the seed.
+
+    Raises:
+        UserError: they have no seed in common.
+    """
+    theirs = {row["seed"]: row["outcome"] == "success" for row in other}
+    pairs = [(row["outcome"] == "success", theirs[row["seed"]]) for row in one if row["seed"] in theirs]
+    if not pairs:
+        raise UserError("the two evaluations have no seed in common: give both the same seed=")
+    counts = {kind: pairs.count(kind) for kind in ((True, True), (True, False), (False, True), (False, False))}
+    alone, others = counts[True, False], counts[False, True]
+    p_value = float(binomtest(alone, alone + others).pvalue) if alone + others else 1.0
+    return Comparison(counts[True, True], alone, others, counts[False, False], p_value)
+
+
+def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
+    """The episodes of another evaluation, whose scenes and rules must be those of `config`.
+
+    Raises:
+        UserError: there is no finished evaluation, it is damaged, or its scenes or rules are others.
+    """
+    try:
+        rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["per_episode"]
+        theirs = stored_options(folder / "config.yaml")
+    except FileNotFoundError as error:
+        raise UserError(
+            f"compare={folder} is no finished evaluation: {Path(error.filename).name} is missing"
+        ) from error
+    except (ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
+        raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
+    mine = flat_options(OmegaConf.to_container(config, resolve=True))
+    for name in sorted(set(mine) | set(theirs)):
+        if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):
+            raise UserError(
+                f"compare={folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes are others"
+            )
+    return list(rows)
+
+
+def sentences(result: Comparison, other: Path) -> str:
+    """The comparison for people."""
+    share = [100 * (result.both + alone) / result.episodes for alone in (result.one_alone, result.other_alone)]
+    return (
+        f"against {other} in the {result.episodes} scenes of both: {share[0]:.1f} % to {share[1]:.1f} %\n"
+        f"both solve {result.both}, this one alone in {result.one_alone}, the other alone in {result.other_alone}, "
+        f"neither in {result.neither}; exact McNemar test p = {result.p_value:.3g}"
+    )
+
+
+def record(result: Comparison, other: Path) -> dict[str, Any]:
+    """The comparison for `results.json`."""
+    return {"against": str(other), **asdict(result)}

@@ -1,0 +1,190 @@
+"""From the words of `plan` and `evaluate` to an environment, a planner and a PointNet."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import pyro
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError, user_input, whole_number
+from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
+from cavin_pyro.config.parts import build_model, class_of, construct
+from cavin_pyro.config.world import check_world, object_ranges, task_of
+from cavin_pyro.evaluation.episode_reward import EpisodeReward
+from cavin_pyro.evaluation.rollout import Episode, rollout
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
+from cavin_pyro.storage.pointnet import pointnet_of
+from envs.pushing import PushingEnv
+from envs.tasks import Task
+from envs.workspace import MAXIMUM_OBJECTS
+from models.model import Model
+from models.networks.pointnet import PointNet
+from models.priors.flow import FlowPrior
+from planning import Planner
+from planning.optimizers import Shooting
+from planning.protocol import RewardFunction
+from planning.searching import SearchingPlanner
+
+# Measured with 1,024 samples on one core: 0.26 to 0.28 s a plan, Shooting 0.13 s.
+SLOW_OPTIMIZERS = {"CrossEntropy", "ImprovedCrossEntropy", "PathIntegral", "Evolution", "SequentialMonteCarlo"}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that closed-loop episodes need; env belongs to this process."""
+
+    env: PushingEnv
+    planner: Planner
+    pointnet: PointNet
+    pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
+
+    @property
+    def task(self) -> Task:
+        """Of the episode that the environment is in."""
+        return self.env.task
+
+    def rollout(self, seed: int, **options: Any) -> Episode:
+        """As `cavin_pyro.evaluation.rollout.rollout`, whose other options these are."""
+        return rollout(
+            self.env, self.planner, self.pointnet, seed=seed, pushes_per_plan=self.pushes_per_plan, **options
+        )
+
+
+def check_words(config: DictConfig) -> None:
+    """Check what needs no checkpoint and no simulator.
+
+    Raises:
+        UserError: a number or name out of its range.
+    """
+    check_world(config.env)
+    if config.layout == "random" and config.planner.get("compile"):
+        raise UserError(
+            "planner.compile=true makes code for one layout, and layout=random has another in every episode: "
+            "take planner.compile=false"
+        )
+
+
+def announce_waiting(config: DictConfig) -> None:
+    """Say on standard error, before the first plan, what makes plans take long."""
+    planner = config.planner
+    if planner.get("compile"):
+        print("planner.compile=true: the first plan is compiled, which takes a minute or two", file=sys.stderr)
+    target = str((planner.get("optimizer") or {}).get("_target_", "")).rpartition(".")[2]
+    if target in SLOW_OPTIMIZERS:
+        print(f"planner.optimizer={target}: a plan takes about twice as long as with Shooting", file=sys.stderr)
+
+
+def set_up(config: DictConfig, *, render: bool = False) -> Setup:
+    """Build environment and planner.
+
+    Raises:
+        UserError: unknown task or layout, a checkpoint that cannot be used, a planner that refuses its options.
+    """
+    check_words(config)
+    set_matmul_precision(config.matmul_precision)
+    keep_freed_memory()
+    task, tiles = task_of(config)
+    with user_input():
+        env = PushingEnv(
+            task=task,
+            layout=config.layout,
+            tiles=tiles,
+            reward=config.reward,
+            objects=config.objects,
+            ranges=object_ranges(config.env),
+            object_set=config.env.objects,
+            assets=config.env.assets,
+            maximum_steps=config.maximum_steps,
+            camera=config.env.camera,
+            segmentation=config.env.segmentation,
+            render_mode="rgb_array" if render else None,
+            robot=config.env.robot,
+        )
+    try:
+        with user_input():
+            reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
+        planner, pointnet = _planner(config, reward)
+        if config.pushes_per_plan is not None:
+            whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
+        with user_input():  # tells at once whether every layout has room for the objects
+            for number in range(len(env.tasks)):
+                env.reset(seed=config.seed, options={"layout": number})
+        if len(env.tasks) > 1:
+            env.reset(seed=config.seed)  # in the layout that the seed draws
+    except BaseException:
+        env.close()
+        raise
+    return Setup(env, planner, pointnet, config.pushes_per_plan)
+
+
+def _planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, PointNet]:
+    path = find_checkpoint(config.checkpoint)
+    checkpoint = load_checkpoint(path, trust=list(config.trust))
+    pointnet = pointnet_of(checkpoint, path)
+    options = {str(name): value for name, value in config.planner.items()}
+    if options.pop("model_free"):
+        return construct(options), pointnet
+    if "model" not in checkpoint.config:
+        raise UserError(f"checkpoint {path} holds no model: give one that train has written")
+    known = checkpoint.config["model"].get("maximum_objects", MAXIMUM_OBJECTS)
+    if config.objects > known:
+        raise UserError(f"objects={config.objects}, but checkpoint {path} knows at most {known}: use objects={known}")
+    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
+    model = build_model(checkpoint.config)
+    checkpoint.load_into("model", model, path)
+    model.requires_grad_(False).eval()
+    _check_planner(options, model, path)
+    torch.manual_seed(config.seed)
+    optimizers = _optimizers(options)
+    return construct(options, model=model, reward=reward, **optimizers), pointnet
+
+
+def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
+    """Take the optimizers that are sections out of a planner's options, and build them.
+
+    `planner.optimizer._target_=my_lab.Mine` replaces the class and leaves `replacement`, an option of `Shooting`, which
+    a class of the user's gets only if it takes it.
+
+    Raises:
+        UserError: one that cannot be built.
+    """
+    built = {}
+    usual = {field.name for field in fields(Shooting)}
+    for name in ("optimizer", "motion_optimizer"):
+        section = options.get(name)
+        if isinstance(section, DictConfig):
+            own = class_of(section)
+            taken = inspect.signature(own).parameters if callable(own) else usual
+            given = {str(key): value for key, value in section.items() if key in taken or key not in usual}
+            built[name] = construct(given)
+            del options[name]
+    return built
+
+
+def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
+    """Make sure that the model has what the planner asks for, and no code that the planner would not choose.
+
+    Raises:
+        UserError: it has not; the model that has is named. Or it is to be compiled, and cannot.
+    """
+    planner = class_of(options)
+    violation = (
+        planner.requires.violation(model)
+        if isinstance(planner, type) and issubclass(planner, SearchingPlanner)
+        else None
+    )
+    if violation is not None:
+        raise UserError(
+            f"{planner.__name__} needs a checkpoint of model={planner.requires.model}, but {path} holds "
+            f"{type(model).__name__}, which {violation}; planner=random takes any"
+        )
+    if options.get("compile") and any(isinstance(part, FlowPrior) for part in model.modules()):
+        raise UserError(
+            f"planner.compile=true, but the priors in {path} are flows, which cannot be compiled: take compile=false"
+        )

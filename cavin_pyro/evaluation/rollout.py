@@ -1,0 +1,202 @@
+"""The closed loop: observe, plan, push T times, repeat (paper, Algorithm 1, lines 3, 4, 11 and 12)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from envs.pushing import ObservationDict, PushingEnv
+from envs.randomness import planner_seed
+from models.networks.pointnet import PointNet
+from models.state import State
+from planning import Plan, Planner
+
+OUTCOMES = ("success", "violation", "fall", "timeout")
+
+
+@dataclass(frozen=True)
+class PlanRecord:
+    """One plan, and the observation that it was made from. `rollout` makes T of its pushes, or fewer.
+
+    Attributes:
+        step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
+        milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
+        clouds: [M, 256, 3] metres, as observed, if a photograph was asked for.
+    """
+
+    step: int
+    centers: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    plan: Plan
+    milliseconds: float
+    photograph: NDArray[np.uint8] | None = None
+    clouds: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One executed push.
+
+    Attributes:
+        step: number of the push, from 1. action: [4] normalised. reward, success, ..., ineffective: of the environment.
+        centers: [M, 3] metres, as observed after the push.
+        subgoal_distance: metres, the mean over objects from their centres to the plan's first subgoal; NaN before a
+            segment's last push and for planners without subgoals.
+    """
+
+    step: int
+    action: NDArray[np.float32]
+    reward: float
+    success: bool
+    violation: bool
+    fall: bool
+    unsafe: bool
+    ineffective: bool
+    centers: NDArray[np.float32]
+    subgoal_distance: float
+
+
+@dataclass
+class Episode:
+    """One episode. outcome: one of `OUTCOMES`. photograph, clouds: as of `PlanRecord`, after the last push."""
+
+    seed: int
+    outcome: str = "timeout"
+    plan_records: list[PlanRecord] = field(default_factory=list)
+    transitions: list[Transition] = field(default_factory=list)
+    photograph: NDArray[np.uint8] | None = None
+    clouds: NDArray[np.float32] | None = None
+
+    @property
+    def total_reward(self) -> float:
+        """The episode's return."""
+        return sum(transition.reward for transition in self.transitions)
+
+    def reached(self, record: PlanRecord) -> NDArray[np.float32]:
+        """Centres observed after each push of a plan: [n, M, 3] metres, n <= T."""
+        later = [other.step for other in self.plan_records if other.step > record.step]
+        transitions = self.transitions[record.step : min(later, default=len(self.transitions))]
+        centers = np.array([transition.centers for transition in transitions], dtype=np.float32)
+        return centers.reshape(-1, *record.centers.shape)
+
+
+@torch.inference_mode()
+def observed_state(observation: ObservationDict, pointnet: PointNet) -> State:
+    """The planner's state, a batch of one, from an observation, without needless padding.
+
+    Args:
+        observation: as of `envs.pushing.PushingEnv`, [M, ...].
+    """
+    objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1
+    centers = torch.from_numpy(observation["centers"][:objects])
+    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
+    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
+    return State(centers[None], pointnet(clouds)[None], mask[None])
+
+
+class EpisodeCallback:
+    """What `rollout` calls while an episode goes on. A subclass overrides the methods that it needs."""
+
+    def on_observation(self, observation: ObservationDict) -> None:
+        """Called with the first observation and with the one after every push."""
+
+    def on_plan(self, record: PlanRecord) -> None:
+        """Called after every plan, before its pushes."""
+
+    def on_frame(self) -> None:
+        """Called a few times during every push."""
+
+    def on_transition(self, transition: Transition) -> None:
+        """Called after every push, after its observation."""
+
+    def on_end(self, episode: Episode) -> None:
+        """Called once, after the last push."""
+
+
+def rollout(
+    env: PushingEnv,
+    planner: Planner,
+    pointnet: PointNet,
+    *,
+    seed: int,
+    pushes_per_plan: int | None = None,
+    photograph: bool = False,
+    callbacks: Sequence[EpisodeCallback] = (),
+) -> Episode:
+    """Run one episode from depth images alone.
+
+    Args:
+        seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
+        pushes_per_plan: pushes to make before the next plan; None makes all T (paper, Algorithm 1, line 11).
+        photograph: keep a picture with every plan.
+        callbacks: called in this order; without any, no frame is computed.
+    """
+    episode = Episode(seed)
+    generator = torch.Generator().manual_seed(planner_seed(seed))
+    env.scene.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
+    observation, _ = env.reset(seed=seed)
+    for callback in callbacks:
+        callback.on_observation(observation)
+    ended = False
+    while not ended:
+        began = time.perf_counter()
+        state = observed_state(observation, pointnet)
+        plan = planner.plan(state, [generator], episode.plan_records[-1].plan if episode.plan_records else None)
+        record = PlanRecord(
+            step=len(episode.transitions),
+            centers=observation["centers"],
+            mask=observation["mask"].astype(np.bool_),
+            plan=plan,
+            milliseconds=1e3 * (time.perf_counter() - began),
+            photograph=env.render() if photograph else None,
+            clouds=observation["clouds"] if photograph else None,
+        )
+        episode.plan_records.append(record)
+        for callback in callbacks:
+            callback.on_plan(record)
+        actions = plan.actions[0].numpy()
+        for number, action in enumerate(actions[:pushes_per_plan]):
+            action = np.clip(action, -1.0, 1.0).astype(np.float32)
+            observation, reward, terminated, truncated, info = env.step(action)
+            last = number == len(actions) - 1
+            transition = Transition(
+                step=info["steps"],
+                action=action,
+                reward=float(reward),
+                centers=observation["centers"],
+                subgoal_distance=_subgoal_distance(record, observation["centers"]) if last else float("nan"),
+                **{name: info[name] for name in ("success", "violation", "fall", "unsafe", "ineffective")},
+            )
+            episode.transitions.append(transition)
+            for callback in callbacks:
+                callback.on_observation(observation)
+                callback.on_transition(transition)
+            ended = terminated or truncated
+            if ended:
+                episode.outcome = next((name for name in OUTCOMES[:3] if info[name]), "timeout")
+                break
+    if photograph:
+        episode.photograph, episode.clouds = env.render(), observation["clouds"]
+    for callback in callbacks:
+        callback.on_end(episode)
+    return episode
+
+
+def _call_on_frame(callbacks: Sequence[EpisodeCallback]) -> None:
+    for callback in callbacks:
+        callback.on_frame()
+
+
+def _subgoal_distance(record: PlanRecord, centers: NDArray[np.float32]) -> float:
+    subgoals = record.plan.subgoals.centers[0]
+    if len(subgoals) == 0:
+        return float("nan")
+    objects = len(subgoals[0])
+    distance = np.linalg.norm(subgoals[0].numpy() - centers[:objects], axis=-1)
+    return float(distance[record.mask[:objects]].mean())

@@ -1,0 +1,169 @@
+"""Checkpoints: one safetensors file with the weights, and in its header the configuration and the provenance.
+
+Weights and configuration are one file, so they stay together. Nothing in it can run code: the header is JSON, and the
+classes that it names must come from this program's packages, or from a module that the user names in `trust`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sysconfig
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.renamed import renamed
+
+FORMAT = "cavin_pyro checkpoint"
+FORMAT_VERSION = 1
+OWN_MODULES = ("models", "guides")
+BUILT_SECTIONS = ("model", "prior", "scales", "guide")  # of the configuration; the others are read by people only
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Weights, configuration and provenance.
+
+    Attributes:
+        config: how to build the parts. provenance: where the weights come from. tensors: by `part.parameter`.
+    """
+
+    config: dict[str, Any]
+    provenance: dict[str, Any]
+    tensors: dict[str, Tensor]
+
+    def load_into(self, part: str, module: nn.Module, where: str | Path) -> None:
+        """Copy one part's weights into a module.
+
+        Raises:
+            UserError: the weights are of another architecture.
+        """
+        prefix = f"{part}."
+        weights = {name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)}
+        wanted = module.state_dict()
+        for name in sorted(set(wanted) | set(weights)):
+            have, want = weights.get(name), wanted.get(name)
+            if have is None or want is None or have.shape != want.shape:
+                shapes = [None if value is None else list(value.shape) for value in (have, want)]
+                raise UserError(
+                    f"checkpoint {where} is of another architecture: {part}.{name} has shape {shapes[0]} in the file "
+                    f"and {shapes[1]} in {type(module).__name__}: use the configuration that it was trained with"
+                )
+        module.load_state_dict(weights)
+
+
+def save_checkpoint(
+    path: Path, *, parts: Mapping[str, nn.Module], config: Mapping[str, Any], provenance: Mapping[str, Any]
+) -> None:
+    """Write the parts' weights atomically, with configuration and provenance in the header."""
+    tensors = {
+        f"{part}.{name}": value.detach().contiguous()
+        for part, module in parts.items()
+        for name, value in module.state_dict().items()
+    }
+    header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
+    header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(save(tensors, metadata=header))  # `save_file` would hide what a full disk says
+
+
+def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
+    """Read and check a checkpoint.
+
+    Args:
+        trust: further modules whose classes the checkpoint may name.
+
+    Raises:
+        UserError: missing, truncated or foreign file, another version, old names, or a class of an untrusted module.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path} is a safetensors file of another program, not a checkpoint of cavin_pyro")
+    if header.get("version") != str(FORMAT_VERSION):
+        raise UserError(
+            f"checkpoint {path} has format version {header.get('version')}, this program reads {FORMAT_VERSION}"
+        )
+    try:
+        config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
+    except (KeyError, ValueError) as error:
+        raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
+    if not isinstance(config, dict) or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
+        raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
+    if old := renamed(config):
+        raise UserError(
+            f"checkpoint {path} has names from before: {', '.join(old)}: "
+            f"rewrite it with python -m cavin_pyro.storage.renamed {path}"
+        )
+    _check_targets([config.get(section) for section in BUILT_SECTIONS], path, trust)
+    return Checkpoint(config, provenance, tensors)
+
+
+def find_checkpoint(name: str) -> Path:
+    """The file of a shipped checkpoint by its name, such as `cavin`, or of another by its path.
+
+    Raises:
+        UserError: there is neither; the names are listed.
+    """
+    path = Path(name)
+    if path.suffix or len(path.parts) > 1 or path.is_file():
+        return path
+    shipped = shipped_folder() / f"{name}.safetensors"
+    if not shipped.is_file():
+        names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.safetensors")))
+        raise UserError(f"unknown checkpoint {name!r}: choose from {names}, or give the path of a .safetensors file")
+    return shipped
+
+
+def shipped_folder() -> Path:
+    """Where the shipped checkpoints are: in a checkout's `checkpoints/`, else with the installed package's data."""
+    checkout = Path(__file__).resolve().parents[2] / "checkpoints"
+    installed = Path(sysconfig.get_path("data")) / "share" / "cavin_pyro" / "checkpoints"
+    return installed if installed.exists() and not checkout.exists() else checkout
+
+
+def default_checkpoint() -> Path:
+    """The checkpoint that commands load unless told otherwise."""
+    return find_checkpoint(DEFAULT_CHECKPOINT)
+
+
+def _check_targets(config: Any, path: Path, trust: Sequence[str]) -> None:
+    if isinstance(config, dict):
+        target = config.get("_target_")
+        top = str(target).split(".")[0]
+        if target is not None and top not in trust and not _is_own_class(str(target)):
+            raise UserError(
+                f"checkpoint {path} asks to run {target}, which is not part of this program: "
+                f"if you trust that module, pass trust=[{top}]"
+            )
+        config = list(config.values())
+    for entry in config if isinstance(config, list) else ():
+        _check_targets(entry, path, trust)
+
+
+def _is_own_class(target: str) -> bool:
+    """Whether a dotted name is a class of this program; what its modules merely import does not count."""
+    module, _, name = target.rpartition(".")
+    if module.split(".")[0] not in OWN_MODULES:
+        return False
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    return isinstance(found, type) and found.__module__.split(".")[0] in OWN_MODULES

@@ -1,0 +1,61 @@
+"""Provenance of a result: command, date, versions and machine."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import platform
+import shlex
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro import __version__
+from cavin_pyro.config.application import PACKAGES
+
+
+def provenance() -> dict[str, Any]:
+    """A record of this run, JSON-ready."""
+    return {
+        "program": f"cavin_pyro {__version__}",
+        "revision": _revision(),
+        "command": " ".join(["python -m", _module(), *(shlex.quote(argument) for argument in sys.argv[1:])]),
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def program_fingerprint() -> str:
+    """Twelve hexadecimal digits that change when any source file of the five packages does."""
+    home, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
+    for package in ("cavin_pyro", *PACKAGES):
+        for file in sorted((home / package).rglob("*.py")):
+            digest.update(str(file.relative_to(home)).encode() + file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _module() -> str:
+    return f"cavin_pyro.{Path(sys.argv[0]).stem.removeprefix('cavin-')}"
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _revision() -> str:
+    """The checkout's commit, with a plus if files have changed since; empty where there is no checkout."""
+    folder = Path(__file__).resolve().parents[2]
+    if not (folder / ".git").exists():
+        return ""
+    try:
+        line = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        return subprocess.run(line, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""

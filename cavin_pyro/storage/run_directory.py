@@ -1,0 +1,108 @@
+"""Run directories: each holds its configuration, so that a run can be repeated and resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.files import atomic_write, read_json, write_json
+from envs.tasks import TASKS
+
+
+def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
+    """Write `config.yaml` and return the configuration as plain data."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    with atomic_write(folder / "config.yaml") as temporary:
+        temporary.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    return {str(name): value for name, value in plain.items()}
+
+
+def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...]) -> None:
+    """Check that the run in a folder, if there is one, has this configuration.
+
+    Args:
+        ignore: options that may differ, as `section.name`.
+
+    Raises:
+        UserError: the earlier run had another configuration; the first option that differs is named.
+    """
+    path = folder / "config.yaml"
+    if not path.exists():
+        return
+    try:
+        earlier = stored_options(path)
+    except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
+        raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
+    now = flat_options(OmegaConf.to_container(config, resolve=True))
+    for name in sorted(set(now) | set(earlier)):
+        if name not in ignore and now.get(name) != earlier.get(name):
+            raise UserError(
+                f"{folder} holds a run with {name}={earlier.get(name)}, not {now.get(name)}: "
+                "resume with the same options, or choose another output=DIR"
+            )
+
+
+def stored_options(path: Path) -> dict[str, Any]:
+    """The options in a `config.yaml` by their dotted names; older versions wrote the task's name alone."""
+    options = flat_options(OmegaConf.to_container(OmegaConf.load(path)))
+    if options.get("task") in TASKS:
+        task = TASKS[options.pop("task")]
+        options["task._target_"] = f"{task.__module__}.{task.__qualname__}"
+    return options
+
+
+def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
+    """Make sure that a run resumes with the data that it began with, in whatever folder; the first time, record them.
+
+    Args:
+        data: of each dataset, among other things, its number of `transitions` and the `fingerprint` of its content.
+
+    Raises:
+        UserError: the run in this folder began with other data, or its record of them cannot be read.
+    """
+    path = folder / "data.json"
+    now = [{name: dataset[name] for name in ("transitions", "fingerprint")} for dataset in data]
+    if not path.exists():
+        write_json(path, now)
+    elif (earlier := _with_fingerprints(read_json(path))) != now:
+        raise UserError(
+            f"{folder} holds a run with other data, {_of_transitions(earlier)} instead of {_of_transitions(now)}: "
+            "resume with the same data=DIR, or choose another output=DIR"
+        )
+
+
+def with_fingerprint(dataset: Mapping[str, Any]) -> dict[str, Any]:
+    """The record of a dataset with today's names: older runs and checkpoints have `mark` for `fingerprint`."""
+    return {"fingerprint" if name == "mark" else name: value for name, value in dataset.items()}
+
+
+def _with_fingerprints(data: Any) -> Any:
+    """`data.json` with today's names; anything else is returned as it is."""
+    if not isinstance(data, list) or not all(isinstance(dataset, dict) for dataset in data):
+        return data
+    return [with_fingerprint(dataset) for dataset in data]
+
+
+def _of_transitions(data: Any) -> str:
+    """What `data.json` holds, for an error line."""
+    try:
+        return " and ".join(f"{dataset['transitions']} transitions ({dataset['fingerprint']})" for dataset in data)
+    except (TypeError, KeyError):
+        return "something unreadable"
+
+
+def flat_options(value: Any, prefix: str = "") -> dict[str, Any]:
+    """A configuration's values by option: {"a": {"b": 1}} -> {"a.b": 1}."""
+    if not isinstance(value, dict):
+        return {prefix.rstrip("."): value}
+    flat: dict[str, Any] = {}
+    for name, entry in value.items():
+        flat |= flat_options(entry, f"{prefix}{name}.")
+    return flat

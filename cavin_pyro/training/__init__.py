@@ -1,0 +1,1 @@
+"""Learning: the trainer, its objectives, and the pretraining of the PointNet."""

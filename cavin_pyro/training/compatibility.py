@@ -1,0 +1,80 @@
+"""Whether a model and a guide are compatible, judged by their sites."""
+
+from __future__ import annotations
+
+from inspect import signature
+from typing import Any
+
+import torch
+from pyro import poutine
+from pyro.poutine.util import site_is_subsample
+from torch import nn
+
+from cavin_pyro.config.errors import UserError
+from models.state import Window
+
+Site = Any  # of a trace: a dictionary of Pyro's
+Sites = dict[str, Site]
+
+
+@torch.no_grad()
+def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> None:
+    """Run both programs once and make sure that the guide has the sites of the model's codes, and no others.
+
+    Pyro itself samples a code that the guide lacks from the prior, and counts sites that only the guide has.
+    `window: [B]`, with B of at least 2, so that one of them can be masked. The random generator's state is
+    restored afterwards.
+
+    Raises:
+        UserError: a program that takes no `encoded`, a code that the guide lacks or the model does not have, one
+            outside of the model's plates, of another shape, or counted where the model does not count it.
+    """
+    for kind, program in (("model", model), ("guide", guide)):
+        if "encoded" not in signature(program.forward).parameters:
+            raise UserError(
+                f"{kind} {type(program).__name__} takes no state features: write "
+                "forward(self, window, generate=False, encoded=None)"
+            )
+    window = window._replace(sequence_mask=torch.arange(len(window.actions)) == 0)
+    with torch.random.fork_rng(devices=[]):
+        wanted, found = _codes(model, window), _codes(guide, window)
+    name = f"guide {type(guide).__name__}"
+    if wanted.keys() != found.keys():
+        raise UserError(
+            f"{name} samples {_listed(found)}, but the codes of model {type(model).__name__} are {_listed(wanted)}: "
+            "give each code, and nothing else, a pyro.sample"
+        )
+    for code, site in found.items():
+        theirs = wanted[code]
+        missing = _plates(theirs) - _plates(site)
+        if missing:
+            raise UserError(
+                f"{name} samples {code} outside of the plate {', '.join(sorted(missing))}: use windows_plate"
+            )
+        if _shape(site) != _shape(theirs):
+            raise UserError(
+                f"{name} samples {code} with batch and event shape {_shape(site)}, the model's is {_shape(theirs)}: "
+                "the code's numbers are the event, see to_event(1)"
+            )
+        if ((site["log_prob"] != 0) & (theirs["log_prob"] == 0)).any():
+            raise UserError(f"{name} counts {code} of windows that do not count: sample it within sequence_mask")
+
+
+def _codes(program: nn.Module, window: Window) -> Sites:
+    """Sampled sites by name, with their log densities."""
+    trace = poutine.trace(program).get_trace(window)
+    trace.compute_log_prob()
+    sites: Sites = {name: trace.nodes[name] for name in trace.stochastic_nodes}
+    return {name: site for name, site in sites.items() if not site_is_subsample(site)}
+
+
+def _plates(site: Site) -> set[str]:
+    return {frame.name for frame in site["cond_indep_stack"]}
+
+
+def _shape(site: Site) -> str:
+    return f"{[*site['fn'].batch_shape]} {[*site['fn'].event_shape]}"
+
+
+def _listed(sites: Sites) -> str:
+    return ", ".join(sorted(sites)) or "none"

@@ -1,0 +1,91 @@
+"""The evidence lower bound, term by term."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.poutine.util import site_is_subsample
+from torch import Tensor
+
+from models.state import Window
+
+EFFECT_AND_MOTION_SITES = ("subgoal_centers", "subgoal_features", "actions", "effect_code", "motion_code")
+Program = Callable[..., Any]  # a Pyro program, or one with a handler around it; called with a window
+
+
+def window_terms(
+    model: Program,
+    guide: Program,
+    window: Window,
+    *,
+    particles: int | None = None,
+    encoded: Tensor | None = None,
+    fixed: Mapping[str, Tensor] | None = None,
+) -> dict[str, Tensor]:
+    """Each term of -ELBO for each window of a batch [B], from one sample of the codes, or from K.
+
+    The sum over terms is minus the logarithm of the sample's importance weight.
+
+    Args:
+        particles: K, an outermost plate of independent samples; the programs must broadcast over it.
+        fixed: values of codes, `[B, D]` or `[K, B, D]`, that replace samples from the guide. Their terms
+            are still the guide's and the model's densities at these values.
+        encoded: what the model's `encode` returns for this window; by default each program computes it.
+
+    Returns:
+        `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`.
+    """
+    given = {} if encoded is None else {"encoded": encoded}
+    with pyro.plate("particles", particles, dim=-2) if particles else nullcontext():
+        guided = poutine.trace(substitute(guide, fixed or {})).get_trace(window, **given)
+        joint = poutine.trace(poutine.replay(model, trace=guided)).get_trace(window, **given)
+    guided.compute_log_prob()
+    joint.compute_log_prob()
+    terms = {}
+    for name, site in joint.nodes.items():
+        if site["type"] != "sample" or site_is_subsample(site):
+            continue
+        if site["is_observed"]:
+            terms[f"nll_{name}"] = -site["log_prob"]
+        else:
+            terms[f"kl_{name}"] = guided.nodes[name]["log_prob"] - site["log_prob"]
+    return terms
+
+
+def substitute(program: Program, values: Mapping[str, Tensor]) -> Program:
+    """The program with these values at these latent sites, in place of samples."""
+    trace = poutine.Trace()
+    for name, value in values.items():
+        trace.add_node(name, name=name, type="sample", is_observed=False, value=value, infer={})
+    return poutine.replay(program, trace=trace) if values else program
+
+
+def elbo_terms(model: Program, guide: Program, window: Window, *, encoded: Tensor | None = None) -> dict[str, Tensor]:
+    """Each term of the loss -ELBO for a batch [B], from one sample of the codes; their sum is Trace_ELBO's loss.
+
+    Returns:
+        The terms of `window_terms`: scalars, summed over windows.
+    """
+    return {name: term.sum() for name, term in window_terms(model, guide, window, encoded=encoded).items()}
+
+
+@torch.no_grad()
+def mean_terms(model: Program, guide: Program, window: Window, *, encoded: Tensor | None = None) -> dict[str, float]:
+    """The same, each divided by the number of windows or transitions that count for it."""
+    sequences = max(1, int(window.sequence_mask.sum()))
+    transitions = max(1, int(window.transition_mask.sum()))
+    means = {}
+    for name, value in elbo_terms(model, guide, window, encoded=encoded).items():
+        latent = name.partition("_")[2] in EFFECT_AND_MOTION_SITES
+        means[name] = value.item() / (sequences if latent else transitions)
+    return means
+
+
+def first_nonfinite(terms: dict[str, Tensor]) -> str | None:
+    """Name of the first term that is not finite."""
+    return next((name for name, value in terms.items() if not bool(torch.isfinite(value).all())), None)

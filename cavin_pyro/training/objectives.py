@@ -1,0 +1,143 @@
+"""What training minimizes: a bound of Pyro's, with the changes that ablations make to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pyro import poutine
+from pyro.infer import ELBO, RenyiELBO
+from pyro.poutine.messenger import Messenger
+from torch import Tensor, nn
+
+from cavin_pyro.training.counterfactual import counterfactual_loss
+from guides.guide import Guide
+from models.model import Model
+from models.state import Window
+
+CODES = ("effect_code", "motion_code")
+
+
+class Objective:
+    """A bound, with optional weights of its KL terms, their warm-up, and the counterfactual term.
+
+    loss = -bound(with KL term i weighted by w_i * min(1, (step + 1) / warm_up_steps))
+           + counterfactual_weight * counterfactual_loss
+
+    With weights of one, no warm-up and no counterfactual term, the defaults, this is the bound and nothing else.
+
+    Args:
+        elbo: any of Pyro's ELBOs. kl_weights: per code, positive. warm_up_steps: over which the weights of the
+            codes' log densities (prior and guide alike) grow from nearly nothing.
+        counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`.
+
+    Raises:
+        ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
+    """
+
+    def __init__(
+        self,
+        elbo: ELBO,
+        *,
+        kl_weights: Mapping[str, float] | None = None,
+        warm_up_steps: int = 0,
+        counterfactual_weight: float = 0.0,
+    ) -> None:
+        self.elbo = elbo
+        self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
+        self.warm_up_steps = warm_up_steps
+        self.counterfactual_weight = counterfactual_weight
+        for name, weight in self.kl_weights.items():
+            if name not in CODES:
+                raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
+            if not weight > 0:
+                raise ValueError(f"objective.kl_weights.{name} must be positive, not {weight:g}")
+        if warm_up_steps < 0 or counterfactual_weight < 0:
+            raise ValueError("objective.warm_up_steps and objective.counterfactual_weight must not be negative")
+        if counterfactual_weight and elbo.num_particles != 1:
+            raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
+        if isinstance(elbo, RenyiELBO) and (warm_up_steps or any(w != 1 for w in self.kl_weights.values())):
+            raise ValueError(
+                "a Renyi bound has no KL terms to weight: leave objective.kl_weights and objective.warm_up_steps, "
+                "or choose objective=trace_elbo"
+            )
+
+    def check(self, model: Model) -> None:
+        """Make sure that a model has what this objective needs.
+
+        Raises:
+            ValueError: it generates no actions, but there is a counterfactual term.
+        """
+        if self.counterfactual_weight and not model.codes:
+            raise ValueError(
+                f"objective counterfactual needs a model that generates actions, and {type(model).__name__} does not: "
+                "choose model= from cascaded, single_latent, flat"
+            )
+
+        if self.elbo.num_particles > 1 and not model.codes:
+            raise ValueError(
+                f"objective with {self.elbo.num_particles} particles needs a model with codes, and "
+                f"{type(model).__name__} has none: choose objective=trace_elbo"
+            )
+
+    def weights(self, step: int) -> dict[str, float]:
+        """Weight of each code's KL term at a step, counted from 0."""
+        ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
+        return {name: ramp * self.kl_weights.get(name, 1.0) for name in CODES}
+
+    def bind(self, model: Model, guide: Guide) -> BoundObjective:
+        """The loss of one model and guide, as a module with the parameters of both."""
+        self.check(model)
+        return BoundObjective(self, model, guide)
+
+
+class BoundObjective(nn.Module):
+    """An objective together with the model and the guide whose parameters it is about."""
+
+    def __init__(self, objective: Objective, model: Model, guide: Guide) -> None:
+        super().__init__()
+        self.objective, self.model, self.guide = objective, model, guide
+
+    def forward(self, window: Window, step: int) -> Tensor:
+        """The loss summed over the windows `[B]`, a scalar, at a step counted from 0."""
+        objective = self.objective
+        weights = objective.weights(step)
+        model: Any = self.model
+        guide: Any = self.guide
+        if any(weight != 1.0 for weight in weights.values()):
+            model, guide = _Weighted(weights)(model), _Weighted(weights)(guide)
+        bound: Any = objective.elbo
+        encoded = self.model.encode(window)  # once for both programs
+        if not objective.counterfactual_weight:
+            return bound.differentiable_loss(model, guide, window, encoded=encoded)
+        guided = poutine.trace(self.guide).get_trace(window, encoded=encoded)
+        loss = bound.differentiable_loss(model, poutine.replay(guide, trace=guided), window, encoded=encoded)
+        codes = {name: guided.nodes[name]["value"] for name in CODES if name in guided.nodes}
+        return loss + objective.counterfactual_weight * counterfactual_loss(self.model, window, codes)
+
+
+class _Weighted(Messenger):
+    """Weights the log density of named sites. `poutine.scale` would weight all of a program's sites."""
+
+    def __init__(self, weights: Mapping[str, float]) -> None:
+        super().__init__()
+        self._weights = weights
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if msg["name"] in self._weights:
+            msg["scale"] = msg["scale"] * self._weights[msg["name"]]
+
+
+def as_objective(part: Objective | ELBO) -> Objective:
+    """An objective, also from a plain ELBO of Pyro's or a user's.
+
+    Raises:
+        ValueError: the part is neither.
+    """
+    if isinstance(part, Objective):
+        return part
+    if isinstance(part, ELBO):
+        return Objective(part)
+    raise ValueError(
+        f"an objective is cavin_pyro.training.objectives.Objective or an ELBO of Pyro, not {type(part).__name__}"
+    )

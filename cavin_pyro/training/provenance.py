@@ -1,0 +1,28 @@
+"""Where a trained model comes from: the record of the run, its data and its PointNet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro.data.dataset import content_fingerprint, read_metadata
+from cavin_pyro.data.windows import WindowTable
+from cavin_pyro.storage.checkpoint import load_checkpoint
+from cavin_pyro.storage.provenance import provenance
+
+
+def training_provenance(data: Sequence[Path], pointnet: Path, windows: WindowTable) -> dict[str, Any]:
+    """The same for a trained model: also which data and which PointNet it was trained with."""
+    trained_before = load_checkpoint(pointnet).provenance
+    kept = ("transitions", "episodes", "settings", "made_by")
+    return {
+        **provenance(),
+        "data": [
+            {**{name: read_metadata(folder)[name] for name in kept}, "fingerprint": content_fingerprint(folder)}
+            for folder in data
+        ],
+        "pointnet": trained_before.get("pointnet", trained_before),
+        "training_windows": len(windows.training),
+        "validation_windows": len(windows.validation),
+    }

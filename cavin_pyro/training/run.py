@@ -1,0 +1,69 @@
+"""A training run, from its configuration to a folder with checkpoint and metrics."""
+
+from __future__ import annotations
+
+import pyro
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.options import configured
+from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.data.windows import load_windows
+from cavin_pyro.storage.checkpoint import find_checkpoint, save_checkpoint
+from cavin_pyro.storage.files import output_folder, write_json
+from cavin_pyro.storage.pointnet import check_fit, load_pointnet
+from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
+from cavin_pyro.training.compatibility import check_compatibility
+from cavin_pyro.training.factory import build_objective, data_folders
+from cavin_pyro.training.provenance import training_provenance
+from cavin_pyro.training.trainer import Trainer
+from envs.workspace import MAXIMUM_OBJECTS
+
+
+def train(config: DictConfig) -> Trainer:
+    """The whole of a training run, from its configuration to a folder with checkpoint and metrics.
+
+    Returns:
+        The run when it has ended.
+
+    Raises:
+        UserError: a configuration or data that cannot be used, or a loss that is not finite.
+    """
+    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
+    torch.manual_seed(config.seed)
+    model = build_model(config)
+    guide = build_guide(config, model)
+    objective = build_objective(config, model)
+    source = find_checkpoint(config.pointnet)
+    pointnet = load_pointnet(source)
+    check_fit(model, pointnet, MAXIMUM_OBJECTS)
+    data = data_folders(config.data)
+    windows = load_windows(
+        data,
+        pointnet,
+        configured(WindowConfig, config.windows, "windows"),
+        segment_length=config.model.segment_length,
+        seed=config.seed,
+        skip_corrupt=config.skip_corrupt,
+    )
+    check_compatibility(model, guide, windows.batch(windows.training[:2]))
+    print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
+
+    folder = output_folder(config.output)
+    check_same_run(folder, config, ignore=("data", "output"))
+    record = training_provenance(data, source, windows)
+    check_same_data(folder, record["data"])
+    settings = write_config(folder, config)
+    parts = {"model": model, "guide": guide, "pointnet": pointnet}
+    path = folder / "checkpoint.safetensors"
+
+    def save(step: int, row: dict[str, float]) -> None:
+        save_checkpoint(path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row})
+
+    trainer = configured(TrainerConfig, config.trainer, "trainer")
+    run = Trainer(model, guide, objective, windows, folder, save, trainer, seed=config.seed)
+    run.run()
+    best = next(row for row in run.rows if row["step"] == run.best_step)
+    write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
+    return run

@@ -1,0 +1,225 @@
+"""Stochastic variational inference: the loop, its validation, its checkpoints, and exact resuming.
+
+One `torch.optim.Adam` over the ELBO as a module, because Pyro's own optimisers keep one per parameter and cost more
+time than these small networks do.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyro
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor, nn
+from torch.utils.tensorboard import SummaryWriter
+
+from cavin_pyro.config.commands.training import TrainerConfig
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.numerics import set_matmul_precision
+from cavin_pyro.data.windows import WindowTable
+from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.progress import progress_bar
+from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
+from cavin_pyro.training.objectives import Objective
+from guides.guide import Guide
+from models.model import Model
+
+Row = dict[str, float]
+
+
+class Trainer:
+    """Trains one model and guide on one table of windows.
+
+    Args:
+        objective: what is minimised. folder: where metrics and the resume file go. seed: of batches and codes.
+        save: called with the step and the metrics whenever the validation loss is the best so far.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        guide: Guide,
+        objective: Objective,
+        windows: WindowTable,
+        folder: Path,
+        save: Callable[[int, Row], None],
+        config: TrainerConfig | None = None,
+        *,
+        seed: int = 0,
+    ) -> None:
+        self.model, self.guide, self.windows = model, guide, windows
+        self.config = config = config or TrainerConfig()
+        self.folder, self._save = folder, save
+        self._loss = objective.bind(model, guide)
+        self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=config.learning_rate, fused=True)
+        self._batches = torch.Generator().manual_seed(seed)
+        set_matmul_precision(config.matmul_precision)
+        torch.manual_seed(seed)
+        self.step, self.best, self.best_step, self.stale = 0, math.inf, 0, 0
+        self.rows: list[Row] = []
+
+    @property
+    def resume_path(self) -> Path:
+        """Everything that the next step depends on, as of the last validation."""
+        return self.folder / "resume.safetensors"
+
+    def run(self) -> None:
+        """Train until the steps are done or patience is lost; goes on from the resume file if there is one.
+
+        Raises:
+            UserError: a loss or gradient that is not finite (the term is named), or a damaged resume file.
+        """
+        if self.resume_path.exists():
+            self._resume()
+        self._check_programs()
+        config, running, since = self.config, 0.0, time.perf_counter()
+        with (
+            warnings.catch_warnings(),
+            unchecked_programs(),
+            progress_bar("training", total=config.steps, initial=self.step) as bar,
+            SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step + 1) as board,
+        ):
+            # Pyro's own warnings, many for one NaN; this loop looks itself and stops.
+            warnings.filterwarnings("ignore", "Encountered", UserWarning)
+            while self.step < config.steps and self.stale < config.patience:
+                running += self._update()
+                self.step += 1
+                bar.update()
+                if self.step % config.validate_every == 0 or self.step == config.steps:
+                    count = self.step - (int(self.rows[-1]["step"]) if self.rows else 0)
+                    windows_per_second = count * config.batch_size / (time.perf_counter() - since)
+                    self._validate(running / count, windows_per_second, board)
+                    running, since = 0.0, time.perf_counter()
+                    bar.set_postfix(validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}")
+
+    def _check_programs(self) -> None:
+        """Let Pyro validate model and guide once, instead of in every step."""
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            self._loss(self.windows.batch(self.windows.training[:2]), self.step)
+
+    def _update(self) -> float:
+        config = self.config
+        numbers = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
+        window = self.windows.batch(numbers)
+        for group in self._optimizer.param_groups:
+            group["lr"] = config.rate(self.step)
+        self._optimizer.zero_grad(set_to_none=True)
+        loss = self._loss(window, self.step) / config.batch_size
+        if not math.isfinite(loss.item()):
+            self._stop_at(first_nonfinite(elbo_terms(self.model, self.guide, window)) or "loss")
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self._loss.parameters(), config.clip_norm)
+        if not math.isfinite(norm.item()):
+            self._stop_at("gradient")
+        self._optimizer.step()
+        return loss.item()
+
+    def _stop_at(self, term: str) -> None:
+        kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
+        raise UserError(
+            f"training stopped after step {self.step}: the term {term} is not finite; {kept}: "
+            "look at the data, or lower trainer.learning_rate"
+        )
+
+    def _validate(self, training_loss: float, windows_per_second: float, board: SummaryWriter) -> None:
+        terms, loss = self._validation_terms()
+        if not math.isfinite(loss):
+            self._stop_at(next((name for name, value in terms.items() if not math.isfinite(value)), "loss"))
+        row = {"step": float(self.step), "training_loss": training_loss, "validation_loss": loss}
+        row |= {f"validation_{name}": value for name, value in terms.items()}
+        row |= {"learning_rate": self.config.rate(self.step), "windows_per_second": windows_per_second}
+        self.rows.append(row)
+        for name, value in row.items():
+            board.add_scalar(name, value, self.step)
+        if loss < self.best:
+            self.best, self.best_step, self.stale = loss, self.step, 0
+            self._save(self.step, row)
+        else:
+            self.stale += 1
+        self._write_rows()
+        self._keep()
+
+    def _validation_terms(self) -> tuple[Row, float]:
+        """Mean terms over the validation windows, and the loss per window, always with the same noise."""
+        numbers = self.windows.validation
+        chosen = numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))]
+        totals: Row = {}
+        loss, parts = 0.0, chosen[: self.config.validation_windows].split(1024)
+        with torch.random.fork_rng(devices=[]), torch.no_grad(), pyro.validation_enabled(False):
+            torch.manual_seed(0)
+            for part in parts:
+                window = self.windows.batch(part)
+                encoded, state = self.model.encode(window), torch.get_rng_state()
+                for name, value in mean_terms(self.model, self.guide, window, encoded=encoded).items():
+                    totals[name] = totals.get(name, 0.0) + value * len(part)
+                torch.set_rng_state(state)
+                loss += sum(
+                    value.item() for value in elbo_terms(self.model, self.guide, window, encoded=encoded).values()
+                )
+        count = sum(len(part) for part in parts)
+        return {name: value / count for name, value in totals.items()}, loss / count
+
+    def _write_rows(self) -> None:
+        with atomic_write(self.folder / "metrics.csv") as temporary, open(temporary, "w", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def _keep(self) -> None:
+        tensors: dict[str, Tensor] = {
+            "random": torch.get_rng_state(),
+            "batches": self._batches.get_state(),
+            "counters": torch.tensor([self.step, self.best, self.best_step, self.stale], dtype=torch.float64),
+        }
+        for part, module in (("model", self.model), ("guide", self.guide)):
+            tensors |= {f"{part}.{name}": value.detach() for name, value in module.state_dict().items()}
+        for number, entry in self._optimizer.state_dict()["state"].items():
+            tensors |= {f"adam.{number}.{name}": value for name, value in entry.items()}
+        with atomic_write(self.resume_path) as temporary:
+            temporary.write_bytes(save({name: value.contiguous() for name, value in tensors.items()}))
+
+    def _resume(self) -> None:
+        try:
+            tensors = load_file(self.resume_path)
+        except (SafetensorError, OSError) as error:
+            raise UserError(
+                f"{self.resume_path} is damaged ({error}): delete it to start again, or choose another output=DIR"
+            ) from error
+        for part, module in (("model", self.model), ("guide", self.guide)):
+            module.load_state_dict(_section(tensors, part))
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name, value in _section(tensors, "adam").items():
+            number, _, entry = name.partition(".")
+            moments.setdefault(int(number), {})[entry] = value
+        self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": moments})
+        step, best, best_step, stale = tensors["counters"].tolist()
+        self.step, self.best, self.best_step, self.stale = int(step), best, int(best_step), int(stale)
+        self.rows = [row for row in read_rows(self.folder / "metrics.csv") if row["step"] <= step]
+        self._batches.set_state(tensors["batches"])
+        torch.set_rng_state(tensors["random"])
+
+
+@contextmanager
+def unchecked_programs() -> Iterator[None]:
+    """Without Pyro's looks at the sites' shapes and names, which cost a small model a twentieth of every step."""
+    with pyro.settings.context(validate_infer=False, validate_poutine=False):
+        yield
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The metrics that a run has written so far."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def _section(tensors: dict[str, Any], part: str) -> dict[str, Any]:
+    return {name[len(part) + 1 :]: value for name, value in tensors.items() if name.startswith(f"{part}.")}

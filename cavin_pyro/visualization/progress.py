@@ -1,0 +1,62 @@
+"""An episode in words: one line per push as it happens, and how long the rest may take."""
+
+from __future__ import annotations
+
+import time
+
+from cavin_pyro.evaluation.rollout import EpisodeCallback, PlanRecord, Transition
+from envs.pushing import ObservationDict
+
+
+class EpisodeProgress(EpisodeCallback):
+    """Prints each push: number, what happened, reward, the time of the plan that it began, and what is left.
+
+    Args:
+        maximum_steps: pushes after which the episode ends.
+    """
+
+    def __init__(self, maximum_steps: int) -> None:
+        self.maximum_steps = maximum_steps
+        self._began: float | None = None
+        self._planned: float | None = None  # seconds, of a plan whose first push is not made yet
+
+    def on_observation(self, observation: ObservationDict) -> None:
+        """Start the clock."""
+        self._began = self._began or time.perf_counter()
+
+    def on_plan(self, record: PlanRecord) -> None:
+        """Keep the plan's time for the line of its first push."""
+        self._planned = record.milliseconds / 1e3
+
+    def on_transition(self, transition: Transition) -> None:
+        """Print the push."""
+        assert self._began is not None
+        left = self.maximum_steps - transition.step
+        each = (time.perf_counter() - self._began) / transition.step
+        planned = "the same plan" if self._planned is None else f"planned in {self._planned:.2f} s"
+        rest = f"at most {left} left, {duration(left * each)}" if left and not ended(transition) else "the last"
+        what = f"{outcome(transition):<16} reward {transition.reward:6.2f}"
+        print(f"push {transition.step:>2}: {what}   {planned}   {rest}", flush=True)
+        self._planned = None
+
+
+def ended(transition: Transition) -> bool:
+    """Whether the episode ended with this push, apart from the number of pushes."""
+    return transition.success or transition.violation or transition.fall
+
+
+def outcome(transition: Transition) -> str:
+    """What a push did, in words."""
+    words = {
+        "success": "goal reached",
+        "violation": "violation",
+        "fall": "an object fell",
+        "unsafe": "unsafe",
+        "ineffective": "moved nothing",
+    }
+    return next((said for name, said in words.items() if getattr(transition, name)), "moved")
+
+
+def duration(seconds: float) -> str:
+    """A time in words: "12 s", "3 min"."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

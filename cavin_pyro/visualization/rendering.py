@@ -1,0 +1,101 @@
+"""Episode rendering: a table of steps, pictures of the plans, a video, and a recording."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.evaluation import episode_row
+from cavin_pyro.evaluation.factory import Setup
+from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback
+from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.visualization.plan import draw_plan
+from cavin_pyro.visualization.progress import EpisodeProgress
+from cavin_pyro.visualization.video import EpisodeVideo
+
+VIEWERS = {"rerun": "rerun"}  # the choices of `viewer=`, and the module that it needs
+
+
+def check_viewer(viewer: object) -> None:
+    """Check the option `viewer`, before anything is written.
+
+    Raises:
+        UserError: unknown viewer, or one whose package is not installed.
+    """
+    if viewer is None:
+        return
+    if viewer not in VIEWERS:
+        raise UserError(f"unknown viewer {viewer!r}: choose from {', '.join(VIEWERS)}, or null for none")
+    try:
+        importlib.import_module(VIEWERS[str(viewer)])
+    except ImportError as error:
+        raise UserError(
+            f"viewer={viewer} needs an optional part that is not installed ({error}): "
+            "run python -m pip install --constraint constraints.txt '.[viewer]' in the repository"
+        ) from error
+
+
+def render_episode(setup: Setup, folder: Path, *, seed: int, video: bool, viewer: str | None = None) -> dict[str, Any]:
+    """Run one episode, print its pushes and write `episode_files` about it; returns its results' row.
+
+    Args:
+        viewer: one of `VIEWERS`, whose module is installed, or None.
+    """
+    env = setup.env
+    with ExitStack() as stack:
+        callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
+        if video:
+            callbacks.append(stack.enter_context(EpisodeVideo(folder / "episode.mp4", setup.task, env=env)))
+        if viewer is not None:
+            from cavin_pyro.visualization.recording import recording  # an optional extra
+
+            callbacks.append(stack.enter_context(recording(folder / "episode.rrd", env, setup.task)))
+        episode = setup.rollout(seed, photograph=True, callbacks=callbacks)
+    write_steps(folder / "steps.csv", episode)
+    draw_plan(folder / "plan.png", episode, setup.task, env.scene.camera)
+    draw_plan(folder / "plan-above.png", episode, setup.task, None)
+    return episode_row(episode)
+
+
+def episode_files(*, video: bool, viewer: str | None = None) -> list[str]:
+    """Names of the files that `render_episode` writes."""
+    names = ["steps.csv", "plan.png", "plan-above.png"]
+    return names + ["episode.mp4"] * video + ["episode.rrd"] * (viewer is not None)
+
+
+def write_steps(path: Path, episode: Episode) -> None:
+    """One line per push: action, reward, what it did, and the planning time before a plan's first push."""
+    planned = {record.step: record.milliseconds for record in episode.plan_records}
+    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ["step", "x", "y", "dx", "dy", "reward", "success", "violation", "fall", "unsafe", "ineffective"]
+            + ["subgoal_distance_m", "planning_ms"]
+        )
+        for transition in episode.transitions:
+            flags = (
+                transition.success,
+                transition.violation,
+                transition.fall,
+                transition.unsafe,
+                transition.ineffective,
+            )
+            distance = (
+                ""
+                if transition.subgoal_distance != transition.subgoal_distance
+                else f"{transition.subgoal_distance:.4f}"
+            )
+            took = planned.get(transition.step - 1)
+            writer.writerow(
+                [
+                    transition.step,
+                    *(f"{value:.4f}" for value in transition.action),
+                    transition.reward,
+                    *(int(flag) for flag in flags),
+                ]
+                + [distance, "" if took is None else f"{took:.1f}"]
+            )

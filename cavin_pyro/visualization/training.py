@@ -1,0 +1,155 @@
+"""Pictures of training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
+from numpy.typing import NDArray
+
+from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.training.trainer import Row
+from models.networks.pointnet import PointNetAutoencoder
+
+DOTS_PER_INCH = 120
+COLORS = {"training": "#0072B2", "validation": "#D55E00"}
+OBSERVED, RECONSTRUCTED = "#9A9A9A", "#E69F00"  # points of a cloud, and of its reconstruction
+RUN_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+RUN_COLUMNS = 3
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as an image, atomically."""
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, facecolor="white")
+
+
+def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None:
+    """The loss and each term of the objective over training steps.
+
+    Args:
+        rows: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and
+            `validation_<term>`; empty cells are skipped.
+
+    Raises:
+        ValueError: there is no row.
+    """
+    if not rows:
+        raise ValueError("there is no row of metrics to draw: train first")
+    terms = [key for key in rows[0] if key.startswith("validation_") and key != "validation_loss"]
+    small = -(-len(terms) // 2)  # columns of small panels, in two rows
+    figure = Figure(figsize=(5.0 + 2.9 * small, 4.2), dpi=DOTS_PER_INCH, layout="constrained")
+    grid = figure.add_gridspec(2, 1 + small, width_ratios=[1.7, *[1.0] * small])
+    loss = figure.add_subplot(grid[:, 0])
+    curves = {name: _curve(rows, f"{name}_loss") for name in COLORS}
+    _draw_curves(loss, curves)
+    loss.set_title("loss", fontsize=11)
+    loss.legend(fontsize=9, frameon=False)
+    loss.set_xlabel("training step", fontsize=9)
+    for number, term in enumerate(terms):
+        row, column = divmod(number, small)
+        panel = figure.add_subplot(grid[row, 1 + column])
+        _draw_curves(panel, {"validation": _curve(rows, term)})
+        panel.set_title(term.removeprefix("validation_").replace("_", " "), fontsize=10)
+    save_figure(path, figure)
+
+
+@torch.inference_mode()
+def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: NDArray[np.float32]) -> None:
+    """Clouds and their reconstructions, from above and from the side.
+
+    Args:
+        clouds: [8, 256, 3] metres from their centres; any other number of them will do.
+
+    Raises:
+        ValueError: there is no cloud.
+    """
+    if len(clouds) == 0:
+        raise ValueError("there is no cloud to draw: give at least one [256, 3]")
+    reconstructed = autoencoder(torch.from_numpy(np.ascontiguousarray(clouds, dtype=np.float32))).numpy()
+    figure = Figure(figsize=(0.8 + 1.6 * len(clouds), 4.1), dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(2, len(clouds), squeeze=False, sharex=True, sharey=True)
+    reach = 1.1 * 100 * max(np.abs(clouds).max(), np.abs(reconstructed).max())  # centimetres
+    for column, pair in enumerate(zip(clouds, reconstructed, strict=True)):
+        for row, vertical in enumerate((1, 2)):
+            panel = axes[row, column]
+            for points, color, size in zip(pair, (OBSERVED, RECONSTRUCTED), (5, 9), strict=True):
+                panel.scatter(100 * points[:, 0], 100 * points[:, vertical], s=size, color=color, linewidths=0)
+            panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+            panel.tick_params(labelsize=8)
+    for row, label in enumerate(("from above\ny (cm)", "from the side\nz (cm)")):
+        axes[row, 0].set_ylabel(label, fontsize=9)
+    for panel in axes[1]:
+        panel.set_xlabel("x (cm)", fontsize=9)
+    handles = [
+        Line2D([], [], color=OBSERVED, marker="o", markersize=4, linestyle="", label="observed"),
+        Line2D([], [], color=RECONSTRUCTED, marker="o", markersize=4, linestyle="", label="reconstructed"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=9, frameon=False)
+    save_figure(path, figure)
+
+
+def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:
+    """The validation loss and its terms over training steps, in nats per window or transition that counts.
+
+    Args:
+        runs: by a name for the legend, at most five, the rows of a run as of `Trainer.rows` or
+            `cavin_pyro.training.trainer.read_rows`.
+
+    Raises:
+        ValueError: no run, too many of them, or one that has no row yet.
+    """
+    if not 1 <= len(runs) <= len(RUN_COLORS) or not all(runs.values()):
+        raise ValueError(f"give 1 to {len(RUN_COLORS)} runs, each with a validation: {len(runs)} given")
+    # Runs of different models do not have the same terms.
+    keys = list(dict.fromkeys(key for rows in runs.values() for key in rows[0] if key.startswith("validation_")))
+    rows_of_panels = -(-len(keys) // RUN_COLUMNS)
+    figure = Figure(figsize=(10.0, 0.6 + 2.1 * rows_of_panels), layout="constrained")
+    axes = figure.subplots(rows_of_panels, RUN_COLUMNS, squeeze=False)
+    for panel, key in zip(axes.flat, keys, strict=False):
+        for color, (name, rows) in zip(RUN_COLORS, runs.items(), strict=False):
+            points = [(row["step"], row[key]) for row in rows if key in row]
+            panel.plot(*zip(*points, strict=True), color=color, linewidth=1.5, marker="o", markersize=3, label=name)
+        panel.set_title(key.removeprefix("validation_").replace("_", " "), fontsize=10)
+        panel.grid(color="#E4E4E4", linewidth=0.6)
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.tick_params(labelsize=8)
+    for panel in axes.flat[len(keys) :]:
+        panel.set_axis_off()
+    for panel in axes.flat[: len(keys)][-RUN_COLUMNS:]:  # the lowest of each column
+        panel.set_xlabel("training step", fontsize=9)
+    handles = axes[0, 0].get_lines()
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=10, frameon=False)
+    return figure
+
+
+def _curve(rows: Sequence[Mapping[str, str | float]], key: str) -> NDArray[np.float64]:
+    """Steps and values [n, 2] of the rows that have a finite value."""
+    cells = [(float(row["step"]), float(row[key])) for row in rows if row.get(key, "") not in ("", None)]
+    curve = np.array(cells, dtype=np.float64).reshape(-1, 2)
+    return curve[np.isfinite(curve).all(axis=1)]
+
+
+def _draw_curves(panel: Axes, curves: Mapping[str, NDArray[np.float64]]) -> None:
+    for name, curve in curves.items():
+        marker = "o" if len(curve) == 1 else None
+        panel.plot(*curve.T, color=COLORS[name], linewidth=1.4, marker=marker, label=name)
+    values = np.concatenate([curve[:, 1] for curve in curves.values()])
+    later = np.concatenate([curve[len(curve) // 20 :, 1] for curve in curves.values()])
+    # A steep beginning would flatten all that follows.
+    if len(values) and values.min() > 0 and values[0] > 20 * values[-1]:
+        panel.set_yscale("log")
+    elif len(values) and np.ptp(values) > 4 * np.ptp(later) > 0:
+        margin = 0.1 * np.ptp(later)
+        panel.set_ylim(later.min() - margin, later.max() + margin)
+    panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+    panel.grid(color="#DDDDDD", linewidth=0.6)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.tick_params(labelsize=8)

@@ -1,0 +1,145 @@
+"""Where a task happens: files that list the tiles of a task's fields.
+
+`TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout.
+
+    task: crossing            # may be left out
+    region: [[2, 2], [2, 3]]  # the fields of `envs.tasks.crossing.Crossing`
+    goal: [[2, 2]]
+    target_start: [[2, 3]]
+    obstacle_start: [[1, 3]]
+
+Source of the layouts of the paper's three tasks: appendix "Task Details"; the published implementation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from envs.tasks import TASKS, Task
+
+RANDOM = "random"
+_FOLDER = Path(__file__).parent
+
+
+def task_class(task: str | type[Task]) -> type[Task]:
+    """The class of a task's name; a class is taken as it is.
+
+    Raises:
+        ValueError: unknown name, or a class that is no whole task.
+    """
+    if isinstance(task, str):
+        if task not in TASKS:
+            raise ValueError(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
+        return TASKS[task]
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        raise ValueError(f"{task!r} is no task: derive it from envs.tasks.Task")
+    if task.__abstractmethods__:
+        raise ValueError(f"task {task.__name__} lacks {' and '.join(sorted(task.__abstractmethods__))}")
+    return task
+
+
+def layout_numbers(task: str | type[Task]) -> tuple[int, ...]:
+    """The layouts of a task that this folder holds."""
+    prefix = f"{task_class(task).name}_"
+    numbers = [path.stem.removeprefix(prefix) for path in _FOLDER.glob(f"{prefix}*.yaml")]
+    return tuple(sorted(int(number) for number in numbers if number.isdecimal()))
+
+
+def possible_tasks(
+    task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None
+) -> tuple[Task, ...]:
+    """A task in each of the layouts that an episode may have, equally likely: one, or several for `layout=random`.
+
+    Args:
+        task, layout, tiles: as of `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
+            in this folder.
+
+    Raises:
+        ValueError: as `load_task` does, or tiles are to replace those of a random layout.
+    """
+    if layout != RANDOM:
+        return (load_task(task, layout, tiles),)
+    if any(one is not None for one in (tiles or {}).values()):
+        numbers = ", ".join(map(str, layout_numbers(task)))
+        raise ValueError(f"tiles replace fields of one layout: give layout={numbers} or a YAML file, not random")
+    kind = task_class(task)
+    sampled = kind.random_layouts() or tuple(load_task(kind, number) for number in layout_numbers(kind))
+    if not sampled:
+        raise ValueError(f"task {kind.name} has no layouts to sample from: give layout=FILE.yaml, not random")
+    return sampled
+
+
+def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None) -> Task:
+    """A task in one of its layouts, or in that of a YAML file.
+
+    Args:
+        task: a name in `envs.tasks.TASKS`, or a class. layout: a number, or the path of a YAML file.
+        tiles: fields that replace those of the layout; None values are ignored.
+
+    Raises:
+        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, or tiles that make no
+            sense.
+    """
+    kind = task_class(task)
+    path = _path(kind, layout)
+    content = _read(path, kind)
+    declared = content.pop("task", kind.name)
+    if declared != kind.name:
+        if declared not in tuple(TASKS):
+            raise ValueError(f"layout {path}: unknown task {declared!r}, choose from {', '.join(TASKS)}")
+        raise ValueError(f"layout {path} is for task {declared}: run it with task={declared}")
+    content |= {name: value for name, value in (tiles or {}).items() if value is not None}
+    where = f"layout {path} with overrides" if tiles else f"layout {path}"
+    return parse_task(kind, content, where=where)
+
+
+def parse_task(task: str | type[Task], content: Mapping[str, Any], *, where: str = "layout") -> Task:
+    """A task in the layout that `content`, lists of tiles by field, describes.
+
+    Raises:
+        ValueError: a key is unknown or missing, or tiles make no sense; the message begins with `where`.
+    """
+    kind = task_class(task)
+    keys = kind.layout_keys()
+    unknown = sorted(set(content) - set(keys), key=str)
+    if unknown:
+        raise ValueError(f"{where}: unknown key {unknown[0]!r}, valid keys are {', '.join(('task', *keys))}")
+    missing = [name for name, required in keys.items() if required and name not in content]
+    if missing:
+        raise ValueError(f"{where}: the key {missing[0]!r} is missing")
+    try:
+        return kind(**content)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _path(kind: type[Task], layout: int | str | Path) -> Path:
+    name = str(layout)
+    if not name.isdecimal():
+        return Path(name)
+    if int(name) not in layout_numbers(kind):
+        raise ValueError(f"unknown layout {name}: choose {_choices(kind)}")
+    return _FOLDER / f"{kind.name}_{int(name)}.yaml"
+
+
+def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror
+        raise ValueError(f"layout {path} cannot be read ({reason}): give {_choices(kind)}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"layout {path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"layout {path} must hold the keys {', '.join(kind.layout_keys())}")
+    return content
+
+
+def _choices(kind: type[Task]) -> str:
+    """`0, 1, 2, random or the path of a YAML file`."""
+    numbers = [str(number) for number in layout_numbers(kind)]
+    return f"{', '.join([*numbers, RANDOM])} or the path of a YAML file" if numbers else "the path of a YAML file"

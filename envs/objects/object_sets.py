@@ -1,0 +1,117 @@
+"""Which objects there are to push: ten builtin shapes, real scans from a folder, both together, or random shapes."""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Protocol
+
+from envs.objects.asset import ObjectAsset, listed, plain_name
+from envs.objects.random_shapes import RANDOM_NAMES, random_shape
+from envs.objects.scans import ScannedObjects
+from envs.objects.shapes import BUILTIN_NAMES, Shape, builtin_shape, write_mesh
+
+
+class ObjectSet(Protocol):
+    """Objects by name. A name is an object's own (`mug`), with the set's before it where both exist (`ycb/mug`)."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names, in an order that does not change from run to run."""
+
+    def asset(self, name: str) -> ObjectAsset:
+        """One object.
+
+        Raises:
+            ValueError: no object has that name, or its files cannot be used.
+        """
+
+
+class BuiltinObjects:
+    """The ten shapes of `envs.objects.shapes`, written to a temporary folder when they are first asked for."""
+
+    names = BUILTIN_NAMES
+
+    def asset(self, name: str) -> ObjectAsset:
+        """See `ObjectSet`."""
+        return _asset(builtin_shape(name))
+
+
+class RandomObjects:
+    """The hundred shapes of `envs.objects.random_shapes`, written in the same way."""
+
+    names = RANDOM_NAMES
+
+    def asset(self, name: str) -> ObjectAsset:
+        """See `ObjectSet`."""
+        return _asset(random_shape(name))
+
+
+class MixedObjects:
+    """Several sets as one.
+
+    Args:
+        sets: no two hold the same name.
+    """
+
+    def __init__(self, *sets: ObjectSet) -> None:
+        self._sets = {name: one for one in sets for name in one.names}
+        self.names = tuple(self._sets)
+
+    def asset(self, name: str) -> ObjectAsset:
+        """See `ObjectSet`."""
+        if name not in self._sets:
+            raise ValueError(f"unknown object {name!r}: choose from {listed(self.names)}")
+        return self._sets[name].asset(name)
+
+
+OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
+    "builtin": lambda assets: BuiltinObjects(),
+    "ycb": ScannedObjects,
+    "mixed": lambda assets: MixedObjects(BuiltinObjects(), ScannedObjects(assets)),
+    "random": lambda assets: RandomObjects(),
+}
+"""What makes the object set of each name, given the folder of assets (None where there is none)."""
+
+
+def load_object_set(name: str, assets: str | Path | None = None) -> ObjectSet:
+    """The set of that name.
+
+    Raises:
+        ValueError: the name is unknown, or the set needs assets that are not there.
+    """
+    if name not in OBJECT_SETS:
+        raise ValueError(f"unknown object set {name!r}: choose from {', '.join(OBJECT_SETS)}")
+    return OBJECT_SETS[name](assets)
+
+
+def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
+    """Objects of the set that are meant by names, with or without the set's name: in a mixed set `mug` means both.
+
+    Raises:
+        ValueError: a name means none of them; the valid ones are named.
+    """
+    found = []
+    for name in names:
+        meant = [one for one in objects.names if name in (one, plain_name(one))]
+        if not meant:
+            valid = dict.fromkeys(plain_name(one) for one in objects.names)
+            raise ValueError(f"unknown object {name!r}: choose from {listed(valid)}")
+        found += meant
+    return tuple(found)
+
+
+def _asset(shape: Shape) -> ObjectAsset:
+    mesh = write_mesh(shape, _mesh_folder())
+    return ObjectAsset(shape.name, shape.mass, shape.radius, collision=mesh, visual=mesh)
+
+
+@cache
+def _mesh_folder() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="cavin_pyro_meshes_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

@@ -1,0 +1,159 @@
+"""The ten builtin objects: the paper's YCB subset rebuilt from convex parts at published sizes and masses.
+
+A shape is a tuple of convex parts; the same parts serve collision and the camera, so what is pushed is what
+is seen. Round things are prisms whose corners lie on the published circle.
+Sizes and masses: YCB Object and Model Set (Calli et al. 2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from envs.objects.asset import plain_name
+
+SIDES = 16  # flat faces around a can; the largest gap to the circle is 2 % of its radius
+STAVES = 10  # flat faces around a hollow vessel, each of them a convex part that costs time in every step
+WALL = 0.004  # metres; thickness of the mug's and the cup's wall and floor
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A rigid object made of convex parts, its origin at the centre of volume.
+
+    Attributes:
+        name: the YCB object's name, or its set's and its own.
+        parts: convex meshes in metres, z up in the pose in which the object is sold.
+        mass: kilograms.
+    """
+
+    name: str
+    parts: tuple[trimesh.Trimesh, ...]
+    mass: float
+
+    @property
+    def radius(self) -> float:
+        """Metres from the origin to the farthest vertex."""
+        return float(max(np.linalg.norm(part.vertices, axis=1).max() for part in self.parts))
+
+
+def _box(x: float, y: float, z: float) -> list[trimesh.Trimesh]:
+    return [trimesh.creation.box((x, y, z))]
+
+
+def _cylinder(diameter: float, height: float) -> list[trimesh.Trimesh]:
+    return [trimesh.creation.cylinder(radius=diameter / 2, height=height, sections=SIDES)]
+
+
+def _hull(points: NDArray[np.float64] | list[list[float]]) -> trimesh.Trimesh:
+    return trimesh.convex.convex_hull(np.asarray(points, dtype=np.float64))
+
+
+def _ring(radius: float, z: float, angles: NDArray[np.floating]) -> NDArray[np.float64]:
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full_like(angles, z)], axis=1)
+
+
+def _lathed(bottom: float, top: float, height: float) -> list[trimesh.Trimesh]:
+    """A hollow vessel open at the top (diameters in metres): a floor, and a wall of one convex stave a side.
+
+    The staves end on the floor instead of beside it, so that only the floor touches the table: each part
+    that touches adds contacts to solve.
+    """
+    turns = np.linspace(0.0, 2.0 * np.pi, STAVES + 1)
+    floor = _hull(np.vstack([_ring(bottom / 2, z, turns[:-1]) for z in (0.0, WALL)]))
+    staves = []
+    for side in range(STAVES):
+        edges = turns[side : side + 2]
+        rings = [_ring(bottom / 2, WALL, edges), _ring(bottom / 2 - WALL, WALL, edges)]
+        rings += [_ring(top / 2, height, edges), _ring(top / 2 - WALL, height, edges)]
+        staves.append(_hull(np.vstack(rings)))
+    return [floor, *staves]
+
+
+def _mug(diameter: float, height: float) -> list[trimesh.Trimesh]:
+    """A straight vessel with a three-part handle that stands 3 cm off the wall."""
+    grip, reach = 0.012, 0.030  # metres
+    handle = []
+    for size, center in (
+        ((reach, grip, grip), (diameter / 2 + reach / 2, 0.0, 0.75 * height)),
+        ((reach, grip, grip), (diameter / 2 + reach / 2, 0.0, 0.25 * height)),
+        ((grip, grip, height / 2 + grip), (diameter / 2 + reach, 0.0, height / 2)),
+    ):
+        part = trimesh.creation.box(size)
+        part.apply_translation(center)
+        handle.append(part)
+    return [*_lathed(diameter, diameter, height), *handle]
+
+
+def _banana(thickness: float, length: float) -> list[trimesh.Trimesh]:
+    """A tapered tube bent by 100 degrees, lying flat; each part is the hull of two neighbouring sections."""
+    bend, cuts = np.radians(100.0), 7
+    tip = 0.4 * thickness / 2  # metres; radius of the tube at its ends
+    bow = length / (2.0 * np.sin(bend / 2)) - tip  # metres; the outer corners of the ends are `length` apart
+    around = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    sections = []
+    for angle in np.linspace(-bend / 2, bend / 2, cuts):
+        radius = thickness / 2 - (thickness / 2 - tip) * (abs(angle) / (bend / 2)) ** 3
+        distance = bow + radius * np.cos(around)
+        sections.append(
+            np.stack([distance * np.sin(angle), distance * np.cos(angle) - bow, radius * np.sin(around)], axis=1)
+        )
+    return [_hull(np.vstack(pair)) for pair in pairwise(sections)]
+
+
+_RECIPES = {  # metres and kilograms
+    "sugar_box": (lambda: _box(0.038, 0.089, 0.175), 0.514),
+    "tomato_soup_can": (lambda: _cylinder(0.066, 0.101), 0.349),
+    "tuna_fish_can": (lambda: _cylinder(0.085, 0.033), 0.171),
+    "pudding_box": (lambda: _box(0.110, 0.089, 0.035), 0.187),
+    "gelatin_box": (lambda: _box(0.085, 0.073, 0.028), 0.097),
+    "potted_meat_can": (lambda: _box(0.050, 0.097, 0.082), 0.370),
+    "banana": (lambda: _banana(0.036, 0.190), 0.066),
+    "mug": (lambda: _mug(0.080, 0.082), 0.118),
+    "a_cups": (lambda: _lathed(0.045, 0.055, 0.060), 0.013),
+    "rubiks_cube": (lambda: _box(0.057, 0.057, 0.057), 0.094),
+}
+BUILTIN_NAMES = tuple(_RECIPES)
+
+
+@cache
+def builtin_shape(name: str) -> Shape:
+    """Build one of the ten shapes.
+
+    Raises:
+        ValueError: the name is not one of `BUILTIN_NAMES`.
+    """
+    if name not in _RECIPES:
+        raise ValueError(f"unknown object {name!r}: choose from {', '.join(BUILTIN_NAMES)}")
+    build, mass = _RECIPES[name]
+    return shape_of(name, build(), mass)
+
+
+def shape_of(name: str, parts: Sequence[trimesh.Trimesh], mass: float) -> Shape:
+    """Convex parts (metres) as one object, moved so that their common centre of volume is the origin."""
+    volumes = np.array([part.volume for part in parts])
+    centroid = (volumes[:, None] * np.array([part.center_mass for part in parts])).sum(axis=0) / volumes.sum()
+    for part in parts:
+        part.apply_translation(-centroid)
+    return Shape(name, tuple(parts), mass)
+
+
+def write_mesh(shape: Shape, folder: Path) -> Path:
+    """Write the shape as one Wavefront file, a group per convex part, and return its path.
+
+    Every triangle keeps corners of its own, so that a renderer shades it flat; a file already there is kept.
+    """
+    path = folder / f"{plain_name(shape.name)}.obj"
+    if not path.exists():
+        parts = [part.copy() for part in shape.parts]
+        for part in parts:
+            part.unmerge_vertices()
+        trimesh.Scene(parts).export(path, include_normals=True)
+    return path

@@ -1,0 +1,41 @@
+"""Clearing: no object may remain in a region (paper, section 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from envs.tasks.step import Step
+from envs.tasks.task import Marking, Task, check_inside
+from envs.tasks.tiles import TileSet, table_distance
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clearing(Task):
+    """Push every object out of the region.
+
+    A margin makes the region larger for planners.
+
+    Attributes:
+        region: the tiles to clear; the target starts within.
+    """
+
+    markings = (Marking("region", "to clear", "#0072B2", 0.35),)
+    about = "all"
+
+    region: TileSet
+
+    def check(self) -> None:
+        """The target starts in the region, or an episode might have ended before it began."""
+        check_inside(self.target_start, self.region, "target_start tile {tile} is outside the region to clear")
+
+    def success(self, step: Step) -> Tensor:
+        """No object is in the region: [...] bool."""
+        return step.all_within(self.region.signed_distance)
+
+    def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
+        """Virtual goals lie at the table's edges: minus the sum, over objects in the region, of the way to one."""
+        remaining = self.region.contains(positions) & mask
+        return -torch.where(remaining, table_distance(positions), 0.0).sum(dim=-1)

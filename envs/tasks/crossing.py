@@ -1,0 +1,43 @@
+"""Crossing: the target has to reach a goal over a bridge (paper, section 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from envs.tasks.step import Step
+from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart, check_inside
+from envs.tasks.tiles import TileSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crossing(Task):
+    """Push the target to the goal without leaving the bridge; obstacles may be anywhere.
+
+    Attributes:
+        region: the bridge. goal: the tiles of the bridge where the target must arrive.
+    """
+
+    markings = (Marking("region", "bridge", "#5A5A5A", 0.35), GOAL_MARKING)
+
+    region: TileSet
+    goal: TileSet
+
+    def check(self) -> None:
+        """The target starts on the bridge, off the goal."""
+        check_apart(self.goal, self.target_start, "tile {tile} is both goal and target_start")
+        on_bridge = (*self.target_start, *self.goal)
+        check_inside(on_bridge, self.region, "tile {tile} is off the bridge, add it to region")
+
+    def success(self, step: Step) -> Tensor:
+        """The target is on a goal tile: [...] bool."""
+        return self.goal.contains(step.target)
+
+    def violation(self, step: Step) -> Tensor:
+        """The target is off the bridge: [...] bool."""
+        return step.target_enters(self.region.signed_distance)
+
+    def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
+        """Minus the target's distance to the nearest centre of a goal tile."""
+        return -self.goal.distance_to_nearest_center(positions[..., 0, :])

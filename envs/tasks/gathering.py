@@ -1,0 +1,42 @@
+"""Gathering: all objects have to come together in a region. Not in the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from envs.tasks.step import Step
+from envs.tasks.task import Marking, Task, check_apart
+from envs.tasks.tiles import TileSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gathering(Task):
+    """Push every object into the region. Nothing but the table's edge is forbidden.
+
+    A margin makes the region smaller for planners.
+
+    Attributes:
+        region: the tiles that all objects have to reach; no object starts within.
+    """
+
+    markings = (Marking("region", "gather here", "#F2C200", 0.50),)
+    about = "all"
+
+    region: TileSet
+
+    def check(self) -> None:
+        """No object starts in the region."""
+        for name in ("target_start", "obstacle_start"):
+            check_apart(getattr(self, name), self.region, name + " tile {tile} is in the region to gather in")
+
+    def success(self, step: Step) -> Tensor:
+        """Every object's centre is in the region: [...] bool."""
+        return step.all_within(self.region.depth)
+
+    def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
+        """Minus the sum, over objects outside of the region, of the distance to it."""
+        distances = self.region.signed_distance(positions).clamp(min=0.0)
+        return -torch.where(mask, distances, 0.0).sum(dim=-1)

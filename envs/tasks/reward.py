@@ -1,0 +1,104 @@
+"""The reward of a task's steps: one implementation for the environment and for planners.
+
++100 at the goal, -100 for a violation, -1 per step, and for dense rewards the progress in metres (paper, section 4.1
+and appendix "Task Details"). Pure functions on tensors with any leading dimensions.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from operator import add
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from envs.tasks.step import Step, off_table
+from envs.tasks.task import Task
+
+REWARD_NAMES = ("dense", "sparse")
+
+
+class Outcome(NamedTuple):
+    """What one step of a task came to; every tensor is [...].
+
+    Attributes:
+        reward: the sum of the terms. terms: by name, see `Task.terms`.
+        success, violation, fall: bool, at most one is true.
+    """
+
+    reward: Tensor
+    terms: dict[str, Tensor]
+    success: Tensor
+    violation: Tensor
+    fall: Tensor
+
+    @property
+    def failure(self) -> Tensor:
+        """Whether the step ended the episode badly: [...] bool."""
+        return self.violation | self.fall
+
+    def step(self, index: int) -> Outcome:
+        """Of outcomes of several steps, `[..., T]`, one: `[...]`."""
+        reward, success, violation, fall = (
+            field[..., index] for field in (self.reward, self.success, self.violation, self.fall)
+        )
+        return Outcome(reward, {name: term[..., index] for name, term in self.terms.items()}, success, violation, fall)
+
+
+class TaskReward:
+    """The reward function of a task.
+
+    Args:
+        task: in its layout. reward: dense or sparse.
+        margin: metres by which to be stricter than the task itself, for planners, whose predictions err: forbidden
+            places, and what must be left, grow; what must be kept within shrinks. An object that starts within the
+            margin may stay there, but come no closer to what is forbidden.
+
+    Raises:
+        ValueError: unknown kind of reward, or a negative margin.
+    """
+
+    def __init__(self, task: Task, *, reward: str = "sparse", margin: float = 0.0) -> None:
+        if reward not in REWARD_NAMES:
+            raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARD_NAMES)}")
+        if not margin >= 0.0:
+            raise ValueError(f"margin must be at least 0 metres, not {margin}")
+        self.task, self.dense, self.margin = task, reward == "dense", margin
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
+        """Judge one step: [...].
+
+        Args:
+            previous, centers: [..., M, 3] metres before and after the step; object 0 is the target.
+            mask: [..., M] bool, True for real objects.
+            fallen: whether an object is known to have left the table, wherever it was seen last.
+        """
+        states = torch.stack(torch.broadcast_tensors(previous, centers), -3)
+        return self._judge(states, mask, fallen).step(0)
+
+    def along(self, states: Tensor, mask: Tensor) -> Outcome:
+        """Judge all T steps of paths as calls for one after another would, faster: [..., T].
+
+        Args:
+            states: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target.
+            mask: [..., M] bool, True for real objects.
+        """
+        return self._judge(states, mask, False)
+
+    def _judge(self, states: Tensor, mask: Tensor, fallen: bool) -> Outcome:
+        step = Step(states[..., :2], mask.unsqueeze(-2), self.margin)
+        fall = step.any_enters(off_table)
+        if fallen:
+            fall = torch.ones_like(fall)
+        violation = self.task.violation(step) & ~fall
+        success = self.task.success(step) & ~fall & ~violation
+        terms = self.task.terms(step, success, violation | fall, dense=self.dense)
+        reward = reduce(add, terms.values())
+        return Outcome(reward.to(states.dtype), terms, success, violation, fall)
+
+    @property
+    def maximum_return(self) -> float:
+        """Upper bound on the return of any episode; infinite where progress counts."""
+        return math.inf if self.dense else self.task.maximum_return

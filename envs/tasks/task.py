@@ -1,0 +1,152 @@
+"""What a task is: the tiles it is played on, when it succeeds and fails, and the terms of its reward.
+
+A task is one class in one file of this folder; `envs/layouts/` holds the layouts that it is played in. The same
+functions judge the steps of the environment and the predicted steps of planners.
+
+Source: paper, section 4.1 and appendix "Task Details".
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import MISSING, dataclass, fields
+from typing import ClassVar, Literal, NamedTuple, get_type_hints
+
+import torch
+from torch import Tensor
+
+from envs.markings import TileGroup
+from envs.tasks.step import Step
+from envs.tasks.tiles import TileSet, parse_tiles
+from envs.workspace import Tile
+
+GOAL_REWARD = 100.0
+VIOLATION_REWARD = -100.0
+TIME_REWARD = -1.0
+
+
+class Marking(NamedTuple):
+    """How pictures show the tiles of a task's `field`: name in legends, colour, and how opaque the fill is."""
+
+    field: str
+    name: str
+    color: str
+    opacity: float
+
+
+GOAL_MARKING = Marking("goal", "goal", "#F2C200", 0.70)  # gold
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(ABC):
+    """A task in one layout.
+
+    A subclass is a frozen dataclass. Each of its fields of type `TileSet` is a list of tiles in layout files, and takes
+    any tiles `(i, j)` in Python; a field without a default needs at least one tile. Other fields are options.
+
+    Attributes:
+        name: by default the name of the class in small letters.
+        markings: how pictures show the layout; later ones lie on top of earlier ones.
+        about: whose subgoals pictures show: the `target` (object 0), or `all` objects where the goal is about all.
+        maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
+        target_start, obstacle_start: tiles on which objects start.
+
+    Raises:
+        ValueError: a tile is malformed, listed twice or off the table, or tiles contradict one another.
+    """
+
+    name: ClassVar[str]
+    markings: ClassVar[tuple[Marking, ...]] = ()
+    about: ClassVar[Literal["target", "all"]] = "target"
+    maximum_return: ClassVar[float] = GOAL_REWARD + TIME_REWARD
+
+    target_start: TileSet
+    obstacle_start: TileSet
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "name" not in vars(cls):
+            cls.name = cls.__name__.lower()
+
+    def __post_init__(self) -> None:
+        kinds = get_type_hints(type(self))
+        for name, required in self.layout_keys().items():
+            if kinds[name] is not TileSet:
+                continue
+            tiles = parse_tiles(getattr(self, name), name)
+            if required and not tiles:
+                raise ValueError(f"{name} needs at least one tile")
+            object.__setattr__(self, name, TileSet(tiles))
+        self.check()
+
+    # What a task says.
+
+    def check(self) -> None:  # noqa: B027 (a task may have nothing to check)
+        """Raise ValueError where tiles contradict one another; the message need not name the layout's file."""
+
+    @abstractmethod
+    def success(self, step: Step) -> Tensor:
+        """Whether the goal is reached: [...] bool."""
+
+    def violation(self, step: Step) -> Tensor:
+        """Whether a rule is broken, which ends the episode: [...] bool; never, unless a task says so.
+
+        That no object may fall off the table is a rule of every task, checked elsewhere (`TaskReward`).
+        """
+        return torch.zeros_like(step.mask[..., 0])
+
+    @abstractmethod
+    def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
+        """Minus the metres still to go: [...]; its increase over a step is the dense reward's `progress`.
+
+        Args:
+            positions: [..., M, 2] metres. mask: [..., M] bool, True for real objects.
+        """
+
+    def terms(self, step: Step, success: Tensor, failure: Tensor, *, dense: bool) -> dict[str, Tensor]:
+        """The reward's terms by name, each [...]; the reward is their sum.
+
+        Args:
+            success, failure: [...] bool, at most one of them true.
+        """
+        progress = torch.zeros_like(step.target[..., 0])
+        if dense:
+            progress = self.potential(step.states, step.mask).diff(dim=-1)
+        return {
+            "goal": GOAL_REWARD * success,
+            "violation": VIOLATION_REWARD * failure,
+            "time": torch.full_like(progress, TIME_REWARD),
+            "progress": progress,
+        }
+
+    @classmethod
+    def random_layouts(cls) -> tuple[Task, ...]:
+        """What `layout=random` samples from; if empty, from the layouts in files."""
+        return ()
+
+    # What follows from that.
+
+    @classmethod
+    def layout_keys(cls) -> dict[str, bool]:
+        """The fields, the task's own before where objects start, and whether a layout must have them."""
+        starts = [field.name for field in fields(Task)]
+        ordered = sorted(fields(cls), key=lambda field: field.name in starts)
+        return {field.name: field.default is MISSING and field.default_factory is MISSING for field in ordered}
+
+    def tile_groups(self) -> list[TileGroup]:
+        """The layout as pictures show it."""
+        groups = [TileGroup(one.name, one.color, one.opacity, getattr(self, one.field).tiles) for one in self.markings]
+        return [group for group in groups if group.tiles]
+
+
+def check_apart(one: Iterable[Tile], other: Iterable[Tile], problem: str) -> None:
+    """Raise ValueError if two groups share a tile, which takes the place of `{tile}` in `problem`."""
+    if shared := set(one) & set(other):
+        raise ValueError(problem.format(tile=list(min(shared))))
+
+
+def check_inside(inner: Iterable[Tile], outer: Iterable[Tile], problem: str) -> None:
+    """Raise ValueError if a tile of `inner` is not in `outer`; it takes the place of `{tile}` in `problem`."""
+    if outside := set(inner) - set(outer):
+        raise ValueError(problem.format(tile=list(min(outside))))

@@ -1,0 +1,1 @@
+"""Networks that the programs are made of (paper, appendix A.1)."""

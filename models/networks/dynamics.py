@@ -1,0 +1,104 @@
+"""Networks that change states: dynamics f and meta-dynamics h (paper, equations 1 and 2, appendix A.1)."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from models.networks.layers import fully_connected, unit
+from models.state import State
+
+PUSH_RANGE = 0.15  # metres, the most that one push moves an object along an axis
+SUBGOAL_RANGE = 0.5  # metres, the most that a segment of pushes moves an object along an axis
+
+
+class EffectTrunk(nn.Module):
+    """Effect feature of each object: what a context (an action or an effect code) does to it.
+
+    With `context_dimension=None` the feature depends on the state alone, and the context's layers are absent.
+    """
+
+    def __init__(self, context_dimension: int | None, *, width: int = 64, encoder_width: int = 64) -> None:
+        super().__init__()
+        self.context = None if context_dimension is None else fully_connected(context_dimension, width)
+        self.from_state = nn.Linear(3 * encoder_width, width)
+        self.from_context = None if context_dimension is None else nn.Linear(width, width, bias=False)
+        self.second = fully_connected(width, width)
+
+    def forward(self, encoded: Tensor, context: Tensor | None = None) -> Tensor:
+        """`encoded: [..., M, 3 * encoder_width]`, `context: [..., context_dimension]` -> `[..., M, width]`.
+
+        The leading dimensions of both broadcast.
+        """
+        feature = self.from_state(encoded)
+        if self.context is not None and self.from_context is not None:
+            # A linear layer on (state feature, context repeated per object). The context's part is computed once
+            # per scene, not once per object.
+            feature = feature + self.from_context(self.context(context)).unsqueeze(-2)
+        return self.second(feature.relu_())
+
+
+class StateChange(nn.Module):
+    """Head that moves each object, with one gate per object.
+
+    center'  = center + gate * maximum_displacement * tanh(change of center)
+    feature' = unit(feature + gate * change of feature)
+    """
+
+    def __init__(self, *, maximum_displacement: float, feature_dimension: int = 64, width: int = 64) -> None:
+        super().__init__()
+        self.maximum_displacement = maximum_displacement  # metres, along each axis
+        self.parts = (1, 3, feature_dimension)
+        self.head = nn.Linear(width, sum(self.parts))
+
+    def forward(self, state: State, effect: Tensor) -> State:
+        """`effect: [..., M, width]` -> predicted state; leading dimensions broadcast, padding stays put."""
+        gate, motion, turn = self.head(effect).split(self.parts, -1)
+        gate = gate.sigmoid() * state.mask.unsqueeze(-1)
+        centers = state.centers + gate * (
+            self.maximum_displacement * motion.contiguous().tanh()
+        )  # tanh is slow on tensors that are not contiguous
+        features = unit(state.features + gate * turn)
+        return State(centers, features, state.mask.expand(centers.shape[:-1]))
+
+
+class Dynamics(nn.Module):
+    """f: mean of the state after one push."""
+
+    def __init__(
+        self, *, feature_dimension: int = 64, width: int = 64, maximum_displacement: float = PUSH_RANGE
+    ) -> None:
+        super().__init__()
+        self.trunk = EffectTrunk(4, width=width, encoder_width=width)
+        self.change = StateChange(
+            maximum_displacement=maximum_displacement, feature_dimension=feature_dimension, width=width
+        )
+
+    def forward(self, state: State, encoded: Tensor, action: Tensor) -> State:
+        """`encoded: [..., M, 3 * width]` features of `state`, `action: [..., 4]` -> `State [...]`."""
+        return self.change(state, self.trunk(encoded, action))
+
+
+class MetaDynamics(nn.Module):
+    """h: mean of the subgoal, the state T pushes ahead, given an effect code."""
+
+    def __init__(
+        self,
+        *,
+        effect_dimension: int = 16,
+        feature_dimension: int = 64,
+        width: int = 64,
+        maximum_displacement: float = SUBGOAL_RANGE,
+    ) -> None:
+        super().__init__()
+        self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=width)
+        self.change = StateChange(
+            maximum_displacement=maximum_displacement, feature_dimension=feature_dimension, width=width
+        )
+
+    def effect(self, encoded: Tensor, effect_code: Tensor) -> Tensor:
+        """Effect feature of (s, c): `[..., M, width]`. The action generator reads it too."""
+        return self.trunk(encoded, effect_code)
+
+    def forward(self, state: State, effect: Tensor) -> State:
+        """`effect: [..., M, width]` of (s, c) -> subgoal `State [...]`."""
+        return self.change(state, effect)

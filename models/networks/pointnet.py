@@ -1,0 +1,58 @@
+"""PointNet, the geometric feature of a point cloud, and its pretraining (paper, section 4.1)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from models.networks.layers import fully_connected, unit
+
+CLOUD_UNIT = 0.1  # metres; about the size of an object
+DECODED_POINTS = 64
+
+
+class PointNet(nn.Module):
+    """Layers 16-32-64 shared by all points, maximum over points, FC 64, unit length."""
+
+    def __init__(self, feature_dimension: int = 64) -> None:
+        super().__init__()
+        self.points = nn.Sequential(fully_connected(3, 16), fully_connected(16, 32), fully_connected(32, 64))
+        # Without ReLU, so that features may point anywhere on the sphere and never vanish.
+        self.feature = nn.Linear(64, feature_dimension)
+
+    def forward(self, clouds: Tensor) -> Tensor:
+        """`clouds: [..., P, 3]` metres from the object's centre, in any order -> `[..., F]`."""
+        pooled = self.points(clouds / CLOUD_UNIT).amax(-2)
+        return unit(self.feature(pooled))
+
+
+class PointNetAutoencoder(nn.Module):
+    """PointNet and a decoder that reconstructs a cloud from its feature."""
+
+    def __init__(self, *, feature_dimension: int = 64, width: int = 128, points: int = DECODED_POINTS) -> None:
+        super().__init__()
+        self.encoder = PointNet(feature_dimension)
+        self.decoder = nn.Sequential(
+            fully_connected(feature_dimension, width),
+            fully_connected(width, width),
+            nn.Linear(width, 3 * points),
+            nn.Unflatten(-1, (points, 3)),
+        )
+
+    def forward(self, clouds: Tensor) -> Tensor:
+        """`clouds: [..., P, 3]` metres -> reconstructions `[..., points, 3]` metres."""
+        return CLOUD_UNIT * self.decoder(self.encoder(clouds))
+
+    def loss(self, clouds: Tensor) -> Tensor:
+        """Mean Chamfer distance over clouds, in units of (0.1 m) squared: a scalar."""
+        return chamfer_distance(self(clouds) / CLOUD_UNIT, clouds / CLOUD_UNIT).mean()
+
+
+def chamfer_distance(a: Tensor, b: Tensor) -> Tensor:
+    """`a: [..., P, 3]`, `b: [..., Q, 3]` -> `[...]`, in squared units of the points.
+
+    Mean squared distance from each point of `a` to its nearest in `b`, plus the same from `b` to `a`.
+    """
+    # By differences, not by matrix products: those lose the small distances to rounding.
+    squared = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").square()
+    return squared.amin(-1).mean(-1) + squared.amin(-2).mean(-1)

@@ -1,0 +1,38 @@
+"""A scene in a few numbers, for learned priors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from models.networks.layers import fully_connected, relative_positions
+from models.state import State
+
+
+class SceneContext(nn.Module):
+    """Feature of a state, and of an effect code if there is one; cheap enough for every candidate of a planner.
+
+    Per object two FC on (center, feature, effect code); sum over real objects; FC. Neither the order of objects nor the
+    content of padding matters.
+    """
+
+    def __init__(self, *, feature_dimension: int, effect_dimension: int | None, width: int) -> None:
+        super().__init__()
+        self.from_object = nn.Linear(3 + feature_dimension, width)
+        self.from_code = None if effect_dimension is None else nn.Linear(effect_dimension, width, bias=False)
+        self.objects = fully_connected(width, width)
+        self.scene = fully_connected(width, width)
+
+    def forward(self, state: State, effect_code: Tensor | None) -> Tensor:
+        """`state: [...]`, `effect_code: [..., C]` -> `[..., width]`; leading dimensions broadcast.
+
+        Raises `ValueError` for an effect code where none is wanted, and for none where one is.
+        """
+        hidden = self.from_object(torch.cat((relative_positions(state.centers), state.features), -1))
+        if self.from_code is not None and effect_code is not None:
+            hidden = hidden + self.from_code(effect_code).unsqueeze(-2)
+        elif self.from_code is not None or effect_code is not None:
+            wanted = "takes no effect code" if effect_code is not None else "needs the effect code"
+            raise ValueError(f"this prior {wanted}: effect_dimension says whether it is p(z | s, c) or p(c | s)")
+        objects = self.objects(hidden.relu_()) * state.mask.unsqueeze(-1)
+        return self.scene(objects.sum(-2))

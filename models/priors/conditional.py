@@ -1,0 +1,36 @@
+"""A learned Gaussian prior of a code, in the place of the paper's N(0, I)."""
+
+from __future__ import annotations
+
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from models.networks.layers import GaussianCode
+from models.networks.scene_context import SceneContext
+from models.state import State
+
+
+class ConditionalPrior(nn.Module):
+    """Diagonal Gaussian p(c | s) or p(z | s, c).
+
+    It begins at N(0, I), so training starts where the paper's does. `TraceMeanField_ELBO` finds the divergence of
+    Gaussian guides from it in closed form.
+    """
+
+    def __init__(
+        self,
+        *,
+        dimension: int = 16,
+        feature_dimension: int = 64,
+        effect_dimension: int | None = None,
+        width: int = 32,
+    ) -> None:
+        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s)."""
+        super().__init__()
+        self.dimension = dimension
+        self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)
+        self.code = GaussianCode(dimension, width=width).initialize_standard()
+
+    def forward(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
+        """`state: [...]`, `effect_code: [..., C]` for motions -> batch `[...]`, event `[dimension]`."""
+        return self.code(self.context(state, effect_code))

@@ -1,0 +1,41 @@
+"""A normalizing flow as the prior of a code, in the place of the paper's N(0, I)."""
+
+from __future__ import annotations
+
+from pyro import distributions
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from models.networks.flows import CodeFlow
+from models.networks.scene_context import SceneContext
+from models.state import State
+
+
+class FlowPrior(nn.Module):
+    """Normalizing flow p(c | s) or p(z | s, c): N(0, I) through couplings that see s and c.
+
+    It begins at N(0, I), so training starts where the paper's does. No divergence from a flow has a closed form:
+    `TraceMeanField_ELBO` takes the one-sample estimate that `Trace_ELBO` takes.
+    """
+
+    def __init__(
+        self,
+        *,
+        dimension: int = 16,
+        feature_dimension: int = 64,
+        effect_dimension: int | None = None,
+        width: int = 32,
+        transforms: int = 4,
+    ) -> None:
+        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s)."""
+        super().__init__()
+        self.dimension = dimension
+        self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)
+        self.flow = CodeFlow(dimension, width, width=width, transforms=transforms)
+
+    def forward(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
+        """`state: [...]`, `effect_code: [..., C]` for motions -> batch `[...]`, event `[dimension]`."""
+        context = self.context(state, effect_code)
+        zero, one = context.new_zeros(()), context.new_ones(())
+        base = distributions.Normal(zero, one).expand((*context.shape[:-1], self.dimension)).to_event(1)
+        return self.flow(base, context)

@@ -1,0 +1,32 @@
+"""Priors of the codes: p(c) and p(z) (paper, section 3.1)."""
+
+from __future__ import annotations
+
+import torch
+from pyro import distributions
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from models.state import State
+
+
+class StandardPrior(nn.Module):
+    """N(0, I) for every state (the paper's prior).
+
+    Every prior is built with these three dimensions and called with these two arguments; learned priors use them.
+    """
+
+    def __init__(
+        self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None
+    ) -> None:
+        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s)."""
+        super().__init__()
+        self.dimension = dimension
+
+    def forward(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
+        """`state: [...]`, `effect_code: [..., C]` for motions -> batch `[...]`, event `[dimension]`."""
+        shape = state.batch_shape
+        if effect_code is not None:
+            shape = torch.broadcast_shapes(shape, effect_code.shape[:-1])
+        zero, one = state.centers.new_zeros(()), state.centers.new_ones(())
+        return distributions.Normal(zero, one).expand((*shape, self.dimension)).to_event(1)

@@ -1,0 +1,1 @@
+"""The planners that the paper compares with (section 4.1, appendix A.2)."""

@@ -1,0 +1,178 @@
+"""Motions that still work if the tool meets the object a little elsewhere (our addition to Algorithm 1, line 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.backends.eager import Backend, eager
+from planning.inputs import check_positive, check_weight
+from planning.protocol import PlanningModel, RewardFunction
+from planning.rollouts import ranking, returns
+from planning.rollouts.candidates import Candidates
+from planning.rollouts.dynamics import predict_states
+from planning.rollouts.sampling import noise_each
+from planning.rollouts.segment import actions_of
+
+QUARTER = 4  # one in so many continues in the next round, with so many times as many rollouts
+
+
+@dataclass(frozen=True)
+class PerturbedRollouts:
+    """Ranks the best motions by rollouts with perturbed pushes and perturbed outcomes.
+
+    The best of a thousand motions is often one about which f errs: a push that just meets the object according to f,
+    and just misses it on the table. Perturbing its start tells the two apart. And the farther f moves an object, the
+    farther it errs: a long push past a forbidden place fails more often than a short one.
+
+    Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts: after each round the best quarter
+    continues, with four times as many rollouts each.
+
+    candidates: motions with perturbed rollouts, the best by line 10. rollouts: of each candidate in the first round.
+    rounds: of equally many rollouts, for fewer and fewer candidates, until one is left. 1 treats all alike.
+    start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
+    outcome_noise: standard deviation, in x and in y, of the centre of an object after a push, per metre that f predicts
+        it to move. A rollout fails by the perturbed centres; its distance to the subgoal is f's.
+    failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal.
+
+    Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
+    """
+
+    candidates: int = 256
+    rollouts: int = 2
+    rounds: int = 3
+    start_noise: float = 0.03
+    outcome_noise: float = 0.5
+    failure_cost: float = 0.3
+
+    def __post_init__(self) -> None:
+        check_positive("candidates", self.candidates)
+        check_positive("rollouts", self.rollouts)
+        check_positive("rounds", self.rounds)
+        check_weight("start_noise", self.start_noise)
+        check_weight("outcome_noise", self.outcome_noise)
+        check_weight("failure_cost", self.failure_cost)
+
+
+def most_robust(
+    robustness: PerturbedRollouts,
+    motions: Candidates,
+    scores: Tensor,
+    later_cost: Tensor,
+    model: PlanningModel,
+    reward: RewardFunction,
+    subgoals: State,
+    feature_weight: float,
+) -> Tensor:
+    """Number of the motion candidate `[B]` int64 with the lowest cost on average; see `sequential_halving`."""
+    problem, actions, goal = motions.problem, motions.at(0, actions_of), subgoals.step(slice(0, 1))
+    what = problem.state, goal, scores, actions, later_cost, problem.generators
+    return sequential_halving(robustness, model, reward, *what, feature_weight=feature_weight, backend=problem.backend)
+
+
+def sequential_halving(
+    robustness: PerturbedRollouts,
+    model: PlanningModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State,
+    scores: Tensor,
+    actions: Tensor,
+    later: Tensor,
+    generators: Sequence[torch.Generator],
+    *,
+    feature_weight: float,
+    backend: Backend = eager,
+) -> Tensor:
+    """Number of the motion with the lowest cost on average, `[B]` int64.
+
+    state: `[B]`, where all motions begin. goal: `[B, 1]`, the first subgoal. scores: `[B, N]`, the higher the better.
+    actions: `[B, N, T, 4]`, the segment that will be executed. later: `[B, N]` square metres that the segments after it
+    cost. A motion whose score or whose cost is not finite loses.
+    """
+    best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
+    numbers, count, done = best.indices, robustness.rollouts, 0
+    infinite = ~torch.isfinite(best.values)
+    total = torch.zeros_like(best.values)  # cost of all rollouts so far
+    for number in range(robustness.rounds):
+        if number and total.shape[-1] == 1:
+            break  # the choice is made
+        if number:
+            going = (total / done).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
+            numbers, infinite, total = (field.gather(1, going) for field in (numbers, infinite, total))
+            count = QUARTER * count
+        distance, failed = perturbed_rollouts(
+            robustness,
+            model,
+            reward,
+            state,
+            goal,
+            actions.take_along_dim(numbers[..., None, None], dim=1),
+            count,
+            generators,
+            feature_weight=feature_weight,
+            backend=backend,
+        )
+        cost = (distance + robustness.failure_cost * failed).sum(-1)
+        cost = cost + count * later.gather(1, numbers)
+        total = torch.where(infinite | ~torch.isfinite(cost), torch.inf, total + cost)
+        done += count
+    return numbers.gather(1, total.argmin(-1, keepdim=True)).squeeze(1)
+
+
+def perturbed_rollouts(
+    robustness: PerturbedRollouts,
+    model: PlanningModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State,
+    actions: Tensor,
+    count: int,
+    generators: Sequence[torch.Generator],
+    *,
+    feature_weight: float = 0.0,
+    backend: Backend = eager,
+) -> tuple[Tensor, Tensor]:
+    """What f predicts of `actions: [B, R, T, 4]`, each perturbed `count` times.
+
+    `state: [B]`. Square metres to the `goal: [B, 1]`, `[B, R, count]`, and whether a rollout fails, alike.
+    """
+    pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
+    pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
+    errors = None
+    if robustness.outcome_noise:
+        errors = robustness.outcome_noise * noise_each((*pushes.shape[1:3], state.objects, 2), generators)
+    pushes = pushes.clamp(-1.0, 1.0)
+    distance, failed = backend(_rollout_costs, model, reward, state, goal, pushes, errors, feature_weight)
+    return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
+
+
+def _rollout_costs(
+    model: PlanningModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State,
+    pushes: Tensor,
+    errors: Tensor | None,
+    feature_weight: float,
+) -> tuple[Tensor, Tensor]:
+    """What f predicts of `pushes: [B, n, T, 4]`: square metres to the `goal`, `[B, n]`, and whether they fail, bool."""
+    plans = state.expand_plans(pushes.shape[1])
+    before, mask = plans.centers, plans.mask
+    here, path = predict_states(model, state.expand_plans(1), pushes)
+    possible = path if errors is None else outcomes(before, path, errors)
+    progress = returns.advance(returns.start(before), reward, before, possible, mask)
+    return ranking.squared_distance(here, goal, feature_weight=feature_weight), progress.failed
+
+
+def outcomes(start: Tensor, path: Tensor, errors: Tensor) -> Tensor:
+    """Perturbed centres after every push, instead of f's `path: [B, n, T, M, 3]` from `start: [B, n, M, 3]`.
+
+    errors: `[B, n, T, M, 2]`, metres in x and in y per metre that f moves an object. Heights stay.
+    """
+    strides = (path - returns.before_each(start, path))[..., :2].norm(dim=-1, keepdim=True)
+    return torch.cat([path[..., :2] + strides * errors, path[..., 2:]], -1)

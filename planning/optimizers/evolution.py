@@ -1,0 +1,87 @@
+"""Evolution of whole plans: random ones first, then changed copies of the best (Perez et al., GECCO 2013)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from planning import records
+from planning.inputs import check_fraction, check_positive, check_weight
+from planning.optimizers.weights import Population, best, samples_of_iteration
+from planning.rollouts.candidates import SearchProblem
+from planning.rollouts.sampling import noise_each, uniform_each
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """Parents are the best candidates so far; offspring lose some of a parent's segments and mutate others.
+
+    Under a sparse reward a random plan that reaches the goal does much that the goal does not need. Deletion makes
+    room for fresh segments at the end, so that offspring are as long as their parents.
+
+    generations: after the initial one, which is sampled from the prior. initial_fraction: of the samples, for the
+    initial generation. parents: how many, at most. deletion_rate, mutation_rate: segments per offspring, on average.
+    step: of a mutation, in (0, 1], which leaves the prior invariant; 1 samples the segment anew. replacement: as in
+    shooting, in the initial generation. warm_start: fraction of the initial generation for the warm start and its
+    offspring.
+
+    Raises ValueError for counts below 1 and numbers outside of their range.
+    """
+
+    generations: int = 4
+    initial_fraction: float = 0.5
+    parents: int = 16
+    deletion_rate: float = 2.0
+    mutation_rate: float = 1.0
+    step: float = 0.5
+    replacement: bool = True
+    warm_start: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_positive("generations", self.generations)
+        check_fraction("initial_fraction", self.initial_fraction, positive=True)
+        check_positive("parents", self.parents)
+        check_weight("deletion_rate", self.deletion_rate)
+        check_weight("mutation_rate", self.mutation_rate)
+        check_fraction("step", self.step, positive=True)
+        check_fraction("warm_start", self.warm_start)
+
+    @property
+    def iterations(self) -> int:
+        """How many times at least one sample is needed."""
+        return 1 + self.generations
+
+    def optimize(self, problem: SearchProblem, samples: int) -> None:
+        """See `Optimizer`."""
+        initial = min(max(1, round(self.initial_fraction * samples)), samples - self.generations)
+        noise = problem.noise(initial)
+        warm = min(initial, math.ceil(self.warm_start * initial))
+        if warm and problem.warm_start is not None:
+            # In the last places: of equal candidates, such as all that do not reach the goal, a new one wins.
+            known = torch.cat([problem.warm_start, self._offspring(problem, problem.warm_start, warm)], 1)
+            noise[:, initial - warm :] = known[:, :warm]
+        candidates = problem.evaluate(noise, replacement=self.replacement)
+        population = Population(candidates.noise, candidates.returns)
+        for number in range(self.generations):
+            population = best(population, self.parents)
+            count = samples_of_iteration(samples - initial, self.generations, number)
+            noise = self._offspring(problem, population.noise, count)
+            population = records.join([population, Population(noise, problem.evaluate(noise).returns)])
+
+    def _offspring(self, problem: SearchProblem, parents: Tensor, count: int) -> Tensor:
+        """`parents: [B, p, K, D]` -> `[B, n, K, D]`, each of one parent sampled uniformly."""
+        segments = problem.segments
+        whose, how_many, which, changed = uniform_each((4, count, segments), problem.generators).unbind(1)
+        fresh, last = noise_each((2, count, segments, problem.dimension), problem.generators).unbind(1)
+        environments = torch.arange(len(parents), device=parents.device).unsqueeze(-1)
+        child = parents[environments, (whose[..., 0] * parents.shape[1]).long()]
+        # Some offspring lose no segment, others many.
+        deleted = which < 2 * self.deletion_rate / segments * how_many[..., :1]
+        order = deleted.int().argsort(dim=-1, stable=True)  # first the segments that stay, in their order
+        child = child.gather(2, order.unsqueeze(-1).expand_as(child))
+        child = torch.where(deleted.gather(2, order).unsqueeze(-1), last, child)
+        mutated = math.sqrt(1.0 - self.step**2) * child + self.step * fresh
+        return torch.where((changed < self.mutation_rate / segments).unsqueeze(-1), mutated, child)

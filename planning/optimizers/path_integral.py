@@ -1,0 +1,57 @@
+"""Model predictive path integral control (Williams et al., ICRA 2017), in noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from planning.inputs import check_fraction, check_positive
+from planning.optimizers.weights import adapt_temperature, samples_of_iteration
+from planning.rollouts.candidates import SearchProblem
+
+
+@dataclass(frozen=True)
+class PathIntegral:
+    """Samples around the mean of the last samples, weighted by exp(return / temperature); beginning with the prior.
+
+    iterations: they share the samples. temperature: in units of the return; None adapts it so that the weights'
+    effective sample size is `effective_sample_size`, a fraction of the candidates. shrink: factor from one iteration's
+    scale to the next's. replacement: as `CrossEntropy`.
+
+    Raises ValueError for counts below 1 and numbers outside of their range.
+    """
+
+    iterations: int = 4
+    temperature: float | None = None
+    effective_sample_size: float = 0.05
+    shrink: float = 0.6
+    replacement: bool = True
+
+    def __post_init__(self) -> None:
+        check_positive("iterations", self.iterations)
+        check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
+        check_fraction("shrink", self.shrink, positive=True)
+        if self.temperature is not None and not 0 < self.temperature < math.inf:
+            raise ValueError(f"temperature must be a positive number or null, not {self.temperature}")
+
+    def optimize(self, problem: SearchProblem, samples: int) -> None:
+        """See `Optimizer`; the last candidate is the last mean, unless that was replaced."""
+        mean = None
+        for number in range(self.iterations):
+            noise = problem.noise(samples_of_iteration(samples, self.iterations, number))
+            if mean is not None:
+                noise = mean + self.shrink**number * noise
+                if number == self.iterations - 1:
+                    noise[:, -1:] = mean
+            candidates = problem.evaluate(noise, replacement=self.replacement)
+            if self.temperature is None:
+                _, logarithms = adapt_temperature(candidates.returns, self.effective_sample_size)
+            else:
+                logarithms = candidates.returns / self.temperature
+            # Where no candidate counts the mean stays: all weights are zero.
+            weights = torch.softmax(logarithms, -1).nan_to_num(0.0).to(noise.dtype)[..., None, None]
+            old = torch.zeros_like(noise[:, :1]) if mean is None else mean
+            found = (weights > 0).any(1, keepdim=True)
+            mean = torch.where(found, (weights * candidates.noise).sum(1, keepdim=True), old)

@@ -1,0 +1,42 @@
+"""Optimizers by name, and what a planner's option `optimizer` may be."""
+
+from __future__ import annotations
+
+from planning.optimizers.cross_entropy import CrossEntropy
+from planning.optimizers.evolution import Evolution
+from planning.optimizers.improved_cross_entropy import ImprovedCrossEntropy
+from planning.optimizers.path_integral import PathIntegral
+from planning.optimizers.protocol import Optimizer
+from planning.optimizers.sequential_monte_carlo import SequentialMonteCarlo
+from planning.optimizers.shooting import Shooting
+from planning.optimizers.weights import samples_of_iteration
+
+OPTIMIZERS: dict[str, type[Optimizer]] = {
+    "shooting": Shooting,
+    "cem": CrossEntropy,
+    "icem": ImprovedCrossEntropy,
+    "mppi": PathIntegral,
+    "evolution": Evolution,
+    "smc": SequentialMonteCarlo,
+}
+ITERATIVE = (CrossEntropy, ImprovedCrossEntropy, PathIntegral, Evolution)
+
+
+def make_optimizer(optimizer: str | Optimizer, *, samples: int) -> Optimizer:
+    """The optimizer of that name, with its defaults, or the given one.
+
+    Raises ValueError, naming the valid ones, for an unknown name or for an object that is no optimizer; and for fewer
+    samples than iterations.
+    """
+    if isinstance(optimizer, str):
+        if optimizer not in OPTIMIZERS:
+            raise ValueError(f"unknown optimizer '{optimizer}': choose from {', '.join(OPTIMIZERS)}")
+        optimizer = OPTIMIZERS[optimizer]()
+    if not isinstance(optimizer, Optimizer):
+        raise ValueError(
+            f"optimizer must be one of {', '.join(OPTIMIZERS)}, or an object with a method optimize(problem, samples), "
+            f"not {optimizer!r}"
+        )
+    if isinstance(optimizer, ITERATIVE):
+        samples_of_iteration(samples, optimizer.iterations, 0)
+    return optimizer

@@ -1,0 +1,76 @@
+"""What optimizers make of returns: the best candidates, and the weight of each."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from planning import records
+
+TEMPERATURES = 97  # inverse temperatures on a grid, evenly spaced in the logarithm
+RANGE = (1e-3, 1e9)  # of them, times the range of the returns, which one violation can make a million times too wide
+SAME = 1.05  # effective sample sizes that differ by less than this factor are the same
+
+
+class Population(NamedTuple):
+    """Candidates and their returns."""
+
+    noise: Tensor  # [B, n, K, D]
+    returns: Tensor  # [B, n]
+
+
+def best(population: Population, count: int) -> Population:
+    """The `count` with the highest returns, best first: `[B, n] -> [B, count]`."""
+    return records.take(population, population.returns.topk(min(count, population.returns.shape[-1]), -1).indices)
+
+
+def samples_of_iteration(samples: int, iterations: int, number: int) -> int:
+    """How many of N = `samples` fall to iteration `number` of `iterations`; the first ones take what is left over.
+
+    Raises ValueError if there are fewer samples than iterations.
+    """
+    if samples < iterations:
+        raise ValueError(f"{iterations} iterations need at least as many samples, not {samples}")
+    return samples // iterations + (number < samples % iterations)
+
+
+def effective_sample_size(log_weights: Tensor) -> Tensor:
+    """(sum w)^2 / sum w^2, how many equally weighted candidates say as much: `[..., n] -> [...]`; 0 without any."""
+    weights = torch.softmax(log_weights, -1).nan_to_num(0.0)
+    return (1.0 / weights.square().sum(-1)).nan_to_num(0.0, posinf=0.0)
+
+
+def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The lowest temperature at which the weights keep `fraction` of the effective sample size, and the log weights.
+
+    Where many share the highest return, much lower temperatures give the same weights; then the highest of those.
+
+    Weights are exp(return / temperature), divided by `exp(before)` (`[B, n]`, zero by default), by which the
+    candidates were sampled already. returns: `[B, n]`, -inf for those that do not count; the fraction is of the
+    others. Gives inverse temperatures `[B]` and log weights `[B, n]`, which are -inf where the returns are, as
+    float64, for large returns at low temperatures leave little of float32.
+    """
+    returns = returns.double()
+    counts = torch.isfinite(returns)
+    finite = torch.where(counts, returns, 0.0)
+    highest = returns.masked_fill(~counts, -torch.inf).amax(-1, keepdim=True)
+    lowest = returns.masked_fill(~counts, torch.inf).amin(-1, keepdim=True)
+    spread = torch.where(highest > lowest, highest - lowest, 1.0)  # [B, 1]
+    low, high = (math.log10(end) for end in RANGE)
+    inverse = torch.logspace(low, high, TEMPERATURES, dtype=returns.dtype, device=returns.device) / spread  # [B, G]
+    relative = torch.where(counts, finite - torch.where(torch.isfinite(highest), highest, 0.0), -torch.inf)
+    history = torch.zeros_like(returns) if before is None else torch.where(counts, before, 0.0)
+    logarithms = inverse.unsqueeze(-1) * relative.unsqueeze(-2) - history.unsqueeze(-2)  # [B, G, n]
+    sizes = effective_sample_size(logarithms)
+    enough = sizes >= fraction * counts.sum(-1, keepdim=True).clamp(min=1)
+    ranks = torch.arange(TEMPERATURES, device=returns.device)
+    # Where no temperature keeps enough, the one that keeps most.
+    number = torch.where(enough.any(-1), torch.where(enough, ranks, -1).amax(-1), sizes.argmax(-1))
+    weighs_the_same = enough & (sizes <= SAME * sizes.gather(-1, number.unsqueeze(-1)))
+    number = torch.where(weighs_the_same.any(-1), weighs_the_same.int().argmax(-1), number)
+    chosen = inverse.gather(-1, number.unsqueeze(-1)).squeeze(-1)
+    environments = torch.arange(len(returns), device=returns.device)
+    return chosen, logarithms[environments, number]

@@ -1,0 +1,61 @@
+"""Choosing and joining plans in records: named tuples, nested or not, of tensors `[B, N, ...]` or None."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+Record = TypeVar("Record", bound=tuple)
+
+
+def apply(record: Record, function: Callable[[Any], Any]) -> Record:
+    """The same function of every field; None stays None. Tuples without names will do, too."""
+
+    def applied(value: Any) -> Any:
+        if isinstance(value, tuple):
+            parts = [applied(part) for part in value]
+            return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+        return None if value is None else function(value)
+
+    return applied(record)
+
+
+def take(record: Record, numbers: Tensor) -> Record:
+    """Plans by number, per environment: fields `[B, N, ...]`, `numbers: [B, n]` int64 -> `[B, n, ...]`."""
+    environments = torch.arange(len(numbers), device=numbers.device).unsqueeze(-1)
+
+    def chosen(field: Tensor) -> Tensor:  # a row at a time: faster than field[environments, numbers]
+        rows = (numbers + environments * field.shape[1]).flatten()
+        return field.flatten(0, 1).index_select(0, rows).unflatten(0, numbers.shape)
+
+    return apply(record, chosen)
+
+
+def join(records: Sequence[Record], dimension: int = 1) -> Record:
+    """The plans of several records of one kind, one after the other: `[B, N_1, ...], ... -> [B, N_1 + ..., ...]`.
+
+    With `dimension=0` the environments: `[B_1, ...], ... -> [B_1 + ..., ...]`.
+    """
+    return _combine(records, lambda values: torch.cat(list(values), dim=dimension))
+
+
+def where(chosen: Tensor, record: Any, other: Any) -> Any:
+    """Fields `[B, ...]` of `record` in the environments `chosen: [B]` bool, of `other` elsewhere."""
+
+    def field(values: Sequence[Tensor]) -> Tensor:
+        first, second = values
+        return torch.where(chosen.view(-1, *[1] * (first.ndim - 1)), first, second)
+
+    return _combine([record, other], field)
+
+
+def _combine(records: Sequence[Any], function: Callable[[Sequence[Any]], Any]) -> Any:
+    """The same function of every field of several records; None where one of them has None."""
+    first = records[0]
+    if isinstance(first, tuple):
+        parts = [_combine(values, function) for values in zip(*records, strict=True)]
+        return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
+    return None if any(record is None for record in records) else function(records)

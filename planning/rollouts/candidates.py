@@ -1,0 +1,276 @@
+"""Candidate plans, rolled out segment by segment: the one place where every planner and every optimizer does so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import records
+from planning.backends.eager import Backend, eager
+from planning.rollouts.extend import extend_segment
+from planning.rollouts.sampling import noise_each, uniform_each
+from planning.rollouts.segment import Objective, SearchSpace, SegmentRecord, SegmentRollout, actions_of
+
+
+@dataclass(frozen=True)
+class SearchProblem:
+    """A search for plans of K segments from `state: [B]`; all that an optimizer is given.
+
+    An optimizer needs `noise`, `generators`, `warm_start` and the call itself: noise `[B, n, K, D]` in, returns
+    `[B, n]` out. `evaluate` and `sample` also replace failed candidates; `begin` lets an optimizer extend candidates
+    segment by segment. Whatever was evaluated is in `considered`, from which the planner chooses.
+    """
+
+    space: SearchSpace
+    objective: Objective
+    state: State
+    generators: Sequence[torch.Generator]  # one per environment
+    segments: int  # K
+    reparameterized: bool = False  # candidates must be made from noise (needed by warm start and compilation)
+    warm_start: Tensor | None = None  # [B, h, K, D] noise of promising candidates, from the last plan
+    best_only: bool = False  # the caller reads no candidate but the best one
+    backend: Backend = eager  # runs the extension of candidates made from noise
+    considered: list[Candidates] = field(default_factory=list, init=False, compare=False)  # whole candidates
+
+    def __call__(self, noise: Tensor) -> Tensor:
+        """The returns `[B, n]` of the candidates that standard normal `noise: [B, n, K, D]` determines.
+
+        Raises ValueError for noise of another shape.
+        """
+        expected = (len(self.generators), self.segments, self.dimension)
+        if noise.ndim != 4 or (noise.shape[0], *noise.shape[2:]) != expected:
+            environments, *rest = expected
+            raise ValueError(
+                f"an optimizer's candidates must be noise [B, n, K, D] = {[environments, 'n', *rest]}, "
+                f"not {list(noise.shape)}"
+            )
+        return self.evaluate(noise).returns
+
+    @property
+    def dimension(self) -> int:
+        """D, the numbers of noise per segment."""
+        return self.space.dimension
+
+    def noise(self, count: int) -> Tensor:
+        """Standard normal noise `[B, n, K, D]` of n = `count` candidates, from every environment's own generator."""
+        return noise_each((count, self.segments, self.dimension), self.generators)
+
+    def sample(self, count: int, *, replacement: bool) -> Candidates:
+        """n = `count` whole candidates, sampled from the prior segment by segment; for `replacement` see `evaluate`."""
+        return self._roll_out(count, [None] * self.segments, replacement, None)
+
+    def evaluate(self, noise: Tensor, *, replacement: bool = False, early_stopping: bool = False) -> Candidates:
+        """The candidates that `noise: [B, n, k, D]` determines; their returns are `candidates.returns: [B, n]`.
+
+        `replacement`: candidates that fail before the last segment become copies of active ones, and continue with
+        their own noise (section 3.2); `candidates.noise` is the noise after replacement. `early_stopping`: an
+        environment's rollouts stop when no active candidate can still reach a higher return than the best terminated
+        one. The best candidate is the same; the others' returns are counted up to where their rollouts stopped.
+        """
+        early_stopped = torch.zeros(len(noise), dtype=torch.bool, device=noise.device) if early_stopping else None
+        return self._roll_out(noise.shape[1], noise.unbind(2), replacement, early_stopped)
+
+    def begin(self, count: int) -> Candidates:
+        """n = `count` candidates without a segment. Their extensions are considered once `consider` is called."""
+        plans = self.state.expand_plans(count)
+        return Candidates(self, plans, self.objective.start(plans))
+
+    def consider(self, candidates: Candidates) -> None:
+        """Let the planner choose among these whole candidates, too."""
+        self.considered.append(candidates)
+
+    def take_considered(self) -> Candidates:
+        """All whole candidates so far, in order, which the problem then forgets (they refer to it).
+
+        Raises ValueError if there are none.
+        """
+        if not self.considered:
+            raise ValueError("the optimizer has evaluated no candidate: call problem(noise) at least once")
+        candidates = join(self.considered)
+        self.considered.clear()
+        return candidates
+
+    def _roll_out(
+        self, count: int, noise: Sequence[Tensor | None], replacement: bool, early_stopped: Tensor | None
+    ) -> Candidates:
+        chances: Sequence[Tensor | None] = [None] * len(noise)
+        if replacement and len(noise) > 1:
+            # All at once, beforehand: an environment's random numbers must not depend on when others stop early.
+            chances = uniform_each((len(noise), count), self.generators).unbind(1)
+        candidates = self.begin(count)
+        for number, (segment, chance) in enumerate(zip(noise, chances, strict=True), 1):
+            if early_stopped is not None and all(early_stopped.tolist()):
+                candidates = candidates.stay(segment)
+            else:
+                last = number == len(noise)
+                candidates, early_stopped = candidates.extend_and_replace(segment, chance, early_stopped, last=last)
+        self.consider(candidates)
+        return candidates
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """n candidates per environment, k segments long, that can be extended, chosen among, joined and taken back.
+
+    Each segment is recorded once, under the numbers that candidates had there; `ancestors` map the numbers from one
+    segment to the next. Copies of a candidate cost nothing.
+    """
+
+    problem: SearchProblem
+    plans: State  # [B, n, M, .] their last states
+    score_state: Any  # fields [B, n]
+    segments: tuple[SegmentRecord, ...] = ()  # k of them, of [B, R, ...]
+    # k of [B, .] int64: for each candidate of the next segment (after the last, for each of `plans`) the number of
+    # its ancestor; None where the numbers stay.
+    ancestors: tuple[Tensor | None, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """n."""
+        return self.plans.batch_shape[-1]
+
+    @property
+    def returns(self) -> Tensor:
+        """`[B, n]`, the higher the better."""
+        return self.score_state.returns
+
+    @property
+    def codes(self) -> Tensor:
+        """`[B, n, k, D]` effect or motion codes, or the pushes of each segment in a row."""
+        return self.history(lambda segment: segment.rollout.code)
+
+    @property
+    def actions(self) -> Tensor:
+        """`[B, n, k T, 4]`, for a search space that has actions."""
+        return self.history(actions_of).flatten(2, 3)
+
+    @property
+    def path(self) -> Tensor:
+        """`[B, n, k T, M, 3]` metres, the predicted centres after every step."""
+        return self.history(lambda segment: segment.rollout.path).flatten(2, 3)
+
+    @property
+    def centers(self) -> Tensor:
+        """`[B, n, k, M, 3]` metres, the predicted centres at the end of every segment."""
+        return self.history(lambda segment: segment.rollout.states.centers)
+
+    @property
+    def states(self) -> State:
+        """`[B, n, k, M, .]` the predicted states at the end of every segment."""
+        features = self.history(lambda segment: segment.rollout.states.features)
+        mask = self.plans.mask.unsqueeze(2).expand(-1, -1, len(self.segments), -1)  # real objects stay real
+        return State(self.centers, features, mask)
+
+    @property
+    def noise(self) -> Tensor:
+        """`[B, n, k, D]`; only of candidates made from noise."""
+
+        def noise_of(segment: SegmentRecord) -> Tensor:
+            assert segment.noise is not None
+            return segment.noise
+
+        return self.history(noise_of)
+
+    @cached_property
+    def rows(self) -> tuple[Tensor | None, ...]:
+        """The numbers that candidates had in each segment, k of `[B, n]` int64; None where they have them still."""
+        rows: list[Tensor | None] = []
+        later: Tensor | None = None
+        for ancestor in reversed(self.ancestors):
+            later = later if ancestor is None else ancestor if later is None else ancestor.gather(1, later)
+            rows.append(later)
+        return tuple(reversed(rows))
+
+    def extend(self, noise: Tensor | None = None) -> Candidates:
+        """One more segment, from `noise: [B, n, D]` or sampled from the prior. Terminated candidates stay."""
+        return self.extend_and_replace(noise, None, None)[0]
+
+    def extend_and_replace(
+        self, noise: Tensor | None, chances: Tensor | None, early_stopped: Tensor | None, *, last: bool = False
+    ) -> tuple[Candidates, Tensor | None]:
+        """One more segment; then copies of active candidates, by `chances: [B, n]` in [0, 1), replace failed ones.
+
+        Without chances, and after the `last` segment, failed candidates stay. In environments that are
+        `early_stopped: [B]` bool, if it is given, all stay. Also returns which environments have stopped afterwards.
+        """
+        problem, before, number = self.problem, self.plans, len(self.segments)
+        # Until the first segment all candidates are in one state, which the model then reads once.
+        here = before if self.segments else problem.state.expand_plans(1)
+        what = problem.space, problem.objective, number, here, before, self.score_state, noise, chances, early_stopped
+        after = extend_segment(*what, problem.generators) if noise is None else problem.backend(extend_segment, *what)
+        segments = (*self.segments, SegmentRecord(noise, after.rollout, after.score_state))
+        ancestors = None if last else after.ancestors
+        plans, score_state = after.plans, after.next_score_state
+        if ancestors is None:
+            plans, score_state = after.rollout.states, after.score_state
+        return Candidates(problem, plans, score_state, segments, (*self.ancestors, ancestors)), after.early_stopped
+
+    def stay(self, noise: Tensor | None) -> Candidates:
+        """One more segment in which no candidate moves; `noise` is only recorded."""
+        last = self.segments[-1].rollout
+        shape = self.plans.batch_shape
+        rollout = SegmentRollout(
+            last.code.new_zeros(*shape, last.code.shape[-1]),
+            None if last.actions is None else last.actions.new_zeros(*shape, *last.actions.shape[2:]),
+            self.plans,
+            self.plans.centers.unsqueeze(-3).expand(-1, -1, last.path.shape[-3], -1, -1),
+        )
+        segments = (*self.segments, SegmentRecord(noise, rollout, self.score_state))
+        return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
+
+    def take(self, numbers: Tensor) -> Candidates:
+        """Candidates by number, `[B, m]` int64: m candidates, copies where a number comes twice."""
+        plans, score_state = records.take((self.plans, self.score_state), numbers)
+        ancestors = self.ancestors
+        if ancestors:
+            last = ancestors[-1]
+            ancestors = (*ancestors[:-1], numbers if last is None else last.gather(1, numbers))
+        return Candidates(self.problem, plans, score_state, self.segments, ancestors)
+
+    def back(self, segments: int) -> Candidates:
+        """The same candidates before their last `segments` segments."""
+        left = len(self.segments) - segments
+        if left == 0:
+            return self.problem.begin(self.count)
+        row, last = self.rows[left - 1], self.segments[left - 1]
+        last = last if row is None else records.take(last, row)
+        ancestors = (*self.ancestors[: left - 1], row)
+        return Candidates(self.problem, last.rollout.states, last.score_state, self.segments[:left], ancestors)
+
+    def compact(self) -> Candidates:
+        """The same candidates, with every segment recorded under their present numbers."""
+        pairs = zip(self.segments, self.rows, strict=True)
+        segments = tuple(segment if row is None else records.take(segment, row) for segment, row in pairs)
+        return Candidates(self.problem, self.plans, self.score_state, segments, (None,) * len(segments))
+
+    def at(self, segment: int, read: Callable[[SegmentRecord], Tensor]) -> Tensor:
+        """One segment of every candidate: `read` takes `[B, R, ...]` from its record -> `[B, n, ...]`."""
+        row, values = self.rows[segment], read(self.segments[segment])
+        return values if row is None else values[self._environments, row]
+
+    @cached_property
+    def _environments(self) -> Tensor:
+        """Numbers of the environments, `[B, 1]`."""
+        mask = self.plans.mask
+        return torch.arange(len(mask), device=mask.device).unsqueeze(-1)
+
+    def history(self, read: Callable[[SegmentRecord], Tensor]) -> Tensor:
+        """The same of all k segments: `[B, n, k, ...]`."""
+        return torch.stack([self.at(segment, read) for segment in range(len(self.segments))], dim=2)
+
+
+def join(parts: Sequence[Candidates]) -> Candidates:
+    """Candidates of one problem and one length, one after the other: `[B, n_1], [B, n_2], ... -> [B, n_1 + ...]`."""
+    if len(parts) == 1:
+        return parts[0]
+    compact = [part.compact() for part in parts]
+    segments = tuple(records.join(same) for same in zip(*(part.segments for part in compact), strict=True))
+    score_state = records.join([part.score_state for part in parts])
+    plans = records.join([part.plans for part in parts])
+    return Candidates(parts[0].problem, plans, score_state, segments, (None,) * len(segments))

@@ -1,0 +1,21 @@
+"""The states that f predicts of actions (paper, equation 1; Algorithm 1, line 9)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.protocol import DynamicsModel
+
+
+def predict_states(model: DynamicsModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
+    """T `pushes: [B, n, T, 4]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]` and the path `[B, n, T, M, 3]`.
+
+    Recursively, an action at a time; the path is in metres.
+    """
+    steps = []
+    for push in pushes.unbind(-2):
+        here = model.next_state(here, push).expand(pushes.shape[:2])
+        steps.append(here.centers)
+    return here, torch.stack(steps, -3)

@@ -1,0 +1,47 @@
+"""Choosing among candidates, per environment."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.inputs import NoFiniteCandidateError
+
+
+def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
+    """Sum over real objects of the squared distance to where they should be: `[...]` square metres.
+
+    `states`, `goals`: `[...]`, whose leading dimensions broadcast; the mask is the goals'. `feature_weight`:
+    square metres per squared unit of distance between features; 0 leaves the features out.
+    """
+    per_object = (states.centers - goals.centers).square().sum(-1)
+    if feature_weight:
+        per_object = per_object + feature_weight * (states.features - goals.features).square().sum(-1)
+    return torch.where(goals.mask, per_object, 0.0).sum(-1)
+
+
+def prefer(scores: Tensor, preferred: Tensor) -> Tensor:
+    """Scores `[B, N]` with -inf for candidates outside `preferred: [B, N]`, in environments that have such plans.
+
+    A preferred plan whose score is not finite does not count.
+    """
+    preferred = preferred & torch.isfinite(scores)
+    return torch.where(preferred | ~preferred.any(-1, keepdim=True), scores, -torch.inf)
+
+
+def best_of(scores: Tensor, what: str) -> Tensor:
+    """Number of the plan with the highest score, the first one of equals: `[B]` int64, from `scores: [B, N]`.
+
+    Scores that are not finite lose. Raises ValueError, naming the environment and `what` was ranked, where
+    none is finite: nothing that follows from such a choice should reach a robot.
+    """
+    finite = torch.isfinite(scores)
+    infinite = (~finite.any(-1)).nonzero().flatten().tolist()
+    if infinite:
+        raise NoFiniteCandidateError(
+            infinite[0],
+            f"none of the {scores.shape[-1]} {what} is finite; "
+            "check the observed state, the reward and the model's weights",
+        )
+    return torch.where(finite, scores, -torch.inf).argmax(-1)

@@ -1,0 +1,129 @@
+"""Samples of a model's priors, with one generator per environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
+
+from models.state import State
+from planning.protocol import Reparameterized
+
+
+def sample_each(
+    prior: Callable[..., Distribution],
+    conditions: Sequence[State | Tensor],
+    generators: Sequence[torch.Generator],
+) -> Tensor:
+    """One sample per candidate from `prior(*conditions)`, each environment with its own generator: `[B, N, 16]`.
+
+    `conditions`: what the prior is given, states and codes with leading dimensions `[B, N]`. The prior is
+    asked per environment, so that neither its randomness nor its distribution sees the rest of the batch.
+    """
+    return torch.stack(
+        [
+            _sample(prior(*(_scene(condition, index) for condition in conditions)), generator)
+            for index, generator in enumerate(generators)
+        ]
+    )
+
+
+def sample_codes(
+    prior: Callable[..., Distribution],
+    conditions: Sequence[State | Tensor],
+    noise: Tensor | None,
+    generators: Sequence[torch.Generator],
+) -> Tensor:
+    """Codes `[B, N, D]` of `prior(*conditions)`: those that `noise: [B, N, D]` determines, or samples without noise."""
+    if noise is None:
+        return sample_each(prior, conditions, generators)
+    return reparameterize_each(prior, conditions, noise)
+
+
+def noise_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Standard normal noise, each environment's from its own generator: `[B, *shape]`."""
+    return torch.stack([torch.randn(*shape, generator=source, device=source.device) for source in generators])
+
+
+def uniform_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Uniform numbers in [0, 1), each environment's from its own generator: `[B, *shape]`."""
+    return torch.stack([torch.rand(*shape, generator=source, device=source.device) for source in generators])
+
+
+def reparameterize_each(
+    prior: Callable[..., Distribution], conditions: Sequence[State | Tensor], noise: Tensor
+) -> Tensor:
+    """The codes `[B, N, D]` that standard normal `noise: [B, N, D]` determines, distributed as the prior.
+
+    The prior is asked per environment, as in `sample_each`. Raises ValueError for a prior that cannot be written as a
+    function of such noise.
+    """
+    return torch.stack(
+        [
+            reparameterize(prior(*(_scene(condition, index) for condition in conditions)), own)
+            for index, own in enumerate(noise)
+        ]
+    )
+
+
+def reparameterize(prior: Distribution, noise: Tensor) -> Tensor:
+    """The code `[..., D]` that standard normal `noise: [..., D]` determines: mean + scale * noise, or a flow's.
+
+    Raises ValueError for a distribution that is neither normal, nor a transformed normal, nor `Reparameterized`.
+    """
+    if isinstance(prior, Reparameterized):
+        return prior.reparameterize(noise)
+    if isinstance(prior, Independent):
+        return reparameterize(prior.base_dist, noise)
+    if isinstance(prior, Normal):
+        return prior.loc + prior.scale * noise
+    if isinstance(prior, TransformedDistribution):
+        code = reparameterize(prior.base_dist, noise)
+        for transform in prior.transforms:
+            code = transform(code)
+        return code
+    raise ValueError(
+        f"codes of a prior of type {type(prior).__name__} can be sampled, but not reparameterized: it is neither "
+        "normal nor a transformed normal, and has no method reparameterize; take the optimizer shooting and "
+        "warm_start=false"
+    )
+
+
+def _is_reparameterizable(prior: Distribution) -> bool:
+    """Whether `reparameterize` knows this prior."""
+    if isinstance(prior, Reparameterized):
+        return True
+    if isinstance(prior, Independent | TransformedDistribution):
+        return _is_reparameterizable(prior.base_dist)
+    return isinstance(prior, Normal)
+
+
+def _sample(prior: Distribution, generator: torch.Generator) -> Tensor:
+    if _is_reparameterizable(prior):
+        shape = prior.batch_shape + prior.event_shape
+        return reparameterize(prior, torch.randn(shape, generator=generator, device=generator.device))
+    with _global_randomness_from(generator):
+        return prior.sample()
+
+
+def _scene(condition: State | Tensor, index: int) -> State | Tensor:
+    return condition.scene(index) if isinstance(condition, State) else condition[index]
+
+
+@contextmanager
+def _global_randomness_from(generator: torch.Generator) -> Iterator[None]:
+    """Let a generator stand in for torch's global one: `Distribution.sample` takes no generator of its own."""
+    device = generator.device
+    if device.type == "cuda":
+        with torch.random.fork_rng(devices=[device]):
+            torch.cuda.set_rng_state(generator.get_state(), device)
+            yield
+            generator.set_state(torch.cuda.get_rng_state(device))
+    else:
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(generator.get_state())
+            yield
+            generator.set_state(torch.get_rng_state())

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from cavin_pyro.config import application as command_module
+from cavin_pyro.config.application import PACKAGES, check_packages, guarded
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError, at_least, user_input
+from cavin_pyro.storage.files import atomic_write
+
+
+def refuse(number: int, place: str | None = None) -> None:
+    raise OSError(number, os.strerror(number), place)
+
+
+def test_bad_input_is_one_line_and_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    def act() -> None:
+        raise UserError("an option\n  is wrong")
+
+    with pytest.raises(SystemExit) as stop:
+        guarded(act)
+    assert stop.value.code == 2
+    assert capsys.readouterr() == ("", "error: an option is wrong\n")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EFBIG, errno.EIO])
+def test_a_disk_that_refuses_is_one_line_that_says_where(
+    number: int, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def act() -> None:
+        with atomic_write(tmp_path / "results.json") as temporary:
+            temporary.write_text("half")
+            refuse(number)
+
+    with pytest.raises(SystemExit) as stop:
+        guarded(act)
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert line.startswith(f"error: the disk refused to store results at {tmp_path / 'results.json'}: ")
+    assert os.strerror(number) in line
+    assert "choose output=DIR" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_errors_that_are_bugs_keep_their_traceback() -> None:
+    for error in (ValueError("a bug"), OSError(errno.ENOTCONN, "a bug"), KeyError("a bug")):
+
+        def act(error: Exception = error) -> None:
+            raise error
+
+        with pytest.raises(type(error)) as caught:
+            guarded(act)
+        assert caught.value is error
+
+
+def test_an_interruption_is_one_line_and_its_own_status(capsys: pytest.CaptureFixture[str]) -> None:
+    def act() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as stop:
+        guarded(act)
+    assert stop.value.code == 130
+    assert capsys.readouterr().err.startswith("error: interrupted; where the command can resume")
+
+
+def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None:
+    with pytest.raises(UserError, match=r"^two lines$"), user_input():
+        raise ValueError("two\n   lines")
+    with pytest.raises(KeyError), user_input():
+        raise KeyError("a bug")
+
+
+@pytest.mark.parametrize("value", [0, -1, 0.5, float("nan"), "3", None, True])
+def test_counts_below_one_and_what_is_no_number_are_refused(value: object) -> None:
+    with pytest.raises(UserError, match=f"^workers must be at least 1, not {value}$"):
+        at_least("workers", value, 1)  # type: ignore[arg-type]
+    at_least("workers", 1, 1)
+
+
+def test_our_own_packages_are_ours() -> None:
+    check_packages()
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_foreign_package_of_the_same_name_is_told_apart(
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / package).mkdir()
+    (tmp_path / package / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    kept = {name for name in sys.modules if name.partition(".")[0] == package}
+    for name in kept:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(UserError) as caught:
+        check_packages()
+    said = (
+        f"the package {package!r} of this program is hidden by {tmp_path / package}: run from another folder, or rename"
+    )
+    assert str(caught.value).startswith(said)
+
+
+@pytest.mark.parametrize("name", ["models/__init__.py", "envs.py"])
+def test_a_foreign_package_in_the_folder_from_which_a_command_is_run(
+    name: str, shell: SimpleNamespace, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("raise SystemExit('was run')\n")
+    answer = shell.run_command("collect", "output=out", folder=tmp_path)
+    assert answer.status == 2
+    (line,) = answer.errors.splitlines()
+    assert line.startswith("error: the package ")
+    assert str(path if name == "envs.py" else path.parent) in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_of_the_same_name_that_are_no_packages_do_no_harm(shell: SimpleNamespace, tmp_path: Path) -> None:
+    for package in PACKAGES:
+        (tmp_path / package).mkdir()
+    overrides = ["transitions=1", "steps=1", "episodes_per_shard=1", "workers=1", "output=out"]
+    answer = shell.run_command("collect", *overrides, folder=tmp_path)
+    assert answer.status == 0, answer.errors
+
+
+@pytest.mark.parametrize(
+    ("command", "overrides", "kilobytes", "refused", "left"),
+    [
+        ("collect", "transitions=50 steps=5 episodes_per_shard=10 workers=1", 150, "episodes-00000.h5", set()),
+        (
+            "train",
+            "data={pushes} pointnet={checkpoint} trainer.steps=2 trainer.validate_every=1 windows.minimum_move=0.001 "
+            "windows.validation_fraction=0.4 trainer.batch_size=2",
+            300,
+            "checkpoint.safetensors",
+            {"config.yaml", "data.json"},
+        ),
+    ],
+)
+def test_a_disk_that_takes_no_more_ends_a_command_in_one_line(
+    command: str,
+    overrides: str,
+    kilobytes: int,
+    refused: str,
+    left: set[str],
+    shell: SimpleNamespace,
+    own_pushes: Path,
+    checkpoint_file: Path,
+    tmp_path: Path,
+) -> None:
+    """The system's limit on the size of a file stands in for a full disk: writing fails half-way in the same manner."""
+    line = overrides.format(checkpoint=checkpoint_file, pushes=own_pushes).split()
+    limit = (kilobytes * 1024, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, limit)  # which the command inherits
+    try:
+        answer = shell.run_command(command, *line, "output=out", folder=tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert answer.status == 2, answer.errors
+    complaint = answer.complaints[-1]
+    assert complaint.startswith(f"error: the disk refused to store results at out/{refused}: ")
+    assert "Traceback" not in answer.errors
+    assert {path.name for path in (tmp_path / "out").iterdir() if path.is_file()} == left
+
+
+def test_every_command_declares_its_options() -> None:
+    root = Path(command_module.__file__).parents[1]
+    mains = {path.stem for path in root.glob("*.py") if "@command(" in path.read_text()}
+    assert mains == set(COMMANDS)
+
+
+def test_what_we_added_to_the_papers_planner_can_be_left_out(
+    shell: SimpleNamespace, checkpoint_file: Path, tmp_path: Path
+) -> None:
+    overrides = [
+        "planner.robustness=null",
+        "planner.avoid_failures=false",
+        "planner.warm_start=false",
+        "planner.idle_distance=0",
+        "pushes_per_plan=null",
+        "margin=0",
+        "planner.samples=8",
+        "planner.horizon=3",
+    ]
+    overrides += [f"checkpoint={checkpoint_file}", "episodes=1", "maximum_steps=3", "objects=2", "workers=1"]
+    answer = shell.run_command("evaluate", *overrides, "output=results", folder=tmp_path)
+    assert answer.status == 0, answer.errors
+    assert "robustness: null" in (tmp_path / "results" / "config.yaml").read_text()
+
+
+def test_a_configuration_from_python_is_that_of_the_command() -> None:
+    config = compose("plan", "task=clearing", "planner.samples=8")
+    assert config.task._target_ == "envs.tasks.clearing.Clearing"
+    assert config.planner.samples == 8
+    assert "hydra" not in config
+
+
+def test_words_from_python_are_refused_as_on_the_command_line() -> None:
+    for overrides, complaint in {
+        ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from cascaded, flat,",
+        ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",
+        ("plan", "objects=many"): "objects must be a whole number, not many",
+    }.items():
+        with pytest.raises(UserError) as caught:
+            compose(*overrides)
+        assert str(caught.value).startswith(complaint)

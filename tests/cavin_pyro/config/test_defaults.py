@@ -1,0 +1,119 @@
+"""The library, the command line and a run's `config.yaml` have one default per option."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hydra.utils import get_object
+from omegaconf import OmegaConf
+
+from cavin_pyro.config import registration
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.constructors import constructor_options
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import configured, options
+from cavin_pyro.config.parts import build_model, construct
+from cavin_pyro.data.collection import CollectionConfig
+from cavin_pyro.data.world import collecting_world
+from envs.pushing import PushingEnv
+from planning import CavinPlanner
+
+PRESETS = Path(registration.__file__).parent / "presets"
+PAPER = {  # Algorithm 1 as it is printed
+    "planner.motion_horizon": "full_horizon",
+    "planner.warm_start": False,
+    "planner.avoid_failures": False,
+    "planner.robustness": None,
+    "planner.reachability": None,
+    "planner.idle_distance": 0.0,
+    "planner.optimizer._target_": "planning.optimizers.Shooting",
+    "pushes_per_plan": None,
+    "margin": 0.0,
+    "matmul_precision": "float32",
+}
+
+
+def plain(config: Any) -> dict[str, Any]:
+    found = OmegaConf.to_container(config)
+    assert isinstance(found, dict)
+    return {str(name): value for name, value in found.items()}
+
+
+def test_a_planner_without_options_is_that_of_the_command(small: SimpleNamespace) -> None:
+    model, reward = build_model(small.config()), object()
+    section = plain(compose("plan").planner)
+    del section["model_free"]
+    ours, theirs = CavinPlanner(model, reward), construct(section, model=model, reward=reward)
+    assert {**vars(ours), "optimizer": None} == {**vars(theirs), "optimizer": None}
+    assert vars(ours.optimizer) == vars(theirs.optimizer)
+
+
+def test_training_without_options_is_that_of_the_command() -> None:
+    config = compose("train")
+    assert asdict(TrainerConfig()) == plain(config.trainer)
+    assert asdict(WindowConfig()) == plain(config.windows)
+
+
+def test_collecting_without_options_is_that_of_the_command() -> None:
+    config = compose("collect")
+    usual = CollectionConfig()
+    assert collecting_world(config.env) == usual
+    for name in ("seed", "steps", "intent_length", "perturbation_rate", "maximum_objects", "episodes_per_shard"):
+        assert config[name] == getattr(usual, name)
+
+
+def test_an_environment_without_options_is_that_of_the_command() -> None:
+    config, defaults = compose("plan"), inspect.signature(PushingEnv).parameters
+    for name in ("layout", "reward", "objects", "maximum_steps"):
+        assert config[name] == defaults[name].default
+    for name in ("robot", "camera", "segmentation"):
+        assert config.env[name] == defaults[name].default
+    assert config.task._target_ == "envs.tasks.crossing.Crossing"
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS.rglob("*.yaml")), ids=lambda path: str(path.relative_to(PRESETS)))
+def test_presets_name_classes_that_exist_and_repeat_none_of_their_defaults(preset: Path) -> None:
+    def check(value: Any) -> None:
+        if isinstance(value, dict):
+            if value.get("_target_"):
+                assert callable(get_object(value["_target_"]))
+                declared = constructor_options(value["_target_"])
+                for name in value.keys() & declared.keys():
+                    assert value[name] != declared[name].default or value[name] is None
+            for entry in value.values():
+                check(entry)
+
+    check(OmegaConf.to_container(OmegaConf.load(preset)))
+
+
+def test_one_word_is_the_papers_algorithm() -> None:
+    config = compose("plan", "planner=paper")
+    for name, value in PAPER.items():
+        assert OmegaConf.select(config, name) == value
+    overridden = compose("plan", "planner=paper", "margin=0.01", "pushes_per_plan=2")
+    assert (overridden.margin, overridden.pushes_per_plan) == (0.01, 2)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_says_what_it_means(command: str) -> None:
+    declared = {one.name: one for one in options(COMMANDS[command])}
+    assert declared.keys() >= {"output", "seed"}
+    for one in declared.values():
+        assert one.about.help and one.about.group
+
+
+def test_a_stored_section_is_checked_as_a_commands_is() -> None:
+    assert configured(WindowConfig, {"maximum_step": 0.3, "of_old": 1}, "windows") == WindowConfig(maximum_step=0.3)
+    for values, said in (
+        ({"maximum_step": "far"}, "windows.maximum_step is of another type"),
+        ({"maximum_step": -1}, "windows.maximum_step must be at least 0 metres, not -1"),
+    ):
+        with pytest.raises(UserError, match=f"^{said}"):
+            configured(WindowConfig, values, "windows")

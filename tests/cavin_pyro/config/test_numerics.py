@@ -1,0 +1,65 @@
+"""Matrix precision and the allocator change speed and rounding only."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from cavin_pyro.config.numerics import MATMUL_PRECISIONS, set_matmul_precision
+
+# Page faults of tensors that are made and dropped: before the call, after it, and after a second one.
+COUNT_PAGE_FAULTS = """
+import json, resource, torch
+from cavin_pyro.config.numerics import keep_freed_memory
+
+def page_faults():
+    first = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        tensors = [torch.ones(6 * 2**20) for _ in range(3)]  # 24 MB each
+        del tensors
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - first
+
+counts = [page_faults()]
+for _ in range(2):
+    keep_freed_memory()
+    page_faults()
+    counts.append(page_faults())
+print(json.dumps(counts))
+"""
+
+
+def processor_flags() -> set[str]:
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text().splitlines() if file.exists() else []
+    return {flag for line in lines if line.startswith("flags") for flag in line.split()}
+
+
+@pytest.mark.parametrize("name", MATMUL_PRECISIONS)
+def test_matrix_products_round_their_factors_to_the_named_precision(name: str) -> None:
+    set_matmul_precision(name)
+    assert torch.get_float32_matmul_precision() == {"float32": "highest", "bfloat16": "medium"}[name]
+    generator = torch.Generator().manual_seed(0)
+    left, right = torch.randn(256, 256, generator=generator), torch.randn(256, 256, generator=generator)
+    exact, rounded = left.double() @ right.double(), left.bfloat16().double() @ right.bfloat16().double()
+    assert (exact - rounded).abs().max() > 0.1
+    allowed = {"float32": [exact], "bfloat16": [rounded] if "amx_bf16" in processor_flags() else [exact, rounded]}
+    product = (left @ right).double()
+    # Sums are kept in float32 in any case, so the product is within 1e-3 of one of these and far from all others.
+    assert min(float((product - expected).abs().max()) for expected in allowed[name]) < 1e-3
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "mallopt"), reason="the C library has no such option"
+)
+def test_freed_memory_is_kept_however_often_that_is_asked_for() -> None:
+    line = [sys.executable, "-c", COUNT_PAGE_FAULTS]
+    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
+    before, once, twice = json.loads(done.stdout)
+    assert before > 10_000
+    assert once < before / 100 and twice < before / 100

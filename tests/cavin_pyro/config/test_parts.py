@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from pyro.infer import Trace_ELBO
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.parts import build_guide, build_model, check_sizes, construct
+from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.pointnet import check_fit, load_pointnet
+from cavin_pyro.training.factory import build_objective
+from models.model import Model
+from models.networks.pointnet import PointNet
+
+
+class AnotherModel(Model):
+    """A model that no guide knows."""
+
+    name = "another"
+
+
+def test_a_model_gets_a_prior_of_its_own_size_for_each_code(small: SimpleNamespace) -> None:
+    config = small.config()
+    config["model"] |= {"effect_dimension": 4, "motion_dimension": 6}
+    model = build_model(config)
+    assert model.prior_of_effects.dimension == 4
+    assert model.prior_of_motions.dimension == 6
+    assert model.width == 8
+
+
+@pytest.mark.parametrize("prior", ["standard", "conditional", "flow"])
+@pytest.mark.parametrize("guide", ["cascaded", "flow"])
+def test_words_for_priors_and_guides_build_what_a_checkpoint_builds_again(
+    prior: str, guide: str, tmp_path: Path
+) -> None:
+    overrides = [f"prior={prior}", f"guide={guide}", "model.width=8", "guide.width=8"]
+    config = OmegaConf.to_container(compose("train", *overrides))
+    model = build_model(config)
+    parts = {"model": model, "guide": build_guide(config, model)}
+    save_checkpoint(tmp_path / "a.safetensors", parts=parts, config=config, provenance={})
+    checkpoint = load_checkpoint(tmp_path / "a.safetensors")
+    again = build_model(checkpoint.config)
+    for part, module in {"model": again, "guide": build_guide(checkpoint.config, again)}.items():
+        checkpoint.load_into(part, module, "a.safetensors")
+        weights = parts[part].state_dict()
+        assert all(torch.equal(value, weights[name]) for name, value in module.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ({"width": 0}, "^prior.width must be at least 1, not 0$"),
+        ({"transforms": -1}, "^prior.transforms must be at least 1, not -1$"),
+        ({"depth": 3}, "models.priors.flow.FlowPrior cannot be built: .*'depth'"),
+    ],
+)
+def test_options_that_a_prior_does_not_take_are_named(option: dict, said: str, small: SimpleNamespace) -> None:
+    config = small.config()
+    config["prior"] = {"_target_": "models.priors.flow.FlowPrior", **option}
+    with pytest.raises(UserError, match=said) as caught:
+        build_model(config)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNamespace) -> None:
+    with pytest.raises(UserError) as caught:
+        build_guide(small.config(), AnotherModel())
+    assert str(caught.value) == (
+        "guide guides.cascaded.CascadedGuide does not fit model AnotherModel (it fits cascaded): "
+        "choose guide= from none of ours"
+    )
+
+
+def test_the_guide_of_a_model_has_its_dimensions(small: SimpleNamespace) -> None:
+    config = small.config()
+    guide = build_guide(config, build_model(config))
+    assert guide.effect_inference.code.head.out_features == 2 * 4
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ({"_target_": "models.nothing.Nothing"}, "models.nothing.Nothing cannot be built"),
+        (
+            {"_target_": "models.networks.pointnet.PointNet", "depth": 3},
+            "models.networks.pointnet.PointNet cannot be built: .*'depth'",
+        ),
+        (
+            {"_target_": "planning.RandomPlanner", "segment_length": 0},
+            "^segment_length must be at least 1, not 0$",
+        ),
+        ({"depth": 3}, "a part has no _target_"),
+    ],
+)
+def test_parts_that_cannot_be_built_are_named(part: dict, said: str) -> None:
+    with pytest.raises(UserError, match=said) as caught:
+        construct(part)
+    assert "\n" not in str(caught.value)
+
+
+def test_sizes_are_counts() -> None:
+    check_sizes("model", {"width": 1, "scale": 0.0, "flag": False, "name": "x", "nothing": None})
+    for value in (0, -3):
+        with pytest.raises(UserError, match=f"^model.width must be at least 1, not {value}$"):
+            check_sizes("model", {"width": value})
+
+
+def test_an_objective_is_any_elbo_of_pyro(small: SimpleNamespace) -> None:
+    config = {"objective": {"_target_": "pyro.infer.Trace_ELBO", "num_particles": 3, "vectorize_particles": True}}
+    objective = build_objective(config, build_model(small.config()))
+    assert isinstance(objective.elbo, Trace_ELBO)
+    assert objective.elbo.num_particles == 3
+
+
+def test_a_model_must_take_the_features_and_the_objects_that_there_are(small: SimpleNamespace) -> None:
+    model = build_model(small.config())
+    check_fit(model, PointNet(), 5)
+    with pytest.raises(UserError, match="feature_dimension=64, but the PointNet's features have 32"):
+        check_fit(model, PointNet(32), 5)
+    with pytest.raises(UserError, match="maximum_objects=5, but datasets have room for 6"):
+        check_fit(model, PointNet(), 6)
+
+
+def test_a_file_without_pointnet_is_refused(small: SimpleNamespace, tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, parts={"model": small.parts()["model"]}, config={}, provenance={})
+    with pytest.raises(UserError, match=r"a\.safetensors holds no PointNet"):
+        load_pointnet(path)

@@ -1,0 +1,52 @@
+"""The models beside the cascade, untrained: they can be checked, and random pushes need no model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from cavin_pyro.criticism.sections import SECTIONS
+
+WINDOWS = {
+    "validation_fraction": 0.4,
+    "maximum_step": 0.2,
+    "minimum_move": 0.001,
+    "maximum_move": 0.5,
+    "negative_fraction": 0.25,
+}
+SECTIONS_OF_CODES = {"guide_error", "amortization", "codes", "aggregate_posterior", "consistency"}
+SMALL = (
+    "windows=5 sizes.guide_error.inner_windows=3 sizes.guide_error.inner_particles=2 sizes.amortization.steps=2 "
+    "sizes.amortization.particles=2 sizes.amortization.samples=20 sizes.aggregate_posterior.permutations=9 "
+    "sizes.predictive.replicates=4 sizes.calibration.samples=8 sizes.growth.episodes=2 sizes.growth.segments=2 "
+    "sizes.consistency.scenes=1 sizes.consistency.objects=2 sizes.consistency.samples=2"
+)
+
+
+@pytest.mark.parametrize(
+    "name", ["dynamics", *(pytest.param(name, marks=pytest.mark.soak) for name in ("flat", "single_latent"))]
+)
+def test_a_check_runs_all_sections_or_says_which_do_not_apply(
+    name: str, small: SimpleNamespace, shell: SimpleNamespace, pushes: Path, tmp_path: Path
+) -> None:
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    small.save_baseline(checkpoint, name, windows=WINDOWS, seed=1)
+    overrides = [f"checkpoint={checkpoint}", "output=out"]
+    cases = {
+        "check": shell.Case("check", [*overrides, f"data={pushes}", *SMALL.split()]),
+        "plan": shell.Case("plan", [*overrides, "planner=random", "maximum_steps=3", "video=false"]),
+    }
+    answers = shell.run_in_turn(cases, tmp_path)
+    for answer in answers.values():
+        assert answer.status == 0, answer.errors
+    report = json.loads((tmp_path / "check" / "out" / "report.json").read_text())
+    assert list(report["sections"]) == list(SECTIONS)
+    empty = {section for section in SECTIONS if "The model has no codes" in " ".join(findings(report, section))}
+    assert empty == (SECTIONS_OF_CODES if name == "dynamics" else set())
+
+
+def findings(report: dict, section: str) -> list[str]:
+    return report["sections"][section]["findings"]

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.evaluation import episode_row, evaluate
+from cavin_pyro.evaluation.factory import Setup, set_up
+from cavin_pyro.evaluation.rollout import (
+    OUTCOMES,
+    Episode,
+    EpisodeCallback,
+    PlanRecord,
+    Transition,
+    observed_state,
+    rollout,
+)
+from cavin_pyro.storage.checkpoint import save_checkpoint
+from envs.pushing import PushingEnv
+from models.networks.pointnet import PointNet
+from planning import CavinPlanner, Plan, RandomPlanner
+
+
+@pytest.fixture
+def env() -> Any:
+    env = PushingEnv(task="crossing", objects=2, maximum_steps=4)
+    yield env
+    env.close()
+
+
+class Still(RandomPlanner):
+    """Random pushes shorter than a millimetre at the edge of the reachable box, which move nothing."""
+
+    def plan(self, state: Any, generators: Any, previous: Any = None) -> Plan:
+        plan = super().plan(state, generators)
+        return plan._replace(actions=plan.actions * 1e-3 + torch.tensor([-0.99, -0.99, 0.0, 0.0]))
+
+
+def fast(*overrides: str) -> list[str]:
+    return ["planner.samples=8", "planner.horizon=6", *overrides]
+
+
+def happened(episode: Episode) -> list[tuple]:
+    return [
+        (transition.action.tolist(), transition.reward, transition.centers.tolist())
+        for transition in episode.transitions
+    ]
+
+
+def test_episodes_are_repeated_by_their_seeds(env: PushingEnv) -> None:
+    pointnet = PointNet()
+    first, second, third = (rollout(env, RandomPlanner(), pointnet, seed=seed) for seed in (5, 5, 6))
+    assert happened(first) == happened(second)
+    assert happened(first) != happened(third)
+    assert first.seed == 5
+
+
+class Listener(EpisodeCallback):
+    """Notes what it is called with."""
+
+    def __init__(self) -> None:
+        self.observations: list[Any] = []
+        self.plans: list[PlanRecord] = []
+        self.transitions: list[Transition] = []
+        self.frames = 0
+        self.ended: list[Episode] = []
+
+    def on_observation(self, observation: Any) -> None:
+        self.observations.append(observation)
+
+    def on_plan(self, record: PlanRecord) -> None:
+        assert len(self.transitions) == record.step
+        self.plans.append(record)
+
+    def on_frame(self) -> None:
+        self.frames += 1
+
+    def on_transition(self, transition: Transition) -> None:
+        np.testing.assert_array_equal(transition.centers, self.observations[-1]["centers"])
+        self.transitions.append(transition)
+
+    def on_end(self, episode: Episode) -> None:
+        self.ended.append(episode)
+
+
+def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) -> None:
+    listener = Listener()
+    episode = rollout(env, RandomPlanner(3), PointNet(), seed=0, callbacks=[listener, EpisodeCallback()])
+    called = listener.plans
+    assert called == episode.plan_records
+    assert listener.transitions == episode.transitions
+    assert len(listener.observations) == len(episode.transitions) + 1
+    assert listener.ended == [episode]
+    assert (listener.frames > 0) == any(not transition.unsafe for transition in episode.transitions)
+    assert [record.step for record in episode.plan_records] == [0, 3][: len(called)]
+    assert [transition.step for transition in episode.transitions] == list(range(1, len(episode.transitions) + 1))
+    for transition in episode.transitions:
+        record = episode.plan_records[(transition.step - 1) // 3]
+        planned = record.plan.actions[0, (transition.step - 1) % 3].numpy()
+        np.testing.assert_array_equal(transition.action, planned)
+    assert episode.outcome in OUTCOMES
+    assert episode.total_reward == sum(transition.reward for transition in episode.transitions)
+
+
+@pytest.mark.parametrize(("pushes_per_plan", "steps"), [(None, [0, 3]), (3, [0, 3]), (2, [0, 2]), (1, [0, 1, 2, 3])])
+def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
+    env: PushingEnv, pushes_per_plan: int | None, steps: list[int]
+) -> None:
+    episode = rollout(env, Still(3), PointNet(), seed=0, pushes_per_plan=pushes_per_plan)
+    assert [record.step for record in episode.plan_records] == steps
+    assert len(episode.transitions) == 4
+    for record, end in zip(episode.plan_records, [*steps[1:], 4], strict=True):
+        made = episode.transitions[record.step : end]
+        np.testing.assert_array_equal([transition.action for transition in made], record.plan.actions[0, : len(made)])
+        np.testing.assert_array_equal(episode.reached(record), [transition.centers for transition in made])
+
+
+def test_the_planner_gets_the_observed_points_without_needless_padding(env: PushingEnv) -> None:
+    pointnet = PointNet()
+    observation, _ = env.reset(seed=0)
+    state = observed_state(observation, pointnet)
+    assert state.centers.shape == (1, 2, 3)
+    assert state.mask.tolist() == [[True, True]]
+    np.testing.assert_array_equal(state.centers[0], observation["centers"][:2])
+    with torch.no_grad():
+        cloud = torch.from_numpy(observation["clouds"][1] - observation["centers"][1])
+        torch.testing.assert_close(state.features[0, 1], pointnet(cloud), rtol=0, atol=1e-6)
+    # An object that was never seen leaves a hole, not a shift.
+    observation["mask"] = np.array([0, 1, 0, 0, 0], np.int8)
+    assert observed_state(observation, pointnet).mask.tolist() == [[False, True]]
+    observation["mask"][:] = 0
+    assert observed_state(observation, pointnet).mask.tolist() == [[False]]
+
+
+def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: PushingEnv) -> None:
+    class Wishful(RandomPlanner):
+        """Wants every object 30 cm above where it is, and does nothing about it."""
+
+        def plan(self, state: Any, generators: Any, previous: Any = None) -> Plan:
+            plan = super().plan(state, generators)
+            there = state.map(lambda field: field[:, None].clone())
+            there.centers[..., 2] += 0.3
+            return plan._replace(
+                actions=torch.zeros(1, 3, 4), subgoals=there, segments=torch.ones(1, dtype=torch.int64)
+            )
+
+    episode = rollout(env, Wishful(3), PointNet(), seed=0)
+    distances = [transition.subgoal_distance for transition in episode.transitions]
+    assert distances[2] == pytest.approx(0.3, abs=0.05)
+    assert np.isnan([distances[0], distances[1]]).all()
+    assert episode_row(episode)["subgoal_distance"] == pytest.approx(distances[2])
+
+
+def test_an_evaluation_runs_only_what_is_missing(configure: Any, tmp_path: Path) -> None:
+    config = configure("planner=random", "seed=10")
+    first = evaluate(config, tmp_path)
+    assert [row["seed"] for row in first] == [10, 11, 12]
+    lines = (tmp_path / "episodes.jsonl").read_text().splitlines(keepends=True)
+    assert [json.loads(line) for line in lines] == first
+    assert evaluate(config, tmp_path) == first
+    # As after a kill: the second line is missing, and the last one was cut short.
+    (tmp_path / "episodes.jsonl").write_text(lines[0] + lines[2][:-9])
+    config.episodes = 4
+    again = evaluate(config, tmp_path)
+    assert [row["seed"] for row in again] == [10, 11, 12, 13]
+    assert again[0] == first[0]
+    for row, earlier in zip(again, first, strict=False):
+        assert {**row, "planning_ms": 0} == {**earlier, "planning_ms": 0}
+    config.episodes = 2
+    assert evaluate(config, tmp_path) == again[:2]
+
+
+def test_a_kill_while_an_evaluation_begins_again_loses_no_episode(
+    configure: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configure("planner=random")
+    evaluate(config, tmp_path)
+    before = (tmp_path / "episodes.jsonl").read_text()
+
+    def killed(self: Path, text: str, **options: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(config, tmp_path)
+    assert (tmp_path / "episodes.jsonl").read_text() == before
+
+
+def parts(setup: Setup) -> SimpleNamespace:
+    setup.env.close()
+    return SimpleNamespace(**vars(setup), task=setup.task)
+
+
+def test_options_reach_the_parts(configure: Any) -> None:
+    setup = parts(set_up(configure(*fast("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7"))))
+    assert isinstance(setup.planner, CavinPlanner)
+    assert (setup.planner.samples, setup.planner.segments) == (8, 2)
+    assert setup.task.name == "insertion"
+    assert setup.planner.reward.dense and setup.env.reward.dense
+    assert (setup.planner.reward.margin, setup.env.reward.margin) == (0.02, 0.0)
+    assert (setup.env.maximum_steps, setup.env.objects) == (7, 2)
+    assert not any(parameter.requires_grad for parameter in setup.planner.model.parameters())
+    setup = parts(set_up(configure("planner=random", "env.ranges.names=[mug]", "env.ranges.scale=[1,1]")))
+    assert isinstance(setup.planner, RandomPlanner)
+    assert {one.name for one in setup.env.scene.objects} == {"mug"}
+
+
+def test_tiles_on_the_command_line_replace_those_of_the_layout(configure: Any) -> None:
+    plain = parts(set_up(configure("planner=random"))).task
+    moved = parts(set_up(configure("planner=random", "tiles.goal=[[1,1],[1,2]]"))).task
+    assert tuple(moved.goal) == ((1, 1), (1, 2)) != tuple(plain.goal)
+    assert moved.region == plain.region
+    setup = parts(set_up(configure(*fast("tiles.goal=[[1,1],[1,2]]"))))
+    assert setup.planner.reward.task == setup.env.task == moved
+
+
+@pytest.mark.parametrize("task", ["clearing", "insertion", "crossing"])
+@pytest.mark.parametrize("layout", [0, 1, 2])
+def test_every_builtin_layout_has_room_for_five_objects(task: str, layout: int, configure: Any) -> None:
+    setup = parts(set_up(configure("planner=random", f"task={task}", f"layout={layout}", "objects=5")))
+    assert len(setup.env.scene.objects) == 5
+
+
+def test_a_checkpoint_that_knows_fewer_objects_is_refused(
+    configure: Any, small: SimpleNamespace, tmp_path: Path
+) -> None:
+    config = small.config()
+    config["model"]["maximum_objects"] = 2
+    path = tmp_path / "two.safetensors"
+    save_checkpoint(path, parts=small.parts(), config=config, provenance={})
+    parts(set_up(configure(f"checkpoint={path}", "objects=2")))
+    with pytest.raises(UserError, match=r"objects=3, but checkpoint .*two\.safetensors knows at most 2: use objects=2"):
+        set_up(configure(f"checkpoint={path}", "objects=3"))
+    parts(set_up(configure(f"checkpoint={path}", "objects=3", "planner=random")))  # which asks no model

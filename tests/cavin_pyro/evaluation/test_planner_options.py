@@ -1,0 +1,149 @@
+"""`planner=` and `planner.optimizer=` with checkpoints of every model: what fits plans, what does not says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyro
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from cavin_pyro.config import parts as building
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.factory import Setup, announce_waiting, set_up
+from cavin_pyro.evaluation.rollout import OUTCOMES, rollout
+from cavin_pyro.storage.checkpoint import save_checkpoint
+from cavin_pyro.visualization.plan import draw_plan
+from models.networks.pointnet import PointNet
+from planning.optimizers import OPTIMIZERS
+from tests.compiler import needs_a_compiler
+
+FITTING = {
+    "cavin": "cascaded",
+    "cavin_evolution": "cascaded",
+    "sectar": "single_latent",
+    "cvae_mpc": "flat",
+    "mpc": "dynamics",
+}
+MODELS = sorted({*FITTING.values()})
+SMALL = ["maximum_steps=3", "objects=2", "planner.samples=16", "planner.horizon=6"]
+
+
+def save_untrained(path: Path, *further: str) -> Path:
+    """A very small checkpoint, as train writes it."""
+    composed = compose("train", "guide=none", "model.width=8", *further)
+    config = {part: OmegaConf.to_container(composed[part], resolve=True) for part in ("model", "prior", "scales")}
+    with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
+        parts = {"model": building.build_model(config), "pointnet": PointNet()}
+        save_checkpoint(path, parts=parts, config=config, provenance={"step": 0})
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """An untrained checkpoint of every model."""
+    folder = tmp_path_factory.mktemp("models")
+    return {name: save_untrained(folder / f"{name}.safetensors", f"model={name}") for name in MODELS}
+
+
+@pytest.fixture
+def setup(checkpoints: dict[str, Path]) -> Callable[..., Setup]:
+    def build(planner: str, model: str, *further: str) -> Setup:
+        overrides = [f"planner={planner}", f"checkpoint={checkpoints[model]}", *SMALL, *further]
+        return set_up(compose("evaluate", *overrides, "output=unused"))
+
+    return build
+
+
+@pytest.mark.parametrize("optimizer", sorted(OPTIMIZERS))
+@pytest.mark.parametrize("planner", sorted(FITTING))
+def test_every_planner_plans_with_every_optimizer(
+    planner: str, optimizer: str, setup: Callable[..., Setup], tmp_path: Path
+) -> None:
+    parts = setup(planner, FITTING[planner], f"planner.optimizer={optimizer}")
+    episode = rollout(parts.env, parts.planner, parts.pointnet, seed=1)
+    assert episode.outcome in OUTCOMES
+    plan = episode.plan_records[0].plan
+    assert plan.actions.shape == (1, 3, 4)
+    assert plan.actions.isfinite().all()
+    assert plan.candidate_centers.shape[2:] == (2, 2, 3)
+    draw_plan(tmp_path / "plan.png", episode, parts.task, parts.env.scene.camera)
+    parts.env.close()
+
+
+@pytest.mark.parametrize(
+    ("planner", "option"),
+    [
+        ("cavin", "planner.reward_at=subgoals"),
+        ("cavin", "planner.stride_limits=[0.1,0.3]"),
+        ("cavin", "planner.optimizer.replacement=false"),
+        ("cavin", "planner.motion_optimizer=cem"),
+        ("cavin", "planner.warm_start=false"),
+        ("cavin", "matmul_precision=float32"),
+        ("cavin_evolution", "planner.optimizer.generations=1"),
+        ("cavin", "planner.reachability={_target_:planning.Reachability}"),
+        ("mpc", "planner.stride_limits=[0.01,0.15]"),
+        ("mpc", "planner.proposal=heuristic"),
+    ],
+)
+def test_options_take_effect(planner: str, option: str) -> None:
+    plans = []
+    for further in ([], [option]):
+        overrides = [f"planner={planner}", *SMALL, "planner.samples=64", *further, "output=unused"]
+        parts = set_up(compose("evaluate", *overrides))  # the shipped checkpoint knows something
+        plans.append(rollout(parts.env, parts.planner, parts.pointnet, seed=1).plan_records[0].plan)
+        parts.env.close()
+    returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
+    assert not (torch.equal(*returns) and torch.equal(*actions))
+
+
+@pytest.mark.soak  # tests/planning/backends/test_compiled.py compiles a whole planner of a toy model in every run
+@needs_a_compiler
+def test_compiled_plans_are_those_of_direct_planning(setup: Callable[..., Setup]) -> None:
+    plans = []
+    for compile in ("false", "true"):
+        overrides = [
+            "matmul_precision=float32",
+            "planner.robustness=null",
+            f"planner.compile={compile}",
+            "task=insertion",
+        ]
+        parts = setup("cavin", "cascaded", *overrides)
+        episode = rollout(parts.env, parts.planner, parts.pointnet, seed=1)
+        plans.append([record.plan for record in episode.plan_records])
+        parts.env.close()
+    for direct, compiled in zip(*plans, strict=True):
+        torch.testing.assert_close(compiled.candidate_returns, direct.candidate_returns)
+        torch.testing.assert_close(compiled.actions, direct.actions, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(compiled.predicted_centers, direct.predicted_centers, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("planner", ["cavin", "random"])
+def test_compilation_is_announced(planner: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for compile in (False, True):
+        overrides = [f"planner={planner}", *([f"planner.compile={compile}"] if planner == "cavin" else [])]
+        announce_waiting(compose("evaluate", *overrides))
+        assert capsys.readouterr().err.count("\n") == int(compile and planner == "cavin")
+
+
+@needs_a_compiler
+def test_flows_are_not_compiled(tmp_path: Path) -> None:
+    path = save_untrained(tmp_path / "flow.safetensors", "model=cascaded", "prior=flow")
+    config = compose("evaluate", f"checkpoint={path}", "planner.compile=true", "output=unused")
+    with pytest.raises(UserError, match=r"the priors in .*flow\.safetensors are flows, which cannot be compiled: take"):
+        set_up(config)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("planner", sorted(FITTING))
+def test_a_planner_names_the_model_that_it_needs(planner: str, model: str, setup: Callable[..., Setup]) -> None:
+    if planner == "mpc" or FITTING[planner] == model:  # all models have dynamics
+        setup(planner, model).env.close()
+    else:
+        with pytest.raises(
+            UserError, match=f"needs a checkpoint of model={FITTING[planner]}, but .*{model}.safetensors"
+        ):
+            setup(planner, model)

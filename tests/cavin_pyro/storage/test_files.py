@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.files import atomic_write, output_folder, read_json, write_json
+
+
+@given(
+    old=st.none() | st.binary(max_size=50),
+    new=st.binary(max_size=50),
+    fails_after=st.none() | st.integers(0, 49),
+)
+def test_a_file_is_the_new_one_or_the_old_one_and_nothing_else_remains(
+    tmp_path_factory: pytest.TempPathFactory, old: bytes | None, new: bytes, fails_after: int | None
+) -> None:
+    path = tmp_path_factory.mktemp("files") / "results.csv"
+    if old is not None:
+        path.write_bytes(old)
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(new[:fails_after])
+            assert temporary.suffix == path.suffix  # writers choose formats by it
+            if fails_after is not None:
+                raise ZeroDivisionError
+    except ZeroDivisionError:
+        expected = old
+    else:
+        expected = new
+    assert (path.read_bytes() if path.exists() else None) == expected
+    assert set(path.parent.iterdir()) <= {path}
+
+
+def test_a_full_disk_says_which_file_it_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OSError) as caught, atomic_write(tmp_path / "results.csv") as temporary:
+        temporary.write_text("half")
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "results.csv"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_json_is_read_as_it_was_written(tmp_path: Path) -> None:
+    content = {"text": "größer", "numbers": [1, 2.5, None], "nested": {"true": True}}
+    write_json(tmp_path / "a.json", content)
+    assert read_json(tmp_path / "a.json") == content
+
+
+@pytest.mark.parametrize("content", [None, b"{", b"\xff\xfe\x00", b""])
+def test_json_that_cannot_be_read_is_named(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=r"a\.json"):
+        read_json(path)
+
+
+def test_an_output_folder_is_made_and_cleared_of_what_a_kill_left(tmp_path: Path) -> None:
+    folder = output_folder(tmp_path / "deep" / "down")
+    (folder / "results.csv").write_text("whole")
+    (folder / ".hidden").write_text("somebody else's")
+    with atomic_write(folder / "plan.png") as temporary:
+        temporary.write_text("whole")
+        (folder / temporary.name.replace("plan", "killed")).write_text("half")
+    assert len(list(folder.iterdir())) == 4
+    assert output_folder(str(folder)) == folder
+    assert {path.name for path in folder.iterdir()} == {"results.csv", "plan.png", ".hidden"}
+
+
+def test_an_output_folder_below_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for place in ("file", "file/below"):
+        with pytest.raises(UserError, match=r"cannot be written .*: choose another with output=DIR"):
+            output_folder(tmp_path / place)

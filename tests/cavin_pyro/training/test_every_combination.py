@@ -1,0 +1,146 @@
+"""Every model with every guide, prior, objective and kind of scales: what fits learns, what does not says so."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pyro
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config import parts as building
+from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.training.elbo import elbo_terms
+from cavin_pyro.training.factory import build_objective
+from cavin_pyro.training.trainer import Trainer
+from models.networks.pointnet import PointNet
+
+CONF = Path(building.__file__).parent / "presets"
+MODELS, GUIDES, PRIORS, OBJECTIVES = (
+    sorted(path.stem for path in (CONF / group).glob("*.yaml")) for group in ("model", "guide", "prior", "objective")
+)
+FITTING = {
+    "cascaded": {"cascaded", "mean_field", "joint", "flow"},
+    "single_latent": {"single_latent"},
+    "flat": {"flat"},
+    "dynamics": {"none"},
+}
+COMBINATIONS_WITHOUT_CODES = {
+    ("dynamics", "none", "standard", "trace_elbo"),
+    ("dynamics", "none", "standard", "mean_field_elbo"),
+}
+ALL = list(itertools.product(MODELS, GUIDES, PRIORS, OBJECTIVES))
+VALID = [
+    names
+    for names in ALL
+    if names[1] in FITTING[names[0]] and (names[0] != "dynamics" or names in COMBINATIONS_WITHOUT_CODES)
+]
+# Of the combinations, `make test` trains those in which every two choices meet that could disagree with one another:
+# each guide with each prior, and each objective with each guide in turn. `make soak` trains all.
+REPRESENTATIVES = {
+    names
+    for names in VALID
+    if names[0] == "dynamics"
+    or (GUIDES.index(names[1]) + PRIORS.index(names[2])) % len(OBJECTIVES) == OBJECTIVES.index(names[3])
+}
+STEPS = TrainerConfig(steps=200, batch_size=16, learning_rate=3e-3, validate_every=200, validation_windows=64)
+
+
+def composed(model: str, guide: str, prior: str, objective: str, scales: str = "fixed") -> DictConfig:
+    overrides = [f"model={model}", f"guide={guide}", f"prior={prior}", f"objective={objective}", f"scales={scales}"]
+    overrides += ["model.width=8", *(["guide.width=8"] if guide != "none" else [])]
+    overrides += ["objective.elbo.num_particles=2"] if objective == "iwae" else []
+    return compose("train", *overrides)
+
+
+@pytest.fixture(scope="module")
+def windows(pushes: Path, tmp_path_factory: pytest.TempPathFactory) -> WindowTable:
+    torch.manual_seed(0)
+    own = shutil.copytree(pushes, tmp_path_factory.mktemp("combinations") / "pushes")  # features go there
+    settings = WindowConfig(validation_fraction=0.4, minimum_move=0.001, negative_fraction=1.0)
+    return load_windows([own], PointNet().requires_grad_(False).eval(), settings, seed=1)
+
+
+def validation_loss(model: Any, guide: Any, table: WindowTable) -> float:
+    torch.manual_seed(3)
+    with torch.no_grad():
+        return sum(value.item() for value in elbo_terms(model, guide, table.batch(table.validation)).values())
+
+
+def losses(config: DictConfig, table: WindowTable, folder: Path) -> tuple[float, float]:
+    """On held-out windows, before and after 200 steps."""
+    torch.manual_seed(0)
+    with pyro.settings.context(
+        module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False
+    ):
+        model = building.build_model(config)
+        guide = building.build_guide(config, model)
+        objective = build_objective(config, model)
+        before = validation_loss(model, guide, table)
+        Trainer(model, guide, objective, table, folder, lambda step, row: None, STEPS).run()
+        return before, validation_loss(model, guide, table)
+
+
+def test_every_preset_is_covered() -> None:
+    assert set(MODELS) == set(FITTING)
+    assert set(GUIDES) == set().union(*FITTING.values())
+    assert {"standard", "conditional", "flow"} <= set(PRIORS)
+    assert {"trace_elbo", "mean_field_elbo", "iwae", "counterfactual"} <= set(OBJECTIVES)
+
+
+def test_the_representatives_cover_every_guide_with_every_prior_and_every_objective() -> None:
+    pairs = {names[1:3] for names in VALID}
+    assert {names[1:3] for names in REPRESENTATIVES} == pairs
+    assert {names[3] for names in REPRESENTATIVES} == set(OBJECTIVES)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(names, id="-".join(names), marks=() if names in REPRESENTATIVES else pytest.mark.soak)
+        for names in VALID
+    ],
+)
+def test_compatible_combinations_learn(names: tuple[str, str, str, str], windows: WindowTable, tmp_path: Path) -> None:
+    before, after = losses(composed(*names), windows, tmp_path)
+    assert math.isfinite(after) and after < before - 1
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_incompatible_combinations_are_refused_in_one_line(model: str) -> None:
+    for names in ALL:
+        if names[0] == model and names not in VALID:
+            config = composed(*names)
+            with pytest.raises(UserError, match=r"(choose|leave)") as caught:
+                program = building.build_model(config)
+                building.build_guide(config, program)
+                build_objective(config, program)
+            assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_learned_scales_learn_with_every_model(model: str, windows: WindowTable, tmp_path: Path) -> None:
+    guide = sorted(FITTING[model])[0]
+    before, after = losses(composed(model, guide, "standard", "trace_elbo", "learned"), windows, tmp_path)
+    assert math.isfinite(after) and after < before - 1
+
+
+@pytest.mark.parametrize("option", ["objective.warm_up_steps=100", "objective.kl_weights.effect_code=0.5"])
+def test_weighted_kl_terms_learn(option: str, windows: WindowTable, tmp_path: Path) -> None:
+    config = composed("cascaded", "cascaded", "standard", "trace_elbo")
+    section, _, value = option.rpartition("=")
+    config_section: Any = config.objective
+    *path, last = section.split(".")[1:]
+    for name in path:
+        config_section = config_section[name]
+    config_section[last] = type(config_section[last])(value)
+    before, after = losses(config, windows, tmp_path)
+    assert math.isfinite(after) and after < before - 1

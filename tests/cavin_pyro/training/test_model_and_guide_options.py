@@ -1,0 +1,95 @@
+"""`model=` and `guide=` on the command line of train: every combination is built or refused."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import pytest
+import torch
+from hydra.utils import get_class
+from omegaconf import DictConfig
+from pyro.infer import Trace_ELBO
+from torch.nn import functional
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.training.elbo import elbo_terms, mean_terms
+from models.state import State, Window
+
+DYNAMICS = {"nll_next_centers", "nll_next_features"}
+SUBGOAL = {"nll_subgoal_centers", "nll_subgoal_features"}
+TERMS = {
+    "cascaded": {"kl_effect_code", "kl_motion_code", "nll_actions"} | SUBGOAL | DYNAMICS,
+    "single_latent": {"kl_effect_code", "nll_actions"} | SUBGOAL | DYNAMICS,
+    "flat": {"kl_motion_code", "nll_actions"} | DYNAMICS,
+    "dynamics": DYNAMICS,
+}
+CODES = {"cascaded": (16, 16), "single_latent": (32, None), "flat": (None, 32), "dynamics": (None, None)}
+
+
+def preset_names(group: str) -> list[str]:
+    folder = resources.files("cavin_pyro.config") / "presets" / group
+    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
+
+
+def configuration(*overrides: str) -> DictConfig:
+    return compose("train", *overrides)
+
+
+def window(batch: int = 6) -> Window:
+    """Some windows and transitions do not count."""
+    features = functional.normalize(torch.randn(batch, 4, 5, 64), dim=-1)
+    states = State(torch.rand(batch, 4, 5, 3), features, torch.ones(batch, 4, 5, dtype=torch.bool))
+    transition_mask = torch.arange(3 * batch).reshape(batch, 3) % 4 != 1
+    return Window(states, torch.rand(batch, 3, 4), transition_mask, torch.arange(batch) % 3 != 1)
+
+
+def test_every_model_of_the_paper_has_a_preset() -> None:
+    assert preset_names("model") == sorted(TERMS)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_codes_have_the_dimensions_of_the_paper(name: str) -> None:
+    model = build_model(configuration(f"model={name}"))
+    found = tuple(getattr(model, f"{kind}_dimension", None) for kind in ("effect", "motion"))
+    assert (model.name, found) == (name, CODES[name])
+
+
+@pytest.mark.parametrize("guide", preset_names("guide"))
+@pytest.mark.parametrize("name", TERMS)
+def test_a_model_and_guide_have_the_terms_of_the_model_or_are_refused(name: str, guide: str) -> None:
+    config = configuration(f"model={name}", f"guide={guide}")
+    model, fits = build_model(config), get_class(config.guide._target_).fits
+    if name not in fits:
+        choices = [option for option in preset_names("guide") if name in get_class(guide_class(option)).fits]
+        with pytest.raises(UserError) as caught:
+            build_guide(config, model)
+        assert str(caught.value) == (
+            f"guide {config.guide._target_} does not fit model {type(model).__name__} (it fits {', '.join(fits)}): "
+            f"choose guide= from {', '.join(choices)}"
+        )
+        return
+    programs, batch = (model, build_guide(config, model)), window()
+    torch.manual_seed(0)
+    loss = Trace_ELBO()(*programs)(batch)
+    torch.manual_seed(0)
+    terms = elbo_terms(*programs, batch)
+    torch.manual_seed(0)
+    means = mean_terms(*programs, batch)
+    assert terms.keys() == TERMS[name]
+    assert sum(value.item() for value in terms.values()) == pytest.approx(loss.item(), rel=1e-5)
+    counts = {term: 13 if term in DYNAMICS else 4 for term in terms}
+    assert means == pytest.approx({term: value.item() / counts[term] for term, value in terms.items()}, rel=1e-4)
+
+
+def guide_class(option: str) -> str:
+    return configuration(f"guide={option}").guide._target_
+
+
+@pytest.mark.parametrize("weight", ["0", "-1", "0.0"])
+def test_the_balance_of_states_and_actions_is_a_positive_number(weight: str) -> None:
+    config = configuration("model=single_latent", f"model.action_weight={weight}")
+    with pytest.raises(UserError, match=f"^action_weight must be a positive number, not {weight}$"):
+        build_model(config)
+    assert build_model(configuration("model=single_latent", "model.action_weight=2")).action_weight == 2

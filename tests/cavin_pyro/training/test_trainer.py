@@ -1,0 +1,266 @@
+"""The training loop on windows made up here; `test_resuming.py` kills the command itself."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pyro
+import pytest
+import torch
+from pyro.infer import Trace_ELBO
+from torch import Tensor, nn
+from torch.nn import functional
+
+from cavin_pyro.config.commands.training import TrainerConfig
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.windows import WindowTable
+from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.training.objectives import Objective
+from cavin_pyro.training.trainer import Row, Trainer, read_rows
+from models.state import State
+
+SHORT = TrainerConfig(steps=8, batch_size=4, validate_every=2, validation_windows=10, learning_rate=1e-2)
+Hook = Callable[[Trainer, int], None]
+
+
+@pytest.fixture(autouse=True)
+def without_validation() -> Iterator[None]:
+    """As the command does, so that a NaN reaches the loss."""
+    with pyro.settings.context(validate_distributions_pyro=False, validate_distributions_torch=False):
+        yield
+
+
+def windows(episodes: int = 10, positions: int = 6) -> WindowTable:
+    """Everything counts; the last three episodes are for validation."""
+    generator = torch.Generator().manual_seed(0)
+    count = episodes * positions
+    start = torch.rand(count, 5, 3, generator=generator)
+    features = functional.normalize(torch.randn(count, 5, 64, generator=generator), dim=-1)
+    states = State(start, features, torch.ones(count, 5, dtype=torch.bool))
+    actions = 2 * torch.rand(count, 4, generator=generator) - 1
+    table = WindowTable(states, actions, torch.ones(count, dtype=torch.bool))
+    starts = [episode * positions + step for episode in range(episodes) for step in range(positions - 3)]
+    table.starts = torch.tensor(starts)
+    table.sequence_mask = torch.ones(len(starts), dtype=torch.bool)
+    table.training, table.validation = torch.arange(len(starts)).split([len(starts) - 9, 9])
+    return table
+
+
+def trainer(
+    small: SimpleNamespace, folder: Path, config: TrainerConfig = SHORT, hook: Hook | None = None, seed: int = 0
+) -> Trainer:
+    """A trainer of a small cascade; the hook is called after each checkpoint."""
+    parts = small.parts()
+
+    def save(step: int, row: Row) -> None:
+        save_checkpoint(folder / "checkpoint.safetensors", parts=parts, config={}, provenance={"step": step})
+        if hook is not None:
+            hook(run, step)
+
+    folder.mkdir(exist_ok=True)
+    programs = (parts["model"], parts["guide"], Objective(Trace_ELBO()))
+    run = Trainer(*programs, windows(), folder, save, config, seed=seed)
+    return run
+
+
+def weights(run: Trainer) -> Tensor:
+    both = nn.ModuleList([run.model, run.guide])
+    return nn.utils.parameters_to_vector(both.parameters()).detach().clone()
+
+
+def without_speed(rows: list[Row]) -> list[Row]:
+    return [{name: value for name, value in row.items() if name != "windows_per_second"} for row in rows]
+
+
+def test_a_constant_learning_rate_stays() -> None:
+    settings = TrainerConfig(steps=100, learning_rate=1e-3)
+    assert {settings.rate(step) for step in (0, 50, 99)} == {1e-3}
+
+
+def test_a_cosine_falls_from_the_learning_rate_to_a_hundredth() -> None:
+    settings = TrainerConfig(steps=100, learning_rate=1e-3, schedule="cosine")
+    rates = [settings.rate(step) for step in range(101)]
+    assert rates[0] == 1e-3
+    assert rates[50] == pytest.approx(0.505e-3)
+    assert rates[100] == pytest.approx(1e-5)
+    assert all(later < earlier for earlier, later in itertools.pairwise(rates))
+
+
+def test_the_optimizer_follows_the_schedule(small: SimpleNamespace, tmp_path: Path) -> None:
+    settings = TrainerConfig(**{**vars(SHORT), "schedule": "cosine"})
+    run = trainer(small, tmp_path / "run", settings)
+    run.run()
+    (group,) = run._optimizer.param_groups
+    assert group["lr"] == settings.rate(7)
+    assert [row["learning_rate"] for row in run.rows] == [settings.rate(step) for step in (2, 4, 6, 8)]
+
+
+def test_training_lowers_the_loss_and_reports_every_term(small: SimpleNamespace, tmp_path: Path) -> None:
+    run = trainer(small, tmp_path / "run", TrainerConfig(**{**vars(SHORT), "steps": 40}))
+    run.run()
+    losses = [row["validation_loss"] for row in run.rows]
+    assert losses[-1] < losses[0] - 10
+    assert run.best == min(losses)
+    with open(tmp_path / "run" / "metrics.csv", newline="") as file:
+        names = next(csv.reader(file))
+    sites = ["subgoal_centers", "subgoal_features", "actions", "next_centers", "next_features"]
+    terms = [f"validation_nll_{site}" for site in sites] + [
+        "validation_kl_effect_code",
+        "validation_kl_motion_code",
+    ]
+    assert {"step", "training_loss", "validation_loss", "learning_rate", "windows_per_second", *terms} == set(names)
+    assert read_rows(tmp_path / "run" / "metrics.csv") == run.rows
+    assert list((tmp_path / "run" / "tensorboard").iterdir())
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").provenance == {"step": run.best_step}
+    assert not pyro.get_param_store().keys()
+
+
+def test_equal_seeds_give_equal_weights_and_others_do_not(small: SimpleNamespace, tmp_path: Path) -> None:
+    runs = []
+    for number, seed in enumerate((0, 0, 1)):
+        run = trainer(small, tmp_path / str(number), seed=seed)
+        run.run()
+        runs.append(weights(run))
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0], runs[2])
+
+
+def test_validation_does_not_disturb_training(small: SimpleNamespace, tmp_path: Path) -> None:
+    often = trainer(small, tmp_path / "often", TrainerConfig(**{**vars(SHORT), "validate_every": 1}))
+    often.run()
+    seldom = trainer(small, tmp_path / "seldom", TrainerConfig(**{**vars(SHORT), "validate_every": 8}))
+    seldom.run()
+    assert torch.equal(weights(often), weights(seldom))
+    assert often.rows[-1]["validation_loss"] == seldom.rows[-1]["validation_loss"]
+    mean = sum(row["training_loss"] for row in often.rows) / 8
+    assert seldom.rows[-1]["training_loss"] == pytest.approx(mean)
+
+
+def test_validation_always_uses_the_same_noise(small: SimpleNamespace, tmp_path: Path) -> None:
+    run = trainer(small, tmp_path / "run", TrainerConfig(**{**vars(SHORT), "learning_rate": 0.0}))
+    run.run()
+    assert len({row["validation_loss"] for row in run.rows}) == 1
+    terms = [value for name, value in run.rows[0].items() if name.startswith(("validation_nll", "validation_kl"))]
+    # Every window counts here, and each holds three transitions.
+    latent = [value for name, value in run.rows[0].items() if name.startswith("validation_") and "next" not in name]
+    dynamics = sum(terms) - sum(value for value in latent if value != run.rows[0]["validation_loss"])
+    assert run.rows[0]["validation_loss"] == pytest.approx(sum(terms) + 2 * dynamics, rel=1e-5)
+
+
+def test_gradients_are_clipped(small: SimpleNamespace, tmp_path: Path) -> None:
+    """Adam forgets the size of a gradient, except where it is small beside its epsilon of 1e-8."""
+    free = trainer(small, tmp_path / "free")
+    before = weights(free)
+    free.run()
+    clipped = trainer(small, tmp_path / "clipped", TrainerConfig(**{**vars(SHORT), "clip_norm": 1e-20}))
+    clipped.run()
+    assert (weights(free) - before).abs().max() > 1e-3
+    assert (weights(clipped) - before).abs().max() < 1e-9
+
+
+def test_training_stops_when_patience_is_lost(small: SimpleNamespace, tmp_path: Path) -> None:
+    settings = TrainerConfig(**{**vars(SHORT), "steps": 100, "learning_rate": 0.0, "patience": 3})
+    run = trainer(small, tmp_path / "run", settings)
+    run.run()
+    assert run.best_step == 2  # never better again
+    assert run.step == 2 * (1 + 3)
+
+
+@pytest.mark.parametrize("broken_after", [2, 4, 6])
+def test_an_interrupted_run_resumes_as_if_it_had_not_been_interrupted(
+    broken_after: int, small: SimpleNamespace, tmp_path: Path
+) -> None:
+    def stop(run: Trainer, step: int) -> None:
+        if step == broken_after:
+            raise KeyboardInterrupt
+
+    whole = trainer(small, tmp_path / "whole")
+    whole.run()
+    assert [row["step"] for row in whole.rows] == [2, 4, 6, 8]
+    with pytest.raises(KeyboardInterrupt):
+        trainer(small, tmp_path / "broken", hook=stop).run()
+    assert not (tmp_path / "broken" / "metrics.csv").exists() or broken_after > 2
+    resumed = trainer(small, tmp_path / "broken")
+    resumed.run()
+    assert torch.equal(weights(resumed), weights(whole))
+    assert without_speed(resumed.rows) == without_speed(whole.rows)
+    assert (resumed.best, resumed.best_step, resumed.stale) == (whole.best, whole.best_step, whole.stale)
+
+
+def test_a_finished_run_is_not_run_again(small: SimpleNamespace, tmp_path: Path) -> None:
+    trainer(small, tmp_path / "run").run()
+
+    def fail(run: Trainer, step: int) -> None:
+        raise AssertionError("trained again")
+
+    again = trainer(small, tmp_path / "run", hook=fail)
+    again.run()
+    assert (again.step, len(again.rows)) == (8, 4)
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing of the kind"])
+def test_a_damaged_resume_file_is_named(content: bytes, small: SimpleNamespace, tmp_path: Path) -> None:
+    trainer(small, tmp_path / "run").run()
+    (tmp_path / "run" / "resume.safetensors").write_bytes(content)
+    with pytest.raises(UserError, match=r"resume\.safetensors is damaged .* delete it to start again"):
+        trainer(small, tmp_path / "run").run()
+
+
+def poison(choose: Callable[[Trainer], Tensor]) -> Hook:
+    """Puts a NaN into a parameter after the checkpoint of step 4."""
+
+    def hook(run: Trainer, step: int) -> None:
+        if step == 4:
+            with torch.no_grad():
+                choose(run).view(-1)[0] = math.nan
+
+    return hook
+
+
+@pytest.mark.parametrize(
+    ("choose", "term"),
+    [
+        (lambda run: run.model.action_generator.starts[-2].bias, "nll_actions"),
+        (lambda run: run.model.meta_dynamics.change.head.bias, "nll_subgoal_centers"),
+        (lambda run: run.model.dynamics.change.head.bias, "nll_next_centers"),
+        (lambda run: run.guide.effect_inference.code.head.bias, "kl_effect_code"),
+        (lambda run: run.guide.motion_inference.code.head.bias, "kl_motion_code"),
+    ],
+)
+def test_a_nan_stops_training_with_its_term_and_the_last_good_checkpoint_stays(
+    choose: Callable[[Trainer], Tensor], term: str, small: SimpleNamespace, tmp_path: Path
+) -> None:
+    run = trainer(small, tmp_path / "run", hook=poison(choose))
+    with pytest.raises(UserError) as caught:
+        run.run()
+    assert f"the term {term} is not finite; the best checkpoint, of step 4, stays" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    checkpoint = load_checkpoint(tmp_path / "run" / "checkpoint.safetensors")
+    assert checkpoint.provenance == {"step": 4}
+    assert all(bool(value.isfinite().all()) for value in checkpoint.tensors.values())
+
+
+def test_a_nan_that_validation_finds_first_is_neither_recorded_nor_resumed_from(
+    small: SimpleNamespace, tmp_path: Path
+) -> None:
+    run = trainer(small, tmp_path / "run")
+    run.windows._states.centers[run.windows.starts[run.windows.validation]] = math.nan  # none for training
+    with pytest.raises(UserError, match="is not finite; there is no checkpoint yet: look at the data"):
+        run.run()
+    assert not list((tmp_path / "run").glob("*.safetensors"))
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+
+
+def test_a_gradient_that_is_not_finite_is_named(small: SimpleNamespace, tmp_path: Path) -> None:
+    run = trainer(small, tmp_path / "run")
+    head = run.model.dynamics.change.head.weight
+    head.register_hook(lambda gradient: gradient * math.inf)
+    before = weights(run)
+    with pytest.raises(UserError, match="the term gradient is not finite; there is no checkpoint yet"):
+        run.run()
+    assert torch.equal(weights(run), before)

@@ -1,0 +1,148 @@
+"""`viewer=rerun`: what a recording holds, read back with rerun's own reader."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyro
+import pytest
+from numpy.typing import NDArray
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.plan import main
+from cavin_pyro.visualization import rendering
+from cavin_pyro.visualization.rendering import check_viewer
+from cavin_pyro.visualization.video import FRAMES_PER_SECOND, PAUSE
+from envs.workspace import push_endpoints
+
+PUSHES = 4  # at most
+FRAMES = 8  # per push that is carried out
+TRANSLATION, POINTS = "Transform3D:translation", "Points3D:positions"
+
+
+@pytest.fixture(scope="module")
+def rerun() -> Any:
+    return pytest.importorskip(
+        "rerun", reason="rerun-sdk is not installed: it comes with the extras test and viewer", exc_type=ImportError
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(rerun: Any, checkpoint_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command leaves with `viewer=rerun`."""
+    output = tmp_path_factory.mktemp("recording") / "episode"
+    overrides = ["task=insertion", "objects=2", f"maximum_steps={PUSHES}", "planner.samples=16", "seed=1"]
+    overrides += [
+        "planner.horizon=6",
+        "viewer=rerun",
+        "video=false",
+        f"checkpoint={checkpoint_file}",
+        f"output={output}",
+    ]
+    names = ("module_local_params", "validate_distributions_pyro", "validate_distributions_torch")
+    kept = {name: pyro.settings.get(name) for name in names}  # which setting up an episode changes
+    with pyro.settings.context(**kept), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["plan", *overrides])
+        main()
+    return output
+
+
+@pytest.fixture(scope="module")
+def changing(rerun: Any, folder: Path) -> Callable[[str, str], dict[float, NDArray[np.float64]]]:
+    """The values of a component by their time in seconds."""
+    recording = rerun.dataframe.load_recording(folder / "episode.rrd")
+
+    def read(entity: str, component: str) -> dict[float, NDArray[np.float64]]:
+        table = recording.view(index="video", contents=f"/{entity}").select().read_all()
+        seconds = table.column("video").cast("int64").to_pylist()
+        values = table.column(f"/{entity}:{component}").to_pylist()
+        return {
+            round(1e-9 * second, 6): np.array(value)
+            for second, value in zip(seconds, values, strict=True)
+            if value is not None
+        }
+
+    return read
+
+
+@pytest.fixture(scope="module")
+def steps(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "steps.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_recording_holds_the_world_the_observations_and_the_plans(rerun: Any, folder: Path) -> None:
+    recording = rerun.dataframe.load_recording(folder / "episode.rrd")
+    found = {(column.entity_path, column.component) for column in recording.schema().component_columns()}
+    for name in ("target", "obstacle_1"):
+        assert (f"/world/objects/{name}", "Transform3D:translation") in found
+        assert (f"/world/observed/points/{name}", "Points3D:positions") in found
+    shapes = {path.rpartition("/")[0] for path, component in found if component == "Mesh3D:vertex_positions"}
+    assert shapes > {"/world/table", "/world/objects/target", "/world/objects/obstacle_1"}
+    assert any(path.startswith("/world/robot/") for path in shapes)
+    assert ("/world/plan/candidates", "Points3D:colors") in found
+    assert ("/world/plan/pushes", "Arrows3D:vectors") in found
+    assert any(path.startswith("/world/plan/subgoals/") for path, _ in found)
+    assert {("/world/tiles/goal", "LineStrips3D:strips"), ("/camera", "EncodedImage:blob")} < found
+    assert not [path for path in folder.iterdir() if "partial" in path.name]
+
+
+def test_arrows_are_drawn_where_the_tool_moved(changing: Callable, steps: list[dict[str, str]]) -> None:
+    origins, vectors = (
+        changing("world/plan/pushes", "Arrows3D:origins"),
+        changing("world/plan/pushes", "Arrows3D:vectors"),
+    )
+    decided = [index for index, step in enumerate(steps) if step["planning_ms"]]
+    assert len(origins) == len(vectors) == len(decided)
+    for index, start, way in zip(decided, origins.values(), vectors.values(), strict=True):
+        action = np.array([float(steps[index][name]) for name in ("x", "y", "dx", "dy")])
+        first, last = push_endpoints(action)
+        np.testing.assert_allclose(start[0, :2], first, atol=1e-3)
+        np.testing.assert_allclose(start[0, :2] + way[0, :2], last, atol=1e-3)
+
+
+def test_candidates_have_the_colours_of_their_returns(changing: Callable) -> None:
+    positions = changing("world/plan/candidates", "Points3D:positions")
+    colors = changing("world/plan/candidates", "Points3D:colors")
+    assert [len(places) for places in positions.values()] == [len(shades) for shades in colors.values()]
+    assert all(len(places) > 10 for places in positions.values())
+
+
+def test_physics_is_recorded_at_the_videos_moments(changing: Callable, steps: list[dict[str, str]]) -> None:
+    poses = changing("world/robot/body_3/base", TRANSLATION)  # after the table and two objects
+    carried_out = sum(not int(step["unsafe"]) for step in steps)
+    decided = sum(bool(step["planning_ms"]) for step in steps)
+    assert carried_out > 0
+    last = max(changing("world/observed/centers", "Points3D:positions"))
+    assert last == pytest.approx(PAUSE * decided + FRAMES * carried_out / FRAMES_PER_SECOND)
+    low = [pose for pose in poses.values() if pose[0, 2] < 0.2]  # on the table
+    assert FRAMES * carried_out - carried_out <= len(low) <= FRAMES * carried_out
+    # Objects lie where they are seen: above the table, and the cloud is theirs.
+    target, seen = (
+        changing(*of) for of in (("world/objects/target", TRANSLATION), ("world/observed/points/target", POINTS))
+    )
+    assert np.linalg.norm(target[0.0][0, :2] - seen[0.0][:, :2].mean(axis=0)) < 0.05
+
+
+def test_no_viewer_is_the_default_and_an_unknown_one_is_refused() -> None:
+    check_viewer(None)
+    with pytest.raises(UserError, match=r"^unknown viewer 'screen': choose from rerun, or null for none$"):
+        check_viewer("screen")
+
+
+def test_a_viewer_that_is_not_installed_says_how_to_install_it_and_nothing_is_written(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(rendering.VIEWERS, "rerun", "no_such_module")
+    monkeypatch.setattr("sys.argv", ["plan", "viewer=rerun", f"output={tmp_path / 'episode'}"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: viewer=rerun needs an optional part that is not installed")
+    assert "python -m pip install" in line and "'.[viewer]'" in line
+    assert not list(tmp_path.iterdir())

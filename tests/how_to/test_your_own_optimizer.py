@@ -1,0 +1,101 @@
+"""docs/how-to/your-own-optimizer.md: its code and its commands, taken from the page and run in a folder of a user's."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from planning.optimizers import Optimizer
+from tests.cavin_pyro.conftest import ROOT, run_command
+
+PAGE = (ROOT / "docs" / "how-to" / "your-own-optimizer.md").read_text(encoding="utf-8")
+(CODE,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
+FOLLOWS = " ..."  # in the page's table: the line goes on
+TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
+SHORT = {  # options that make each of the page's commands a matter of seconds
+    "plan": ("maximum_steps=2", "planner.samples=32", "video=false"),
+    "evaluate": ("episodes=2", "maximum_steps=2", "planner.samples=32"),
+}
+
+
+def own(**options: Any) -> Optimizer:
+    """The page's optimizer."""
+    made: dict[str, Any] = {}
+    exec(compile(CODE, "my_lab.py", "exec"), made)
+    optimizer: Optimizer = made["EvolutionStrategy"](**options)
+    return optimizer
+
+
+def is_told(line: str) -> bool:
+    """Whether the page's table has the line, or its beginning."""
+    return any(
+        line == told or (told.endswith(FOLLOWS) and line.startswith(told.removesuffix(FOLLOWS))) for told in TOLD
+    )
+
+
+def test_the_class_is_short() -> None:
+    (found,) = (node for node in ast.parse(CODE).body if isinstance(node, ast.ClassDef))
+    assert found.end_lineno is not None and found.end_lineno - found.lineno + 1 <= 30
+
+
+def test_it_finds_more_than_shooting_with_the_same_samples(toy: Any) -> None:
+    state, far = toy.scenes([[(0.0, 0.0)]] * 8), toy.GoalDisc(goal=(10.0, 0.0), dense=True)
+    ours, theirs = (
+        toy.plain(toy.PointMass(), far, samples=256, horizon=12, optimizer=optimizer).plan(
+            state, toy.generators(*range(8))
+        )
+        for optimizer in (own(), "shooting")
+    )
+    assert ours.expected_return.mean() > theirs.expected_return.mean()
+
+
+def test_it_goes_on_from_the_last_plan(toy: Any) -> None:
+    state, reward = toy.scenes([[(0.0, 0.0)]]), toy.GoalDisc(goal=(0.6, 0.0))
+    planner = toy.plain(toy.PointMass(), reward, samples=64, horizon=15, optimizer=own(), warm_start=True)
+    many = toy.plain(toy.PointMass(), reward, samples=4096, horizon=15, optimizer="evolution", warm_start=True)
+    last = many.plan(state, toy.generators(1))
+    assert last.expected_success.all()
+    assert planner.plan(state, toy.generators(2), last).expected_success.all()
+
+
+@pytest.mark.parametrize(("command", "options"), LINES)
+def test_the_commands_of_the_page_work(command: str, options: str, tmp_path: Path) -> None:
+    (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
+    words = shlex.split(options)
+    done = run_command(command, *words, *SHORT[command], folder=tmp_path)
+    assert done.status == 0, done.errors
+    (output,) = (word.removeprefix("output=") for word in words if word.startswith("output="))
+    assert any((tmp_path / output).iterdir())
+
+
+def test_an_argument_that_it_does_not_take_is_told_as_the_page_says(tmp_path: Path) -> None:
+    (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
+    words = "planner.optimizer._target_=my_lab.EvolutionStrategy", "+planner.optimizer.depth=3"
+    answer = run_command("plan", *words, "output=never", folder=tmp_path)
+    assert answer.status == 2
+    (line,) = answer.complaints
+    assert is_told(line.removeprefix("error: ")), line
+
+
+class Narrow:
+    def optimize(self, problem: Any, samples: int) -> None:
+        problem(problem.noise(128)[..., :4])
+
+
+class Idle:
+    def optimize(self, problem: Any, samples: int) -> None:
+        pass
+
+
+@pytest.mark.parametrize("optimizer", [object(), Narrow(), Idle()], ids=["no optimizer", "narrow", "idle"])
+def test_mistakes_are_told_as_the_page_says(optimizer: Any, toy: Any) -> None:
+    state = toy.scenes([[(0.0, 0.0)]])
+    with pytest.raises(ValueError) as error:
+        toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.6, 0.0)), optimizer=optimizer).plan(state, toy.generators(1))
+    assert is_told(str(error.value)), str(error.value)

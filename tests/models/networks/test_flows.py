@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import pyro
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from pyro import poutine
+from pyro.distributions import Normal
+from torch import Tensor
+from torch.autograd.functional import jacobian
+
+from models.networks.flows import CodeFlow
+
+both_ways = pytest.mark.parametrize("from_base", [True, False])
+
+
+def randomized(flow: CodeFlow, size: float = 0.5) -> CodeFlow:
+    """In float64, with weights far from the identity."""
+    for parameter in flow.double().parameters():
+        torch.nn.init.normal_(parameter, std=size)
+    return flow
+
+
+def numbers(*shape: int) -> Tensor:
+    return torch.randn(shape, dtype=torch.float64)
+
+
+def standard(*shape: int) -> Normal:
+    return Normal(torch.zeros(shape, dtype=torch.float64), 1.0).to_event(1)
+
+
+@both_ways
+@pytest.mark.parametrize("dimension", [1, 2, 5])
+def test_a_new_flow_is_the_identity(dimension: int, from_base: bool) -> None:
+    flow = CodeFlow(dimension, 3, width=8, from_base=from_base).double()
+    base, context = Normal(numbers(4, dimension), numbers(4, dimension).exp()).to_event(1), numbers(4, 3)
+    changed = flow(base, context)
+    torch.manual_seed(1)
+    sampled = changed.rsample()
+    torch.manual_seed(1)
+    assert torch.equal(sampled, base.rsample())
+    assert torch.equal(changed.log_prob(sampled), base.log_prob(sampled))
+    assert torch.equal(changed.log_prob(sampled + 1), base.log_prob(sampled + 1))
+
+
+@both_ways
+@pytest.mark.parametrize("dimension", [1, 2, 5])
+def test_the_density_follows_from_the_jacobian(dimension: int, from_base: bool) -> None:
+    """A code is a function of its noise z = mean + epsilon, and log q(code) = log N(z) - log |d code / d z|."""
+    flow = randomized(CodeFlow(dimension, 3, width=8, from_base=from_base))
+    mean, context = numbers(dimension), numbers(3)
+
+    def code(mean: Tensor) -> Tensor:
+        torch.manual_seed(1)
+        return flow(Normal(mean, 1.0).to_event(1), context).rsample()
+
+    torch.manual_seed(1)
+    epsilon = numbers(dimension)
+    log_normal = -0.5 * epsilon.square().sum() - 0.5 * dimension * math.log(2 * math.pi)
+    expected = log_normal - jacobian(code, mean).det().abs().log()
+    found = flow(Normal(mean, 1.0).to_event(1), context).log_prob(code(mean))
+    assert (expected - log_normal).abs() > 0.05
+    assert found.item() == pytest.approx(expected.item(), rel=1e-9)
+
+
+@both_ways
+def test_the_density_sums_to_one(from_base: bool) -> None:
+    distribution = randomized(CodeFlow(2, 3, width=8, from_base=from_base), size=0.3)(standard(2), numbers(3))
+    axis = torch.linspace(-30, 30, 601, dtype=torch.float64)
+    with torch.no_grad():
+        mass = distribution.log_prob(torch.cartesian_prod(axis, axis)).exp().sum() * (axis[1] - axis[0]) ** 2
+    assert mass.item() == pytest.approx(1, abs=1e-3)
+
+
+@both_ways
+def test_the_last_sample_is_scored_as_any_other_code(from_base: bool) -> None:
+    flow = randomized(CodeFlow(5, 3, width=8, from_base=from_base))
+    distribution = flow(standard(4, 5), numbers(4, 3))
+    sampled = distribution.rsample()
+    scores = [distribution.log_prob(sampled), distribution.log_prob(sampled.clone())]
+    gradients = [torch.autograd.grad(score.sum(), list(flow.parameters()), retain_graph=True) for score in scores]
+    assert torch.allclose(*scores, rtol=1e-10)
+    assert all(torch.allclose(*pair, atol=1e-10) for pair in zip(*gradients, strict=True))
+
+
+def test_codes_sampled_without_gradients_are_scored_with_them() -> None:
+    """As wake-sleep does."""
+    flow = randomized(CodeFlow(5, 3, width=8, from_base=True))
+    distribution = flow(standard(4, 5), numbers(4, 3))
+    with torch.no_grad():
+        sampled = distribution.rsample()
+    assert distribution.log_prob(sampled).requires_grad
+
+
+@given(
+    batch=st.lists(st.integers(1, 3), max_size=2),
+    samples=st.lists(st.integers(1, 3), max_size=2),
+    from_base=st.booleans(),
+)
+def test_each_element_of_a_batch_has_its_own_context(batch: list[int], samples: list[int], from_base: bool) -> None:
+    flow = randomized(CodeFlow(3, 2, width=8, from_base=from_base))
+    context = numbers(*batch, 2)
+    distribution = flow(standard(*batch, 3), context)
+    sampled = distribution.rsample(samples)
+    assert (distribution.batch_shape, distribution.event_shape) == ((*batch,), (3,))
+    assert sampled.shape == (*samples, *batch, 3)
+    scores = distribution.log_prob(sampled)
+    assert scores.shape == (*samples, *batch)
+    one = flow(standard(3), context[(0,) * len(batch)])
+    first = (0,) * (len(samples) + len(batch))
+    assert torch.allclose(one.log_prob(sampled[first]), scores[first])
+    wider = distribution.expand((2, *batch))
+    assert torch.allclose(wider.log_prob(sampled[(0,) * len(samples)])[1], scores[(0,) * len(samples)])
+
+
+def test_one_code_is_scored_under_many_contexts() -> None:
+    flow, code, contexts = randomized(CodeFlow(3, 2, width=8)), numbers(3), numbers(6, 4, 2)
+    scores = flow(standard(6, 4, 3), contexts).log_prob(code)
+    assert scores.shape == (6, 4)
+    assert torch.allclose(scores[5, 2], flow(standard(3), contexts[5, 2]).log_prob(code))
+
+
+def test_in_a_plate_with_particles_and_a_mask() -> None:
+    flow, mask = randomized(CodeFlow(3, 2, width=8, from_base=True)), torch.tensor([True, False, True, True])
+    distribution = flow(standard(4, 3), numbers(4, 2))
+
+    def program() -> None:
+        with pyro.plate("particles", 5, dim=-2), pyro.plate("windows", 4, dim=-1), poutine.mask(mask=mask):
+            pyro.sample("code", distribution)
+
+    traced = poutine.trace(program).get_trace()
+    traced.compute_log_prob()
+    site = traced.nodes["code"]
+    assert site["value"].shape == (5, 4, 3)
+    assert torch.allclose(site["log_prob"], distribution.log_prob(site["value"].clone()) * mask)
+
+
+@both_ways
+def test_samples_depend_on_the_global_seed_alone(from_base: bool) -> None:
+    distribution = randomized(CodeFlow(3, 2, width=8, from_base=from_base))(standard(4, 3), numbers(4, 2))
+    repeats = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        repeats.append(distribution.sample())
+    torch.manual_seed(1)
+    assert torch.allclose(distribution.rsample(), repeats[0])
+    assert torch.equal(repeats[0], repeats[1])
+    assert not torch.equal(repeats[0], repeats[2])
+    assert not repeats[0].requires_grad
+
+
+def test_arguments_of_distributions_are_checked_as_before() -> None:
+    program = (
+        "from torch.distributions import Distribution, Normal\n"
+        "for checked in (True, False):\n"
+        "    Distribution.set_default_validate_args(checked)\n"
+        "    [sys.modules.pop(name) for name in list(sys.modules) if name.startswith(('zuko', 'models'))]\n"
+        "    import models.networks.flows\n"
+        "    assert Normal(0.0, 1.0)._validate_args is checked, checked\n"
+    )
+    subprocess.run([sys.executable, "-c", f"import pyro, sys\n{program}"], check=True)

@@ -1,0 +1,179 @@
+"""Compiled planning says what direct planning says, makes no code twice, and plans several environments at once."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from models.state import State
+from planning import CvaeMpcPlanner, PerturbedRollouts, Plan
+from planning.backends import chunking
+from planning.backends.compiled import Compiled
+from planning.backends.eager import eager
+from planning.inputs import NoFiniteCandidateError
+from tests.compiler import needs_a_compiler
+
+
+class Pair(NamedTuple):
+    left: Tensor
+    right: Tensor | None
+
+
+def scaled(pair: Pair, factor: float, power: int) -> tuple[Pair, Tensor]:
+    left = factor * pair.left**power
+    return Pair(left, pair.right), left.sum()
+
+
+def rounded_product(layer: torch.nn.Linear, numbers: Tensor) -> Tensor:
+    return layer(numbers)
+
+
+def branching(numbers: Tensor) -> Tensor:
+    return numbers if bool(numbers.any()) else -numbers
+
+
+def tensors(plan: Plan) -> list[Tensor]:
+    return [tensor for field in plan for tensor in (field if isinstance(field, State) else (field,))]
+
+
+@needs_a_compiler
+def test_code_is_made_once_for_each_constant_and_shape() -> None:
+    backend, numbers = Compiled(), torch.tensor([1.0, 2.0, 3.0])
+    cases = [
+        (numbers, None, 2.0, 2),
+        (numbers + 1, None, 2.0, 3),  # other numbers, and another count
+        (numbers, None, 0.5, 2),
+        (numbers[:2], None, 2.0, 2),
+    ]
+    for left, right, factor, power in cases:
+        expected, (pair, total) = (call(scaled, Pair(left, right), factor, power) for call in (eager, backend))
+        torch.testing.assert_close(pair.left, expected[0].left)
+        torch.testing.assert_close(total, expected[1])
+        assert isinstance(pair, Pair)
+        assert (pair.right is None) == (right is None)
+    assert len(backend._versions) == 3
+
+
+@needs_a_compiler
+def test_code_is_for_numbers_as_they_lie_in_memory() -> None:
+    backend, numbers = Compiled(), torch.arange(12.0).reshape(3, 4)
+    for left in (numbers, numbers.t().contiguous().t(), numbers[:1].expand(3, 4), numbers):
+        pair, total = backend(scaled, Pair(left, left[0]), 3.0, 1)
+        torch.testing.assert_close((*pair, total), (3 * left, left[0], 3 * left.sum()))
+
+
+@needs_a_compiler
+def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32() -> None:
+    torch.manual_seed(0)
+    layer, numbers = torch.nn.Linear(64, 64), torch.randn(32, 64)
+    backend = Compiled()
+    with torch.inference_mode():
+        torch.set_float32_matmul_precision("highest")
+        exact = layer(numbers)
+        torch.testing.assert_close(backend(rounded_product, layer, numbers), exact)
+        torch.set_float32_matmul_precision("medium")
+        rounded = backend(rounded_product, layer, numbers)
+    assert rounded.dtype == torch.float32
+    assert torch.equal(rounded, rounded.bfloat16().float())
+    torch.testing.assert_close(rounded, exact, rtol=0.02, atol=0.02)
+
+
+@needs_a_compiler
+def test_what_cannot_be_compiled_is_one_clear_line() -> None:
+    with pytest.raises(ValueError, match=r"^compile=true: branching cannot be compiled: .*$"):
+        Compiled()(branching, torch.zeros(2))
+
+
+def test_no_compiler_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "nowhere++")
+    with pytest.raises(ValueError, match=r"^compile=true needs a C\+\+ compiler, and 'nowhere\+\+' was not found: "):
+        Compiled()
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("threads", [1, 3])
+def test_each_keeps_the_order_and_the_number_of_threads(threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        counts = Compiled().each(lambda item: (item, torch.get_num_threads()), range(7))
+        assert [item for item, _ in counts] == list(range(7))
+        assert {count for _, count in counts} == {1}
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_what_an_item_complains_of_is_heard() -> None:
+    def infinite(item: int) -> int:
+        if item == 2:
+            raise NoFiniteCandidateError(item, "nothing to choose")
+        return item
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(NoFiniteCandidateError, match="^environment 2: nothing to choose$"):
+            Compiled().each(infinite, range(5))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+@needs_a_compiler
+def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
+    toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.set_float32_matmul_precision("highest")
+    monkeypatch.setattr(Distribution, "_validate_args", True)  # as torch has it, and other tests may not
+    monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", 1)
+    state = toy.scenes([[(0.1 * number, 0.0), (0.3, 0.2)] for number in range(4)], gains=(1.0, 0.0))
+    direct, compiled = (
+        toy.plain(
+            toy.PointMass(),
+            toy.GoalDisc(goal=(0.4, 0.1), forbidden_below=-0.05),
+            samples=64,
+            horizon=9,
+            warm_start=True,
+            robustness=PerturbedRollouts(candidates=16, rollouts=2, rounds=2),
+            compile=compile,
+        )
+        for compile in (False, True)
+    )
+    expected = direct.plan(state, toy.generators(*range(4)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)  # so that two environments are planned at once
+    try:
+        found = compiled.plan(state, toy.generators(*range(4)))
+        alone = compiled.plan(state.scene(slice(2, 3)), toy.generators(2))
+    finally:
+        torch.set_num_threads(threads)
+    for ours, theirs, one in zip(tensors(found), tensors(expected), tensors(alone), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+        assert torch.equal(ours[2:3], one)
+    # The first segment of effects, the others, the same of motions, and the perturbed rollouts.
+    assert len(compiled.backend._versions) == 5  # type: ignore[attr-defined]
+    assert Distribution._validate_args
+
+
+def test_the_episode_decides_what_is_rewarded(toy: SimpleNamespace) -> None:
+    class Changing:
+        """A reward that changes from episode to episode."""
+
+        current = toy.GoalDisc(goal=(0.1, 0.0))
+
+        def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> object:
+            return self.current(previous, centers, mask)
+
+    planner = CvaeMpcPlanner(toy.Flat(), Changing(), samples=256, horizon=3)  # type: ignore[arg-type]
+    state = toy.scenes([[(0.0, 0.0)]])
+    for goal in (0.1, -0.1, 0.1):
+        Changing.current = toy.GoalDisc(goal=(goal, 0.0))
+        plan = planner.plan(state, toy.generators(0))
+        assert plan.expected_success.all()
+        assert (plan.predicted_centers[0, :, 0, 0] - goal).abs().min() < 0.05

@@ -1,0 +1,81 @@
+"""Effective sizes, adaptive temperatures and shares of the samples."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from planning.optimizers.weights import adapt_temperature, effective_sample_size, samples_of_iteration
+
+INFINITE = float("inf")
+
+
+def test_effective_size_counts_equal_weights_and_nothing_else() -> None:
+    logarithms = torch.tensor([[0.0, 0.0, 0.0, 0.0], [3.0, 3.0, -INFINITE, -INFINITE], [-INFINITE] * 4])
+    torch.testing.assert_close(effective_sample_size(logarithms), torch.tensor([4.0, 2.0, 0.0]))
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    seed=st.integers(0, 10_000),
+    fraction=st.sampled_from([0.1, 0.3, 0.5, 0.9]),
+    scale=st.sampled_from([1e-4, 1.0, 1e4]),
+    failed=st.integers(0, 100),
+)
+def test_the_temperature_keeps_the_fraction_of_the_living_and_hardly_more(
+    seed: int, fraction: float, scale: float, failed: int
+) -> None:
+    returns = scale * torch.randn(1, 200, generator=torch.Generator().manual_seed(seed))
+    returns[:, :failed] = -INFINITE
+    inverse, logarithms = adapt_temperature(returns, fraction)
+    size, valid = effective_sample_size(logarithms), 200 - failed
+    assert fraction * valid <= size <= (fraction + 0.25) * valid  # temperatures are tried on a grid
+    assert (logarithms[:, :failed] == -INFINITE).all()
+    expected = torch.softmax(inverse[:, None] * (returns - returns.max()), -1)
+    torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
+
+
+def test_what_candidates_were_drawn_by_is_divided_out() -> None:
+    returns = torch.tensor([[0.0, -1.0, -2.0, -3.0]])
+    before = 0.7 * returns
+    inverse, logarithms = adapt_temperature(returns, 0.5, before=before)
+    expected = torch.softmax(inverse * returns - before.double(), -1)
+    torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
+
+
+def test_where_many_share_the_highest_return_the_temperature_is_no_lower_than_it_takes() -> None:
+    returns = torch.cat([torch.full((1, 50), 95.0), torch.full((1, 50), -6.0)], -1)
+    inverse, logarithms = adapt_temperature(returns, 0.3)
+    assert 50 <= effective_sample_size(logarithms) <= 55
+    assert inverse < 10 / 101
+
+
+def test_one_violation_does_not_hide_the_differences_among_the_others() -> None:
+    returns = torch.cat([torch.tensor([[-1e3]]), 1e-3 * torch.linspace(-1, 0, 99)[None]], -1)
+    _, logarithms = adapt_temperature(returns, 0.3)
+    assert 30 <= effective_sample_size(logarithms) <= 50
+
+
+def test_equal_returns_weigh_the_same() -> None:
+    _, logarithms = adapt_temperature(torch.full((1, 5), -30.0), 0.3)
+    assert len(logarithms.unique()) == 1
+
+
+def test_where_nothing_counts_there_are_no_weights() -> None:
+    inverse, logarithms = adapt_temperature(torch.full((1, 5), -INFINITE), 0.3)
+    assert inverse.isfinite().all()
+    assert (logarithms == -INFINITE).all()
+
+
+@settings(max_examples=50)
+@given(samples=st.integers(1, 5000), iterations=st.integers(1, 20))
+def test_iterations_share_the_samples_evenly_and_completely(samples: int, iterations: int) -> None:
+    if samples < iterations:
+        with pytest.raises(ValueError, match=f"^{iterations} iterations need at least as many samples"):
+            samples_of_iteration(samples, iterations, 0)
+        return
+    shares = [samples_of_iteration(samples, iterations, number) for number in range(iterations)]
+    assert sum(shares) == samples
+    assert max(shares) - min(shares) <= 1
