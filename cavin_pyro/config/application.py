@@ -6,11 +6,13 @@ def main(config: DictConfig) -> None: ...
 
 from __future__ import annotations
 
+import argparse
 import errno
 import importlib.util
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -77,11 +79,10 @@ def _stop(line: str, status: int) -> NoReturn:
 
 def _help_or_check(name: str, purpose: str) -> bool:
     """Check the overrides of the command line before Hydra's own application reads them; whether help was all."""
-    from cavin_pyro.config.command_line import read
     from cavin_pyro.config.composition import check_overrides, presets_by_name, sweeps
 
     sys.argv[1:] = presets_by_name(sys.argv[1:])
-    line = read(sys.argv[1:])
+    line = read_command_line(sys.argv[1:])
     for overrides in sweeps(line.overrides) if line.multirun else [line.overrides]:
         config = check_overrides(name, overrides, line.config_dir)
     if line.help:
@@ -89,6 +90,42 @@ def _help_or_check(name: str, purpose: str) -> bool:
 
         print(help_page(name, purpose, config))
     return line.help
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """What stands after a command's name. config_dir: a folder of presets of the user's own."""
+
+    overrides: list[str]
+    help: bool
+    version: bool
+    multirun: bool
+    config_dir: str | None
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}: --help lists the options")
+
+
+def read_command_line(words: Sequence[str]) -> CommandLine:
+    """Tell overrides from flags.
+
+    Raises:
+        UserError: a flag without its value.
+    """
+    parser = _Parser(add_help=False, allow_abbrev=False)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("--help", "-h", action="store_true")
+    parser.add_argument("--version", action="store_true")
+    parser.add_argument("--multirun", "-m", action="store_true")
+    parser.add_argument("--config-dir", "-cd")
+    for flag in (["--cfg", "-c"], ["--package", "-p"], ["--config-path", "-cp"], ["--config-name", "-cn"]):
+        parser.add_argument(*flag)
+    parser.add_argument("--info", "-i", nargs="?")
+    known, others = parser.parse_known_intermixed_args(list(words))
+    overrides = [*known.overrides, *(word for word in others if not word.startswith("-"))]
+    return CommandLine(overrides, known.help, known.version, known.multirun, known.config_dir)
 
 
 def _run(name: str, body: Body, config: DictConfig) -> None:

@@ -29,6 +29,9 @@ from guides.guide import Guide
 from models.model import Model
 from models.state import Window
 
+# Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
+ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum_move", "negative_fraction")
+
 
 def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the words `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
@@ -100,7 +103,9 @@ def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowCo
         UserError: the checkpoint does not tell them.
     """
     try:
-        windows = configured(WindowConfig, checkpoint.config["windows"], "windows")
+        stored = checkpoint.config["windows"]
+        # A default in place of a value that lacks would hold out other windows.
+        windows = configured(WindowConfig, {**stored, **{name: stored[name] for name in ALWAYS_STORED}}, "windows")
         return windows, int(checkpoint.config["model"]["segment_length"]), int(checkpoint.config["seed"])
     except (AttributeError, KeyError, TypeError) as error:
         raise UserError(

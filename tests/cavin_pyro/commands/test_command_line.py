@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from cavin_pyro import __main__ as listing
 from cavin_pyro import __version__, plan
-from cavin_pyro.config.command_line import read
+from cavin_pyro.config.application import read_command_line
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.composition import check_overrides, compose
 from cavin_pyro.config.errors import UserError
@@ -72,7 +72,7 @@ def _plain(command: str) -> dict:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_examples_of_help_are_valid(command: str) -> None:
     for overrides in EXAMPLES[command]:
-        line = read(overrides.split())
+        line = read_command_line(overrides.split())
         if not line.multirun:
             compose(command, *line.overrides)
 

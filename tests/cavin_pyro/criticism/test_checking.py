@@ -13,6 +13,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
+from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
@@ -76,7 +77,8 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
 ) -> None:
     context, about = load_context(check_config("windows=1000"))
     checkpoint = load_checkpoint(trained)
-    table = load_windows([pushes], context.pointnet, trained_windows(checkpoint, trained))
+    windows, segment_length, seed = trained_windows(checkpoint, trained)
+    table = load_windows([pushes], context.pointnet, windows, segment_length=segment_length, seed=seed)
     for name in ("training", "validation"):
         window = getattr(context, name)
         counted = getattr(table, name)[table.sequence_mask[getattr(table, name)]]
@@ -145,11 +147,15 @@ def test_checkpoints_that_cannot_be_checked_are_refused_with_the_reason(small: S
         {},
         {"windows": WINDOWS},
         {"windows": {"negative_fraction": 0.2}, "seed": 0},
+        {"windows": {}, "seed": 0},
         {"windows": 3, "seed": 0},
+        {"windows": None, "seed": 0},
+        {"windows": [], "seed": 0},
     ):
         with pytest.raises(UserError, match="does not tell which windows its training held out"):
             trained_windows(saved(parts, {**config, **wrong}), path)
-    assert trained_windows(saved(parts, {**config, "windows": WINDOWS, "seed": 7}), path).seed == 7
+    told = trained_windows(saved(parts, {**config, "windows": WINDOWS, "seed": 7}), path)
+    assert told == (WindowConfig(**WINDOWS, held_out_objects=[]), 3, 7)
 
 
 def test_sections_are_chosen_by_name_and_run_in_the_reports_order(monkeypatch: pytest.MonkeyPatch) -> None:
