@@ -37,17 +37,17 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace) -> None:
     """Collect some transitions and report."""
-    settings = CollectionConfig(seed=1, object_set=arguments.objects, assets=arguments.assets, camera=arguments.camera)
-    scene = open_scene(settings)
-    collect_episode(scene, settings, 10**6)  # meshes are written and libraries loaded
+    config = CollectionConfig(seed=1, object_set=arguments.objects, assets=arguments.assets, camera=arguments.camera)
+    scene = open_scene(config)
+    collect_episode(scene, config, 10**6)  # meshes are written and libraries loaded
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     made, episode, shard, size, writing = 0, 0, 0, 0, 0.0
     wall, cpu = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         while made < arguments.transitions:
             episodes = []
-            while len(episodes) < settings.episodes_per_shard and made < arguments.transitions:
-                episodes.append(collect_episode(scene, settings, episode))
+            while len(episodes) < config.episodes_per_shard and made < arguments.transitions:
+                episodes.append(collect_episode(scene, config, episode))
                 made, episode = made + int(episodes[-1]["length"]), episode + 1
             began, path = time.process_time(), shard_path(Path(folder), shard)
             write_shard(path, {name: np.stack([one[name] for one in episodes]) for name in episodes[0]})

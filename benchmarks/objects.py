@@ -56,14 +56,14 @@ def creep(scene: Scene) -> np.ndarray:
 def main() -> None:
     name, assets, *numbers = sys.argv[1:]
     wanted, count = [*map(int, numbers), *(1000, 0)[len(numbers) :]]
-    settings = CollectionConfig(seed=1)
+    config = CollectionConfig(seed=1)
     scene = Scene(object_set=load_object_set(name, assets))
     found: dict[str, list[float]] = defaultdict(list)
     watch, made, falls = Watch(scene), 0, 0
     for episode in range(10**9):
-        drawing, acting = np.random.default_rng([settings.seed, episode]).spawn(2)
+        drawing, acting = np.random.default_rng([config.seed, episode]).spawn(2)
         began = time.process_time()
-        observation = scene.sample([WHOLE_TABLE] * (count or 1 + episode % 5), settings.ranges, drawing)
+        observation = scene.sample([WHOLE_TABLE] * (count or 1 + episode % 5), config.ranges, drawing)
         found["reset, ms"].append(1e3 * (time.process_time() - began))
         for body in scene.bodies:
             depths = [-contact[8] for contact in scene.world._bullet.getContactPoints(body, 0)]
@@ -71,9 +71,9 @@ def main() -> None:
         if episode % 20 == 0:
             found["creep in a second, mm"].extend(1e3 * creep(scene))
         policy = HeuristicPushingPolicy(
-            acting, intent_length=settings.intent_length, perturbation_rate=settings.perturbation_rate
+            acting, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
         )
-        for _ in range(settings.steps):
+        for _ in range(config.steps):
             action = policy.act(observation) if episode % 5 else acting.uniform(-1.0, 1.0, 4)
             watch.settling = 0
             began = time.process_time()

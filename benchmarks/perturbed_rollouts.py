@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.evaluation.factory import set_up
+from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.rollout import observed_state
 from planning.extensions import perturbed_rollouts as extension
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts, sequential_halving
@@ -48,7 +48,7 @@ def problems(objects: int, episodes: int, pushes: int) -> list[PlanningProblem]:
         asked.append(PlanningProblem(given, options))
         return sequential_halving(*given, **options)
 
-    one = set_up(compose("evaluate", "task=crossing", f"objects={objects}", "reward=sparse"))
+    one = make_runner(compose("evaluate", "task=crossing", f"objects={objects}", "reward=sparse"))
     with mock.patch.object(extension, "sequential_halving", recorded):
         for seed in range(10000, 10000 + episodes):
             observation, _ = one.env.reset(seed=seed)

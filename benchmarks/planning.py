@@ -1,6 +1,6 @@
 """What a plan costs: `python benchmarks/planning.py [--quick]`.
 
-Milliseconds per plan with the shipped checkpoint, direct and compiled (`planner.compile=true`), the floating-point
+Milliseconds per plan with the shipped checkpoint, eager and compiled (`planner.compile=true`), the floating-point
 operations in it, and the share of this machine's own rate of float32 matrix products that planning reaches; then the
 flat problem (30 pushes searched at once, the same dynamics, reward and samples) for our MPC and two public planners.
 Wall time, all in turn, medians and the fastest; crossing, sparse, horizon 30, T = 3, the first scenes of 16 episodes,
@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.evaluation.factory import Setup, set_up
+from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import observed_state
 from envs.tasks import TaskReward
 from models.state import State
@@ -38,12 +38,12 @@ SCENES = 16  # also the larger batch
 FEATURES = 64
 
 
-def setup(objects: int, samples: int, *overrides: str) -> Setup:
+def runner(objects: int, samples: int, *overrides: str) -> EpisodeRunner:
     shared = ["task=crossing", f"objects={objects}", f"planner.samples={samples}", f"planner.horizon={HORIZON}"]
-    return set_up(compose("evaluate", *overrides, *shared))
+    return make_runner(compose("evaluate", *overrides, *shared))
 
 
-def scenes(one: Setup, count: int) -> State:
+def scenes(one: EpisodeRunner, count: int) -> State:
     """`count` scenes as the camera sees them: [count, M, ...]."""
     states = [observed_state(one.env.reset(seed=seed)[0], one.pointnet) for seed in range(count)]
     return State(*(torch.cat(field) for field in zip(*states, strict=True)))
@@ -105,7 +105,7 @@ def planners(objects: int, samples: int, ways: list[str]) -> tuple[dict[str, Any
     """A planner for each of the `ways`, and the scenes that they plan for."""
     found: dict[str, Any] = {}
     for way in ways:
-        one = setup(objects, samples, f"planner.compile={str(way == 'compiled').lower()}")
+        one = runner(objects, samples, f"planner.compile={str(way == 'compiled').lower()}")
         found[way], state = one.planner, scenes(one, SCENES)
         one.env.close()
     if "compiled" in found:
@@ -122,7 +122,7 @@ def grid(samples: list[int], objects: list[int], repetitions: int, ways: list[st
     for count in samples:
         for number in objects:
             found, state = planners(number, count, ways)
-            work = operations(planning(found["direct"], state, 1)) / SCENES
+            work = operations(planning(found["eager"], state, 1)) / SCENES
             for batch in (1, SCENES):
                 rate = matrix_rate()  # anew each time: where cores are shared, it changes by the minute
                 actions = {way: planning(found[way], state, batch) for way in (*ways, *plain)}
@@ -141,9 +141,9 @@ def next_state(model: PlanningModel, state: State, action: Tensor) -> State:
 class FlatProblem:
     """f and the reward as functions of a flat state `[..., M * 67]`, as the public planners want them."""
 
-    def __init__(self, one: Setup, state: State) -> None:
+    def __init__(self, one: EpisodeRunner, state: State) -> None:
         planner: MpcPlanner = one.planner  # type: ignore[assignment]
-        self.model, self.engine, self.mask = planner.model, planner.engine, state.mask[0]
+        self.model, self.backend, self.mask = planner.model, planner.backend, state.mask[0]
         self.reward = TaskReward(one.task)
         self.objects = state.objects
         self.start = torch.cat((state.centers[0], state.features[0]), -1).flatten()
@@ -153,7 +153,7 @@ class FlatProblem:
         return State(parts[..., :3], parts[..., 3:], self.mask.expand(parts.shape[:-1]))
 
     def step(self, flat: Tensor, action: Tensor) -> Tensor:
-        after = self.engine(next_state, self.model, self.unpack(flat), action)
+        after = self.backend(next_state, self.model, self.unpack(flat), action)
         return torch.cat((after.centers, after.features), -1).flatten(-2)
 
     def rewards(self, before: Tensor, after: Tensor) -> Tensor:
@@ -218,15 +218,15 @@ def cem_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
 
 
 def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
-    print("the flat problem, 3 objects: ms per plan; all call the same f, direct or compiled by our engine")
+    print("the flat problem, 3 objects: ms per plan; all call the same f, eager or compiled by our backend")
     for count in samples:
-        setups = {
+        runners = {
             # No margin: all maximise the task's own reward.
-            way: setup(3, count, "planner=mpc", "margin=0", f"planner.compile={str(way == 'compiled').lower()}")
+            way: runner(3, count, "planner=mpc", "margin=0", f"planner.compile={str(way == 'compiled').lower()}")
             for way in ways
         }
         ours, theirs = {}, {}
-        for way, one in setups.items():
+        for way, one in runners.items():
             problem = FlatProblem(one, scenes(one, 1))
             ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1), 1)
             theirs[f"pytorch_mppi, f {way}"] = mppi_planner(problem, count)
@@ -237,7 +237,7 @@ def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
             times = ", ".join(f"{median / spent[own].median:.2f}" for own in ours)
             ratios = "" if name in ours else f"; over ours {times}"
             print(f"{count:7d} samples  {name:25s} {median:8.1f} ({fastest:.1f}){ratios}", flush=True)
-        for one in setups.values():
+        for one in runners.values():
             one.env.close()
 
 
@@ -248,7 +248,7 @@ def main() -> None:
     parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
     arguments = parser.parse_args()
-    ways = ["direct"] if arguments.no_compile else ["direct", "compiled"]
+    ways = ["eager"] if arguments.no_compile else ["eager", "compiled"]
     samples, objects, repetitions = ([32], [2], 2) if arguments.quick else ([256, 1024, 8192], [1, 3, 5], 4)
     if not arguments.no_grid:
         grid(samples, objects, repetitions, ways)

@@ -27,7 +27,7 @@ from scipy.stats import binomtest, bootstrap
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.collection import clutter_area
-from cavin_pyro.evaluation.factory import Setup, set_up
+from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.sampling import WHOLE_TABLE, ObjectRanges
 from envs.observation import MINIMUM_PIXELS, Observation
@@ -187,15 +187,15 @@ class Watched:
 
 
 @cache
-def task_setup(task: str, objects: int) -> Setup:
+def task_runner(task: str, objects: int) -> EpisodeRunner:
     world = ("env.camera=kinect2", "env.segmentation=clusters")
-    return set_up(compose("evaluate", f"task={task}", f"objects={objects}", "reward=sparse", *world))
+    return make_runner(compose("evaluate", f"task={task}", f"objects={objects}", "reward=sparse", *world))
 
 
 def one_task(_: Scene, number: int, picture: Pictures) -> dict[str, Any]:
     """Tasks and numbers of objects take turns."""
     task, objects = TASKS[number % 3], (3, 5)[number // 3 % 2]
-    one = task_setup(task, objects)
+    one = task_runner(task, objects)
     scene = one.env.scene
     if not isinstance(scene.segmenter, Watched):
         scene.segmenter = Watched(scene.segmenter, scene, picture)

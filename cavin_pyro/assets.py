@@ -36,9 +36,9 @@ def _run() -> None:
     parser.add_argument(
         "--source", metavar="URL", help="a mirror in place of the publisher's site, same paths below it"
     )
-    words = parser.parse_args()
-    kind = kinds[words.kind]
-    print(install(kind, words.to, site(words.source or kind.site)))
+    arguments = parser.parse_args()
+    kind = kinds[arguments.kind]
+    print(install(kind, arguments.to, site(arguments.source or kind.site)))
 
 
 if __name__ == "__main__":

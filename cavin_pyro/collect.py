@@ -29,14 +29,14 @@ def main(config: DictConfig) -> None:
             f"maximum_objects must be between minimum_objects={config.minimum_objects} and {MAXIMUM_OBJECTS}, "
             f"not {config.maximum_objects}"
         )
-    settings = replace(
+    collection = replace(
         collecting_world(config.env),
         **{one.name: config[one.name] for one in fields(CollectionOptions)},
     )
     folder = output_folder(config.output)
     if config.repair:
-        print(f"{repair(settings, folder)} files collected again")
-    metadata = collect(settings, folder, transitions=config.transitions, workers=config.workers)
+        print(f"{repair(collection, folder)} files collected again")
+    metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
     summary = summarize_data(folder)
     write_json(folder / "statistics.json", summary.figures())
     draw_data(folder / "statistics.png", summary)

@@ -12,19 +12,19 @@ def main(config: DictConfig) -> None:
     """Plan and execute an episode of each task with the shipped checkpoint, from depth images alone."""
     import copy
 
-    from cavin_pyro.evaluation.factory import set_up
+    from cavin_pyro.evaluation.factory import make_runner
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import write_config
     from cavin_pyro.visualization.rendering import render_episode
 
     for task in config.tasks:
-        words = copy.deepcopy(config)
-        words.task = task
-        setup = set_up(copy.deepcopy(words), render=True)
+        options = copy.deepcopy(config)
+        options.task = task
+        runner = make_runner(copy.deepcopy(options), render=True)
         folder = output_folder(f"{config.output}/{task}")
-        write_config(folder, words)
-        row = render_episode(setup, folder, seed=config.seed, video=True)
-        setup.env.close()
+        write_config(folder, options)
+        row = render_episode(runner, folder, seed=config.seed, video=True)
+        runner.env.close()
         print(f"{task}: {row['outcome']} after {row['steps']} pushes")
         for what, name in (("picture", "plan.png"), ("from above", "plan-above.png"), ("video", "episode.mp4")):
             print(f"  {what:<11}{folder / name}", flush=True)

@@ -15,21 +15,21 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
     from cavin_pyro.evaluation.evaluation import evaluate
-    from cavin_pyro.evaluation.factory import set_up
+    from cavin_pyro.evaluation.factory import make_runner
     from cavin_pyro.evaluation.statistics import summarize, table
     from cavin_pyro.storage.files import atomic_write, output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
-    setup = set_up(copy.deepcopy(config))  # bad input is told before anything is written
-    setup.env.close()
+    runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
+    runner.env.close()
     others = earlier_rows(Path(config.compare), config) if config.compare else []
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
     write_config(folder, config)
     results = summarize(evaluate(config, folder))
     text = table(
-        results, f"{setup.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
+        results, f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
     )
     if others:
         comparison = compare(results["per_episode"], others)

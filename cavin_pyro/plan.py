@@ -13,7 +13,7 @@ def main(config: DictConfig) -> None:
     import copy
     from pathlib import Path
 
-    from cavin_pyro.evaluation.factory import announce_waiting, set_up
+    from cavin_pyro.evaluation.factory import announce_waiting, make_runner
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -21,14 +21,14 @@ def main(config: DictConfig) -> None:
 
     check_viewer(config.viewer)
     check_same_run(Path(config.output), config, ignore=("output", "video", "viewer"))
-    setup = set_up(copy.deepcopy(config), render=True)
+    runner = make_runner(copy.deepcopy(config), render=True)
     folder = output_folder(config.output)
     write_config(folder, config)
     announce_waiting(config)
-    row = render_episode(setup, folder, seed=config.seed, video=config.video, viewer=config.viewer)
-    setup.env.close()
+    row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
+    runner.env.close()
     write_json(folder / "results.json", {**row, "provenance": provenance()})
-    print(f"{setup.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
+    print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
     for name in episode_files(video=config.video, viewer=config.viewer):
         print(f"  {folder / name}")
 

@@ -33,7 +33,7 @@ def main(config: DictConfig) -> None:
         held_out_objects=config.held_out_objects,
     )
     folder = output_folder(config.output)
-    settings = write_config(folder, config)
+    stored_config = write_config(folder, config)
     losses = pretrain(
         autoencoder,
         clouds,
@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
     )
     record = {**provenance(), "clouds": len(clouds), "losses": losses}
     parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}
-    save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=settings, provenance=record)
+    save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=stored_config, provenance=record)
     write_json(folder / "metrics.json", record)
     draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
     print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")

@@ -96,7 +96,7 @@ class ModelRequirements:
     excluded: tuple[str, ...] = ()
 
     def violation(self, model: object) -> str | None:
-        """In words, what `model` lacks or has besides; None if it fits."""
+        """What `model` lacks or must not have, for an error line; None if it fits."""
         missing = [name for name in self.methods if not hasattr(model, name)]
         superfluous = [name for name in self.excluded if hasattr(model, name)]
         if missing:

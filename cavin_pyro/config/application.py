@@ -94,7 +94,7 @@ def _help_or_check(name: str, purpose: str) -> bool:
 
 @dataclass(frozen=True)
 class CommandLine:
-    """What stands after a command's name. config_dir: a folder of presets of the user's own."""
+    """The arguments after a command's name. config_dir: a folder of presets of the user's own."""
 
     overrides: list[str]
     help: bool
@@ -108,8 +108,8 @@ class _Parser(argparse.ArgumentParser):
         raise UserError(f"{message}: --help lists the options")
 
 
-def read_command_line(words: Sequence[str]) -> CommandLine:
-    """Tell overrides from flags.
+def read_command_line(arguments: Sequence[str]) -> CommandLine:
+    """Separate overrides from flags.
 
     Raises:
         UserError: a flag without its value.
@@ -123,8 +123,8 @@ def read_command_line(words: Sequence[str]) -> CommandLine:
     for flag in (["--cfg", "-c"], ["--package", "-p"], ["--config-path", "-cp"], ["--config-name", "-cn"]):
         parser.add_argument(*flag)
     parser.add_argument("--info", "-i", nargs="?")
-    known, others = parser.parse_known_intermixed_args(list(words))
-    overrides = [*known.overrides, *(word for word in others if not word.startswith("-"))]
+    known, others = parser.parse_known_intermixed_args(list(arguments))
+    overrides = [*known.overrides, *(one for one in others if not one.startswith("-"))]
     return CommandLine(overrides, known.help, known.version, known.multirun, known.config_dir)
 
 

@@ -38,7 +38,7 @@ HEADINGS = {  # of the groups, in the order of the page
     "data": "Data",
     "training": "Training",
     "trainer": "Trainer",
-    "windows": "Windows: what is learned from",
+    "windows": "Training windows",
     "world": "World",
     "objects": "Objects",
     "run": "Run",
@@ -63,10 +63,10 @@ def help_page(name: str, purpose: str, config: DictConfig) -> str:
     lines = [f"python -m cavin_pyro.{name} [option=value ...]     (cavin_pyro {__version__})", ""]
     lines += textwrap.wrap(" ".join(inspect.cleandoc(purpose).split()), WIDTH)
     lines += ["", "Examples"]
-    lines += [f"  python -m cavin_pyro.{name} {words}".rstrip() for words in EXAMPLES[name]]
+    lines += [f"  python -m cavin_pyro.{name} {overrides}".rstrip() for overrides in EXAMPLES[name]]
     chosen = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     own = {group: choice for group, choice in chosen.items() if presets(group) and group not in unread}
-    lines += ["", "Presets: one word for several options, which are listed below"]
+    lines += ["", "Presets: each sets several options, which are listed below"]
     for group, choice in own.items():
         lines += _entry(f"{group}={choice}", f"one of {', '.join(presets(group))}")
     declared = [one for one in options(COMMANDS[name]) if one.name.partition(".")[0] not in unread]
@@ -94,7 +94,7 @@ def help_page(name: str, purpose: str, config: DictConfig) -> str:
 
 
 def presets(group: str) -> list[str]:
-    """The words for a group of presets, such as `planner`; none if it is not ours."""
+    """The choices in a group of presets, such as `planner`; none for a group that is not ours."""
     folder = resources.files("cavin_pyro.config.presets").joinpath(group)
     if group.startswith("hydra") or not folder.is_dir():
         return []

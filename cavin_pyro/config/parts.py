@@ -114,12 +114,12 @@ def class_of(config: Config) -> Any:
 
 
 def _guides_for(model_name: str) -> list[str]:
-    """Words for `guide=` that fit a model."""
-    words = []
+    """The choices of `guide=` that fit a model."""
+    names = []
     presets = resources.files("cavin_pyro.config") / "presets" / "guide"
     for file in sorted(presets.iterdir(), key=lambda entry: entry.name):
         if file.name.endswith(".yaml"):
             guide = class_of(yaml.safe_load(file.read_text(encoding="utf-8")))
             if model_name in guide.fits:
-                words.append(file.name.removesuffix(".yaml"))
-    return words
+                names.append(file.name.removesuffix(".yaml"))
+    return names

@@ -1,4 +1,4 @@
-"""From the words `env.*` to the parts of the world."""
+"""The parts of the world from the options `env.*`."""
 
 from __future__ import annotations
 
@@ -60,26 +60,26 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     with user_input():
         objects = load_object_set(env.objects, env.assets)
     every = tuple(dict.fromkeys(map(plain_name, objects.names)))
-    for word in ("names", "target"):
-        if not isinstance(ranges[word], list | None):
-            raise UserError(f"env.ranges.{word} must be a list of objects, not {ranges[word]}")
-        ranges[word] = tuple(ranges[word] or (every if word == "names" else ()))
+    for name in ("names", "target"):
+        if not isinstance(ranges[name], list | None):
+            raise UserError(f"env.ranges.{name} must be a list of objects, not {ranges[name]}")
+        ranges[name] = tuple(ranges[name] or (every if name == "names" else ()))
         try:
-            chosen(ranges[word], objects)
+            chosen(ranges[name], objects)
         except ValueError as error:
-            raise UserError(str(error).replace(":", f" in env.ranges.{word}:", 1)) from error
-    for word in ("scale", "mass", "friction", "kilograms"):
-        ranges[word] = _pair(f"env.ranges.{word}", ranges[word]) if ranges[word] or word != "kilograms" else None
-    for word in ("clearance", "drop_height"):
-        if not isinstance(ranges[word], int | float) or not ranges[word] >= 0:
-            raise UserError(f"env.ranges.{word} must be at least 0 metres, not {ranges[word]}")
+            raise UserError(str(error).replace(":", f" in env.ranges.{name}:", 1)) from error
+    for name in ("scale", "mass", "friction", "kilograms"):
+        ranges[name] = _pair(f"env.ranges.{name}", ranges[name]) if ranges[name] or name != "kilograms" else None
+    for name in ("clearance", "drop_height"):
+        if not isinstance(ranges[name], int | float) or not ranges[name] >= 0:
+            raise UserError(f"env.ranges.{name} must be at least 0 metres, not {ranges[name]}")
     return ObjectRanges(**ranges)
 
 
-def _pair(word: str, value: Any) -> tuple[float, float]:
+def _pair(name: str, value: Any) -> tuple[float, float]:
     numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
     if not numbers or not 0 < value[0] <= value[1]:
-        raise UserError(f"{word} must be two positive numbers, low then high, not {value}")
+        raise UserError(f"{name} must be two positive numbers, low then high, not {value}")
     return value[0], value[1]
 
 

@@ -22,7 +22,7 @@ from cavin_pyro.data.world import collecting_world
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
 from cavin_pyro.storage.pointnet import check_fit, pointnet_of
 from cavin_pyro.storage.provenance import provenance
-from cavin_pyro.storage.run_directory import with_fingerprint
+from cavin_pyro.storage.run_directory import with_current_keys
 from cavin_pyro.training.factory import data_folders
 from envs.workspace import MAXIMUM_OBJECTS
 from guides.guide import Guide
@@ -34,7 +34,7 @@ ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum
 
 
 def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
-    """Read what the words `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
+    """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
     Windows are chosen and held out with the checkpoint's own configuration and seed, so that the held-out episodes are
     those that its training held out.
@@ -133,28 +133,31 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     metadata, fingerprint = read_metadata(folder), content_fingerprint(folder)
     entries = trained.get("data")
     same, verdict = _verdict(metadata, fingerprint, entries if isinstance(entries, list) else [])
-    seed = metadata["settings"].get("seed")
+    seed = metadata["configuration"].get("seed")
     found = {"folder": str(folder), "transitions": metadata["transitions"], "seed": seed, "fingerprint": fingerprint}
     return {**found, "same": same, "verdict": verdict}
 
 
 def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[Any]) -> tuple[bool | None, str]:
-    entries = [with_fingerprint(entry) for entry in entries if isinstance(entry, dict)]
+    entries = [with_current_keys(entry) for entry in entries if isinstance(entry, dict)]
     if not entries:
-        return None, "the checkpoint does not tell what it was trained on"
-    wanted = metadata["settings"]
-    same_settings = [entry for entry in entries if with_current_names(entry.get("settings") or {}) == wanted]
-    if not same_settings:
-        return False, "the model was trained on other data: none of these episodes is known to it"
-    entry = next((entry for entry in same_settings if entry.get("fingerprint") == fingerprint), same_settings[0])
+        return None, "the checkpoint does not say what it was trained on"
+    wanted = metadata["configuration"]
+    same_configuration = [entry for entry in entries if with_current_names(entry.get("configuration") or {}) == wanted]
+    if not same_configuration:
+        return False, "the model was trained on other data, on none of these episodes"
+    entry = next(
+        (entry for entry in same_configuration if entry.get("fingerprint") == fingerprint), same_configuration[0]
+    )
     grown = (
         "" if entry.get("transitions") == metadata["transitions"] else f", of which it saw {entry.get('transitions')}"
     )
     if entry.get("fingerprint") == fingerprint:
         return True, f"the model was trained on these{grown}"
     if "fingerprint" in entry:
-        return False, "collected with the settings of the training data, but by another program: other episodes"
-    return None, f"settings and seed are those of the training data{grown}; whether the content is, it does not tell"
+        return False, "collected with the configuration of the training data, but by another program: other episodes"
+    unknown = "the checkpoint does not say whether the content is"
+    return None, f"configuration and seed are those of the training data{grown}; {unknown}"
 
 
 def _objective(config: Mapping[str, Any]) -> str | None:

@@ -30,9 +30,9 @@ def record(
     pointnet: PointNet, world: CollectionConfig, *, episodes: int, steps: int, objects: int, seed: int
 ) -> Recording:
     """Simulate `episodes` of up to `steps` pushes with at most `objects` objects, by the policy that collects data."""
-    settings = replace(world, seed=SEED + seed, steps=steps, maximum_objects=objects)
-    with closing(open_scene(settings)) as scene:
-        rows = [collect_episode(scene, settings, number) for number in range(episodes)]
+    config = replace(world, seed=SEED + seed, steps=steps, maximum_objects=objects)
+    with closing(open_scene(config)) as scene:
+        rows = [collect_episode(scene, config, number) for number in range(episodes)]
     arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     made = np.arange(steps + 1) <= arrays["length"][:, None]  # [E, S + 1]
     # A fall ends an episode, and what has fallen is no longer a state of the table.

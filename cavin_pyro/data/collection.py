@@ -47,28 +47,28 @@ class CollectionConfig(CollectionOptions):
 
 
 def collect(
-    settings: CollectionConfig,
+    config: CollectionConfig,
     folder: Path,
     *,
     transitions: int = CollectConfig.transitions,
     workers: int = CollectConfig.workers,
 ) -> dict[str, Any]:
-    """Collect whole shards until at least `transitions` pushes are on disk; go on where an earlier run stopped.
+    """Collect whole shards until at least `transitions` pushes are on disk; resume an earlier run.
 
     Shards are computed in parallel, but committed in order by this process alone: the metadata count a shard only
-    once its file is in place. A run that was killed therefore resumes after the last shard that counts.
+    once its file is in place. A killed run therefore resumes after the last shard that counts.
 
     Returns:
         The dataset's metadata.
 
     Raises:
-        UserError: the folder holds a dataset of other settings.
+        UserError: the folder holds a dataset of another configuration.
     """
-    metadata = _begin(settings, folder)
+    metadata = _begin(config, folder)
     with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
         if metadata["transitions"] >= transitions:
             return metadata
-        for arrays, seconds in _shards(settings, first=metadata["shards"], workers=workers):
+        for arrays, seconds in _shards(config, first=metadata["shards"], workers=workers):
             write_shard(shard_path(folder, metadata["shards"]), arrays)
             made = int(arrays["length"].sum())
             metadata["shards"] += 1
@@ -82,20 +82,20 @@ def collect(
     return metadata
 
 
-def collect_episode(scene: Scene, settings: CollectionConfig, episode: int) -> Arrays:
+def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arrays:
     """Collect one episode; arrays as in `cavin_pyro.data.dataset`, without the leading E."""
-    scene_generator, policy_generator = collection_streams(settings.seed, episode)
-    count = int(scene_generator.integers(settings.minimum_objects, settings.maximum_objects + 1))
+    scene_generator, policy_generator = collection_streams(config.seed, episode)
+    count = int(scene_generator.integers(config.minimum_objects, config.maximum_objects + 1))
     with user_input():
-        observation = scene.sample([clutter_area(scene_generator)] * count, settings.ranges, scene_generator)
+        observation = scene.sample([clutter_area(scene_generator)] * count, config.ranges, scene_generator)
     policy = HeuristicPushingPolicy(
-        policy_generator, intent_length=settings.intent_length, perturbation_rate=settings.perturbation_rate
+        policy_generator, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
     )
-    arrays = _blank(settings, scene)
+    arrays = _blank(config, scene)
     arrays["mask"][:] = observation.mask
     arrays["episode"] = np.array(episode, np.int64)
     _record_observation(arrays, 0, observation)
-    for step in range(settings.steps):
+    for step in range(config.steps):
         action = policy.act(observation).astype(np.float32)
         report = scene.push(action)
         observation = scene.observe()
@@ -115,8 +115,8 @@ def clutter_area(generator: np.random.Generator) -> Area:
     return [(tuple(corner), tuple(corner + size))]
 
 
-def _blank(settings: CollectionConfig, scene: Scene) -> Arrays:
-    steps, objects = settings.steps, MAXIMUM_OBJECTS
+def _blank(config: CollectionConfig, scene: Scene) -> Arrays:
+    steps, objects = config.steps, MAXIMUM_OBJECTS
     arrays: Arrays = {
         "centers": np.zeros((steps + 1, objects, 3), np.float32),
         "clouds": np.zeros((steps + 1, objects, POINTS_PER_OBJECT, 3), np.float16),
@@ -153,17 +153,17 @@ def _record_push(
     arrays["target"][step], arrays["angle"][step] = policy.intent.target, policy.intent.angle
 
 
-def open_scene(settings: CollectionConfig) -> Scene:
-    """The world in which episodes of these settings are collected.
+def open_scene(config: CollectionConfig) -> Scene:
+    """The world in which episodes of this configuration are collected.
 
     Raises:
         UserError: it has no such part, or a part lacks its files.
     """
     with user_input():
         return Scene(
-            object_set=load_object_set(settings.object_set, settings.assets),
-            camera=settings.camera,
-            segmentation=settings.segmentation,
+            object_set=load_object_set(config.object_set, config.assets),
+            camera=config.camera,
+            segmentation=config.segmentation,
         )
 
 
@@ -174,40 +174,38 @@ def _scene(**parts: Any) -> Scene:
 
 
 def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str, float]]:
-    settings, shard = job
+    config, shard = job
     parts = ("object_set", "assets", "camera", "segmentation")
-    scene = _scene(**{name: getattr(settings, name) for name in parts})
+    scene = _scene(**{name: getattr(config, name) for name in parts})
     began = time.process_time()
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
-    first = shard * settings.episodes_per_shard
-    episodes = [
-        collect_episode(scene, settings, episode) for episode in range(first, first + settings.episodes_per_shard)
-    ]
+    first = shard * config.episodes_per_shard
+    episodes = [collect_episode(scene, config, episode) for episode in range(first, first + config.episodes_per_shard)]
     arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
     return arrays, {"cpu": time.process_time() - began, **scene.seconds}
 
 
-def _shards(settings: CollectionConfig, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
+def _shards(config: CollectionConfig, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
     numbers = (first + number for number in range(10**9))
     if workers == 1:
-        yield from (_collect_shard((settings, number)) for number in numbers)
+        yield from (_collect_shard((config, number)) for number in numbers)
         return
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        waiting = [pool.apply_async(_collect_shard, ((settings, next(numbers)),)) for _ in range(2 * workers)]
+        waiting = [pool.apply_async(_collect_shard, ((config, next(numbers)),)) for _ in range(2 * workers)]
         while True:
             # A bounded queue: `imap` would run ahead of the disk without limit.
             yield waiting.pop(0).get()
-            waiting.append(pool.apply_async(_collect_shard, ((settings, next(numbers)),)))
+            waiting.append(pool.apply_async(_collect_shard, ((config, next(numbers)),)))
 
 
-def _begin(settings: CollectionConfig, folder: Path) -> dict[str, Any]:
-    """Metadata of the dataset so far, checked against what is asked for."""
-    wanted, usual = (_plain(asdict(one)) for one in (settings, CollectionConfig()))
+def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
+    """Metadata of the dataset so far, checked against the requested configuration."""
+    wanted, usual = (_plain(asdict(one)) for one in (config, CollectionConfig()))
     del wanted["assets"], usual["assets"]
     if not (folder / "metadata.json").exists():
         metadata = {
-            "settings": wanted,
-            "shape_names": list(load_object_set(settings.object_set, settings.assets).names),
+            "configuration": wanted,
+            "shape_names": list(load_object_set(config.object_set, config.assets).names),
             "made_by": f"cavin_pyro {__version__}",
             "shards": 0,
             "episodes": 0,
@@ -220,14 +218,14 @@ def _begin(settings: CollectionConfig, folder: Path) -> dict[str, Any]:
         if "is empty" not in str(error):
             raise
         (folder / "metadata.json").unlink()
-        return _begin(settings, folder)
-    stored = usual | metadata["settings"]  # older versions did not write options that came later
+        return _begin(config, folder)
+    stored = usual | metadata["configuration"]  # older versions lack later options
     stored["ranges"] = usual["ranges"] | stored["ranges"]
     for name, value in wanted.items():
         if stored[name] != value:
             raise UserError(
                 f"{folder} holds a dataset with {name}={stored[name]}, not {value}: "
-                "resume with the same settings, or choose another output=DIR"
+                "resume with the same options, or choose another output=DIR"
             )
     return metadata
 
@@ -246,21 +244,21 @@ def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, flo
 
 
 def _plain(value: Any) -> Any:
-    """Tuples as lists, so that settings compare equal after a round trip through JSON."""
+    """Tuples as lists, so that configurations compare equal after a round trip through JSON."""
     if isinstance(value, dict):
         return {name: _plain(entry) for name, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def repair(settings: CollectionConfig, folder: Path) -> int:
+def repair(config: CollectionConfig, folder: Path) -> int:
     """Collect again the shards that are missing or corrupt; returns how many there were."""
-    metadata, repaired = _begin(settings, folder), 0
+    metadata, repaired = _begin(config, folder), 0
     for number in range(metadata["shards"]):
         try:
             read_shard(shard_path(folder, number))
         except UserError as error:
             print(f"collecting again: {error}", flush=True)
-            arrays, _ = _collect_shard((replace(settings), number))
+            arrays, _ = _collect_shard((replace(config), number))
             write_shard(shard_path(folder, number), arrays)
             repaired += 1
     return repaired

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
+from cavin_pyro.storage.run_directory import with_current_keys
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
-RENAMED = {"hold": "intent_length", "perturbed": "perturbation_rate"}  # settings, by their former names
+RENAMED = {"hold": "intent_length", "perturbed": "perturbation_rate"}  # options of a collection, by their former names
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -100,23 +101,24 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             f"dataset {folder} has format version {metadata.get('version')}, this program reads {FORMAT_VERSION}: "
             "collect it again"
         )
+    metadata = with_current_keys(metadata)
     counts = [metadata.get(name) for name in ("shards", "episodes", "transitions")]
-    if not all(type(count) is int for count in counts) or not isinstance(metadata.get("settings"), dict):
-        raise UserError(f"{path} is damaged: settings or counts are missing; collect the dataset again")
+    if not all(type(count) is int for count in counts) or not isinstance(metadata.get("configuration"), dict):
+        raise UserError(f"{path} is damaged: configuration or counts are missing; collect the dataset again")
     if metadata["shards"] < 1:
         raise UserError(
             f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
         )
-    return {**metadata, "settings": with_current_names(metadata["settings"])}
+    return {**metadata, "configuration": with_current_names(metadata["configuration"])}
 
 
-def with_current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a collection as an older version wrote them, by today's names."""
-    return {RENAMED.get(name, name): value for name, value in settings.items()}
+def with_current_names(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a collection, as an older version wrote it, with the current names."""
+    return {RENAMED.get(name, name): value for name, value in configuration.items()}
 
 
 def content_fingerprint(folder: Path) -> str:
-    """Twelve hexadecimal digits of the first shard's bytes: equal for equal settings, program and simulator.
+    """Twelve hexadecimal digits of the first shard's bytes: equal for equal configuration, program and simulator.
 
     Raises:
         UserError: the shard cannot be read.

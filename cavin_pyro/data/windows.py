@@ -94,7 +94,7 @@ def load_windows(
     """
     config = config or WindowConfig()
     fingerprint, shards = pointnet_fingerprint(pointnet), []
-    lengths = {folder: read_metadata(folder)["settings"]["steps"] for folder in folders}
+    lengths = {folder: read_metadata(folder)["configuration"]["steps"] for folder in folders}
     if len(set(lengths.values())) > 1:
         raise UserError(
             "datasets with episodes of different length cannot be joined: "

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from cavin_pyro.evaluation.factory import Setup, announce_waiting, set_up
+from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
@@ -74,19 +74,19 @@ def _finished(path: Path) -> dict[int, Row]:
     return rows
 
 
-_setup: Setup | None = None  # one per worker process
+_runner: EpisodeRunner | None = None  # one per worker process
 
 
 def _begin(config: DictConfig) -> None:
-    global _setup
+    global _runner
     # One thread per worker: more threads per process slow all of them down.
     torch.set_num_threads(1)
-    _setup = set_up(config)
+    _runner = make_runner(config)
 
 
 def _episode(seed: int) -> Row:
-    assert _setup is not None
-    return episode_row(_setup.rollout(seed))
+    assert _runner is not None
+    return episode_row(_runner.rollout(seed))
 
 
 def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:

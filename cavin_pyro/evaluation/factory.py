@@ -1,4 +1,4 @@
-"""From the words of `plan` and `evaluate` to an environment, a planner and a PointNet."""
+"""Factories: an environment, a planner and a runner of episodes, from the options of `plan` and `evaluate`."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ SLOW_OPTIMIZERS = {"CrossEntropy", "ImprovedCrossEntropy", "PathIntegral", "Evol
 
 
 @dataclass(frozen=True)
-class Setup:
-    """All that closed-loop episodes need; env belongs to this process."""
+class EpisodeRunner:
+    """Runs closed-loop episodes with one environment and one planner; `env` belongs to this process."""
 
     env: PushingEnv
     planner: Planner
@@ -46,18 +46,18 @@ class Setup:
 
     @property
     def task(self) -> Task:
-        """Of the episode that the environment is in."""
+        """The task of the current episode."""
         return self.env.task
 
     def rollout(self, seed: int, **options: Any) -> Episode:
-        """As `cavin_pyro.evaluation.rollout.rollout`, whose other options these are."""
+        """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`."""
         return rollout(
             self.env, self.planner, self.pointnet, seed=seed, pushes_per_plan=self.pushes_per_plan, **options
         )
 
 
-def check_words(config: DictConfig) -> None:
-    """Check what needs no checkpoint and no simulator.
+def check_options(config: DictConfig) -> None:
+    """Check the options that need neither a checkpoint nor the simulator.
 
     Raises:
         UserError: a number or name out of its range.
@@ -65,13 +65,13 @@ def check_words(config: DictConfig) -> None:
     check_world(config.env)
     if config.layout == "random" and config.planner.get("compile"):
         raise UserError(
-            "planner.compile=true makes code for one layout, and layout=random has another in every episode: "
-            "take planner.compile=false"
+            "planner.compile=true compiles for one layout, and layout=random samples another in every episode: "
+            "choose planner.compile=false"
         )
 
 
 def announce_waiting(config: DictConfig) -> None:
-    """Say on standard error, before the first plan, what makes plans take long."""
+    """Announce on standard error, before the first plan, that plans will take long."""
     planner = config.planner
     if planner.get("compile"):
         print("planner.compile=true: the first plan is compiled, which takes a minute or two", file=sys.stderr)
@@ -80,18 +80,15 @@ def announce_waiting(config: DictConfig) -> None:
         print(f"planner.optimizer={target}: a plan takes about twice as long as with Shooting", file=sys.stderr)
 
 
-def set_up(config: DictConfig, *, render: bool = False) -> Setup:
-    """Build environment and planner.
+def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
+    """Build the environment from the options of the task and the section `env`.
 
     Raises:
-        UserError: unknown task or layout, a checkpoint that cannot be used, a planner that refuses its options.
+        UserError: an unknown task, layout or object, or a part of the world that lacks files.
     """
-    check_words(config)
-    set_matmul_precision(config.matmul_precision)
-    keep_freed_memory()
     task, tiles = task_of(config)
     with user_input():
-        env = PushingEnv(
+        return PushingEnv(
             task=task,
             layout=config.layout,
             tiles=tiles,
@@ -106,24 +103,14 @@ def set_up(config: DictConfig, *, render: bool = False) -> Setup:
             render_mode="rgb_array" if render else None,
             robot=config.env.robot,
         )
-    try:
-        with user_input():
-            reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
-        planner, pointnet = _planner(config, reward)
-        if config.pushes_per_plan is not None:
-            whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
-        with user_input():  # tells at once whether every layout has room for the objects
-            for number in range(len(env.tasks)):
-                env.reset(seed=config.seed, options={"layout": number})
-        if len(env.tasks) > 1:
-            env.reset(seed=config.seed)  # in the layout that the seed draws
-    except BaseException:
-        env.close()
-        raise
-    return Setup(env, planner, pointnet, config.pushes_per_plan)
 
 
-def _planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, PointNet]:
+def make_planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, PointNet]:
+    """Build the planner with the checkpoint's model, and the checkpoint's PointNet.
+
+    Raises:
+        UserError: a checkpoint that cannot be used, or a planner that refuses its options.
+    """
     path = find_checkpoint(config.checkpoint)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     pointnet = pointnet_of(checkpoint, path)
@@ -143,6 +130,33 @@ def _planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, Point
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
     return construct(options, model=model, reward=reward, **optimizers), pointnet
+
+
+def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
+    """Build an environment and a planner, and run episodes with them.
+
+    Raises:
+        UserError: as `check_options`, `make_environment` and `make_planner`, or a layout without room for the objects.
+    """
+    check_options(config)
+    set_matmul_precision(config.matmul_precision)
+    keep_freed_memory()
+    env = make_environment(config, render=render)
+    try:
+        with user_input():
+            reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
+        planner, pointnet = make_planner(config, reward)
+        if config.pushes_per_plan is not None:
+            whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
+        with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
+            for number in range(len(env.tasks)):
+                env.reset(seed=config.seed, options={"layout": number})
+        if len(env.tasks) > 1:
+            env.reset(seed=config.seed)  # in the layout that the seed samples
+    except BaseException:
+        env.close()
+        raise
+    return EpisodeRunner(env, planner, pointnet, config.pushes_per_plan)
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 from envs.tasks import TASKS
 
+RENAMED_KEYS = {"mark": "fingerprint", "settings": "configuration"}  # of the record of a dataset
+
 
 def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
     """Write `config.yaml` and return the configuration as plain data."""
@@ -59,7 +61,7 @@ def stored_options(path: Path) -> dict[str, Any]:
 
 
 def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
-    """Make sure that a run resumes with the data that it began with, in whatever folder; the first time, record them.
+    """Check that a run resumes with the data that it began with, in any folder; the first time, record them.
 
     Args:
         data: of each dataset, among other things, its number of `transitions` and the `fingerprint` of its content.
@@ -71,23 +73,23 @@ def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
     now = [{name: dataset[name] for name in ("transitions", "fingerprint")} for dataset in data]
     if not path.exists():
         write_json(path, now)
-    elif (earlier := _with_fingerprints(read_json(path))) != now:
+    elif (earlier := _with_current_keys(read_json(path))) != now:
         raise UserError(
             f"{folder} holds a run with other data, {_of_transitions(earlier)} instead of {_of_transitions(now)}: "
             "resume with the same data=DIR, or choose another output=DIR"
         )
 
 
-def with_fingerprint(dataset: Mapping[str, Any]) -> dict[str, Any]:
-    """The record of a dataset with today's names: older runs and checkpoints have `mark` for `fingerprint`."""
-    return {"fingerprint" if name == "mark" else name: value for name, value in dataset.items()}
+def with_current_keys(dataset: Mapping[str, Any]) -> dict[str, Any]:
+    """The record of a dataset, as older datasets, runs and checkpoints have it, with the current keys."""
+    return {RENAMED_KEYS.get(name, name): value for name, value in dataset.items()}
 
 
-def _with_fingerprints(data: Any) -> Any:
-    """`data.json` with today's names; anything else is returned as it is."""
+def _with_current_keys(data: Any) -> Any:
+    """`data.json` with the current keys; anything else is returned as it is."""
     if not isinstance(data, list) or not all(isinstance(dataset, dict) for dataset in data):
         return data
-    return [with_fingerprint(dataset) for dataset in data]
+    return [with_current_keys(dataset) for dataset in data]
 
 
 def _of_transitions(data: Any) -> str:

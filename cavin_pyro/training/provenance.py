@@ -13,13 +13,13 @@ from cavin_pyro.storage.provenance import provenance
 
 
 def training_provenance(data: Sequence[Path], pointnet: Path, windows: WindowTable) -> dict[str, Any]:
-    """The same for a trained model: also which data and which PointNet it was trained with."""
+    """The provenance of a trained model: the run, its data and its PointNet."""
     trained_before = load_checkpoint(pointnet).provenance
-    kept = ("transitions", "episodes", "settings", "made_by")
+    names = ("transitions", "episodes", "configuration", "made_by")
     return {
         **provenance(),
         "data": [
-            {**{name: read_metadata(folder)[name] for name in kept}, "fingerprint": content_fingerprint(folder)}
+            {**{name: read_metadata(folder)[name] for name in names}, "fingerprint": content_fingerprint(folder)}
             for folder in data
         ],
         "pointnet": trained_before.get("pointnet", trained_before),

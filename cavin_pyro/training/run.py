@@ -54,12 +54,12 @@ def train(config: DictConfig) -> Trainer:
     check_same_run(folder, config, ignore=("data", "output"))
     record = training_provenance(data, source, windows)
     check_same_data(folder, record["data"])
-    settings = write_config(folder, config)
+    stored_config = write_config(folder, config)
     parts = {"model": model, "guide": guide, "pointnet": pointnet}
     path = folder / "checkpoint.safetensors"
 
     def save(step: int, row: dict[str, float]) -> None:
-        save_checkpoint(path, parts=parts, config=settings, provenance={**record, "step": step, "metrics": row})
+        save_checkpoint(path, parts=parts, config=stored_config, provenance={**record, "step": step, "metrics": row})
 
     trainer = configured(TrainerConfig, config.trainer, "trainer")
     run = Trainer(model, guide, objective, windows, folder, save, trainer, seed=config.seed)

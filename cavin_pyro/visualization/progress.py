@@ -1,4 +1,4 @@
-"""An episode in words: one line per push as it happens, and how long the rest may take."""
+"""Progress of an episode: one line per push as it happens, and how long the rest may take."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ def ended(transition: Transition) -> bool:
 
 
 def outcome(transition: Transition) -> str:
-    """What a push did, in words."""
-    words = {
+    """What a push did, for people."""
+    names = {
         "success": "goal reached",
         "violation": "violation",
         "fall": "an object fell",
         "unsafe": "unsafe",
         "ineffective": "moved nothing",
     }
-    return next((said for name, said in words.items() if getattr(transition, name)), "moved")
+    return next((said for name, said in names.items() if getattr(transition, name)), "moved")
 
 
 def duration(seconds: float) -> str:
-    """A time in words: "12 s", "3 min"."""
+    """A duration for people: "12 s", "3 min"."""
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -10,7 +10,7 @@ from typing import Any
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import episode_row
-from cavin_pyro.evaluation.factory import Setup
+from cavin_pyro.evaluation.factory import EpisodeRunner
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
@@ -39,25 +39,27 @@ def check_viewer(viewer: object) -> None:
         ) from error
 
 
-def render_episode(setup: Setup, folder: Path, *, seed: int, video: bool, viewer: str | None = None) -> dict[str, Any]:
+def render_episode(
+    runner: EpisodeRunner, folder: Path, *, seed: int, video: bool, viewer: str | None = None
+) -> dict[str, Any]:
     """Run one episode, print its pushes and write `episode_files` about it; returns its results' row.
 
     Args:
         viewer: one of `VIEWERS`, whose module is installed, or None.
     """
-    env = setup.env
+    env = runner.env
     with ExitStack() as stack:
         callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
         if video:
-            callbacks.append(stack.enter_context(EpisodeVideo(folder / "episode.mp4", setup.task, env=env)))
+            callbacks.append(stack.enter_context(EpisodeVideo(folder / "episode.mp4", runner.task, env=env)))
         if viewer is not None:
             from cavin_pyro.visualization.recording import recording  # an optional extra
 
-            callbacks.append(stack.enter_context(recording(folder / "episode.rrd", env, setup.task)))
-        episode = setup.rollout(seed, photograph=True, callbacks=callbacks)
+            callbacks.append(stack.enter_context(recording(folder / "episode.rrd", env, runner.task)))
+        episode = runner.rollout(seed, photograph=True, callbacks=callbacks)
     write_steps(folder / "steps.csv", episode)
-    draw_plan(folder / "plan.png", episode, setup.task, env.scene.camera)
-    draw_plan(folder / "plan-above.png", episode, setup.task, None)
+    draw_plan(folder / "plan.png", episode, runner.task, env.scene.camera)
+    draw_plan(folder / "plan-above.png", episode, runner.task, None)
     return episode_row(episode)
 
 

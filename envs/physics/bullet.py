@@ -11,7 +11,7 @@ from pathlib import Path
 
 @contextmanager
 def _quiet(descriptor: int) -> Iterator[None]:
-    """Keep what Bullet prints at import and on connecting out of the streams with the program's own words."""
+    """Silence what Bullet prints at import and on connecting, so that the streams hold the program's output only."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = os.dup(descriptor)

@@ -54,7 +54,7 @@ def most_reachable(
     codes = rescored.codes  # [B, F, K, C]
     first, distance = _first_segment(options, rescored, codes[:, :, 0], model, reward)
     problem = effects.problem
-    space = _FirstByMotions(predict, first, codes)
+    space = _FixedFirstSegment(predict, first, codes)
     again = SearchProblem(space, problem.objective, problem.state, problem.generators, problem.segments).begin(count)
     for _ in range(problem.segments):
         again = again.extend()
@@ -92,8 +92,8 @@ def _first_segment(
     return rollout, distance.gather(-1, closest.unsqueeze(-1)).squeeze(-1)
 
 
-class _FirstByMotions:
-    """Given plans: the first segment as it was predicted by f, the others by h from there."""
+class _FixedFirstSegment:
+    """Given plans: f has predicted the first segment, h predicts the others from there."""
 
     dimension = 0  # there is nothing to search
 

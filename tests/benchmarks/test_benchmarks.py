@@ -16,8 +16,8 @@ from cavin_pyro.data.collection import CollectionConfig, collect
 ROOT = Path(__file__).parents[2]
 
 
-def run(name: str, *words: str) -> str:
-    command = [sys.executable, str(ROOT / "benchmarks" / f"{name}.py"), *words]
+def run(name: str, *arguments: str) -> str:
+    command = [sys.executable, str(ROOT / "benchmarks" / f"{name}.py"), *arguments]
     surroundings = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
         command, cwd=ROOT, env=surroundings, check=True, capture_output=True, text=True, timeout=300
@@ -83,9 +83,9 @@ def test_segmentation_is_judged_in_scenes_and_over_whole_episodes(tmp_path: Path
 
 @pytest.mark.soak
 def test_the_world_survives_adversarial_pushes_and_resumes(tmp_path: Path) -> None:
-    words = ["--adversarial", "0.8", "--log", str(tmp_path / "world.jsonl")]
-    run("world", "--resets", "2", "--pushes", "10", *words)
-    printed = run("world", "--resets", "5", "--pushes", "40", *words)
+    arguments = ["--adversarial", "0.8", "--log", str(tmp_path / "world.jsonl")]
+    run("world", "--resets", "2", "--pushes", "10", *arguments)
+    printed = run("world", "--resets", "5", "--pushes", "40", *arguments)
     assert "5 resets: " in printed and "40 pushes: " in printed
     assert printed.count("0 jumps, 0 looks at an object inside the table") == 2
     assert "NaN: refused" in printed and "WRONG" not in printed
@@ -95,8 +95,8 @@ def test_the_world_survives_adversarial_pushes_and_resumes(tmp_path: Path) -> No
 
 @pytest.mark.soak
 def test_an_arm_survives_adversarial_pushes_without_growing_memory(tmp_path: Path) -> None:
-    words = ["--resets", "4", "--pushes", "12", "--adversarial", "0.7", "--robot", "panda"]
-    printed = run("world", *words, "--log", str(tmp_path / "world.jsonl"))
+    arguments = ["--resets", "4", "--pushes", "12", "--adversarial", "0.7", "--robot", "panda"]
+    printed = run("world", *arguments, "--log", str(tmp_path / "world.jsonl"))
     assert printed.count("0 jumps, 0 looks at an object inside the table") == 2 and "WRONG" not in printed
     assert "12 pushes: " in printed and "heuristic: done" in printed and ": refused" in printed
 

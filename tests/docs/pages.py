@@ -18,21 +18,21 @@ class Line:
     """One line of a block of commands, as a shell splits it; what continues after a backslash is part of it."""
 
     page: str
-    words: tuple[str, ...]
+    tokens: tuple[str, ...]
 
     @property
     def command(self) -> str | None:
         """`plan` of `python -m cavin_pyro.plan`; None for other lines."""
-        is_ours = self.words[:2] == ("python", "-m") and self.words[2].startswith("cavin_pyro.")
-        return self.words[2].removeprefix("cavin_pyro.") if is_ours else None
+        is_ours = self.tokens[:2] == ("python", "-m") and self.tokens[2].startswith("cavin_pyro.")
+        return self.tokens[2].removeprefix("cavin_pyro.") if is_ours else None
 
     @property
     def options(self) -> tuple[str, ...]:
         """What follows the command's name."""
-        return self.words[3:]
+        return self.tokens[3:]
 
     def __str__(self) -> str:
-        return f"{self.page}: {shlex.join(self.words)}"
+        return f"{self.page}: {shlex.join(self.tokens)}"
 
 
 def name(page: Path) -> str:
@@ -45,7 +45,7 @@ def commands(page: Path) -> list[Line]:
     blocks = [block for language, block in FENCE.findall(page.read_text(encoding="utf-8")) if not language]
     lines = "".join(blocks).replace("\\\n", " ").splitlines()
     split = [tuple(shlex.split(line, comments=True)) for line in lines]
-    return [Line(name(page), words) for words in split if words]
+    return [Line(name(page), tokens) for tokens in split if tokens]
 
 
 def code_in_prose(page: Path) -> Iterator[str]:

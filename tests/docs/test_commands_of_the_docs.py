@@ -20,7 +20,7 @@ from tests.docs.pages import PAGES, ROOT, Line, commands
 from tests.test_repository import PROJECT
 
 LINES = [line for page in PAGES for line in commands(page)]
-EACH_ONCE = [*{line.words: line for line in LINES}.values()]
+EACH_ONCE = [*{line.tokens: line for line in LINES}.values()]
 TUTORIAL_AND_HOW_TO = (
     "docs/tutorial/first-plan.md",
     *(f"docs/how-to/{page}.md" for page in ("collect-and-train", "check-a-model", "evaluate-and-compare")),
@@ -52,7 +52,7 @@ def test_the_command_composes(line: Line) -> None:
 
 @pytest.mark.parametrize("line", [line for line in EACH_ONCE if not line.command], ids=str)
 def test_what_is_no_command_of_ours_is_there(line: Line) -> None:
-    tool, *rest = [word for word in line.words if not re.fullmatch(r"[A-Z_]+=\S*", word)]
+    tool, *rest = [word for word in line.tokens if not re.fullmatch(r"[A-Z_]+=\S*", word)]
     extras = PROJECT["project"]["optional-dependencies"]
     if tool == "make":
         assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -63,7 +63,7 @@ def test_what_is_no_command_of_ours_is_there(line: Line) -> None:
         named = set(re.findall(r"\[(\w+)\]", rest[-3] if rest[-1] == "setuptools" else rest[-1]))
         assert named <= set(extras)
     else:
-        assert line.words in {("source", ".venv/bin/activate"), ("rerun", "runs/seen-in-3d/episode.rrd")}
+        assert line.tokens in {("source", ".venv/bin/activate"), ("rerun", "runs/seen-in-3d/episode.rrd")}
 
 
 def run_in_order(pages: Sequence[str], folder: Path) -> None:

@@ -73,14 +73,14 @@ def test_classes_and_functions_that_the_page_names_are_there(page: Path) -> None
 def test_options_that_the_page_names_exist(page: Path, options: set[str]) -> None:
     named = set()
     for code in code_in_prose(page):
-        words = code.split()
-        words = words[3:] if words[:2] == ["python", "-m"] else words
-        words = [] if "(" in code else words  # Python
-        for word in words:
-            if match := re.fullmatch(r"([a-z_/]+(?:\.[a-z_]+)*\.?)=.*", word):
+        tokens = code.split()
+        tokens = tokens[3:] if tokens[:2] == ["python", "-m"] else tokens
+        tokens = [] if "(" in code else tokens  # Python
+        for token in tokens:
+            if match := re.fullmatch(r"([a-z_/]+(?:\.[a-z_]+)*\.?)=.*", token):
                 named.add(match[1])
-            elif re.fullmatch(r"(env|planner|windows|trainer|objective|model|guide|sizes)(\.[a-z_]+)+", word):
-                named.add(word)
+            elif re.fullmatch(r"(env|planner|windows|trainer|objective|model|guide|sizes)(\.[a-z_]+)+", token):
+                named.add(token)
     named = {one for one in named if not one.endswith("._target_")}
     assert not sorted(named - options - {"name"})  # `name=value`
 

@@ -24,7 +24,7 @@ LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
 FOLLOWS = " ..."  # in the page's table: the line goes on
 TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
 
-# The page's commands train for days and look at everything: these words, added to them, make each a matter of seconds.
+# The page's commands train for days: these overrides, added to them, shorten each to seconds.
 SHORT = {
     "train": "model.width=8 trainer.steps=4 trainer.validate_every=2 trainer.batch_size=4 windows.minimum_move=0.001 "
     "windows.validation_fraction=0.4",
@@ -34,9 +34,9 @@ SHORT = {
 
 
 def commands(name: str) -> list[tuple[str, list[str]]]:
-    """The page's commands about one run, with words that shorten them."""
-    found = [(command, shlex.split(words)) for command, words in LINES if f"runs/{name}" in words]
-    return [(command, [*words, *SHORT[command].split()]) for command, words in found]
+    """The page's commands about one run, with overrides that shorten them."""
+    found = [(command, shlex.split(overrides)) for command, overrides in LINES if f"runs/{name}" in overrides]
+    return [(command, [*overrides, *SHORT[command].split()]) for command, overrides in found]
 
 
 def in_one_line(answer: Answer) -> str:
@@ -48,7 +48,9 @@ def in_one_line(answer: Answer) -> str:
 def is_told(line: str) -> bool:
     """Whether the page's table has the line, or its beginning."""
     return any(
-        line == told or (told.endswith(FOLLOWS) and line.startswith(told.removesuffix(FOLLOWS))) for told in TOLD
+        line == line_of_error
+        or (line_of_error.endswith(FOLLOWS) and line.startswith(line_of_error.removesuffix(FOLLOWS)))
+        for line_of_error in TOLD
     )
 
 
@@ -79,34 +81,36 @@ def test_the_commands_of_the_page_work_and_need_trust(
     name: str, target: str, expected: list[str], folder: Path
 ) -> None:
     run = name.rstrip("/")
-    training = [words for command, words in commands(run) if command == "train" and f"output=runs/{run}" in words]
+    training = [
+        overrides for command, overrides in commands(run) if command == "train" and f"output=runs/{run}" in overrides
+    ]
     assert len(training) == 1
     trained = run_command("train", *training[0], folder=folder)
     assert trained.status == 0, trained.errors
     using = commands(name)
     assert [command for command, _ in using] == expected
-    for command, words in using:
-        refused = run_command(command, *[word for word in words if not word.startswith("trust=")], folder=folder)
+    for command, overrides in using:
+        refused = run_command(command, *[one for one in overrides if not one.startswith("trust=")], folder=folder)
         line = in_one_line(refused)
         assert f"runs/{run}/checkpoint.safetensors asks to run my_lab.{target}" in line
         assert line.endswith("pass trust=[my_lab]")
         assert is_told(line) or target != "MyGuide"
-        (output,) = (word.removeprefix("output=") for word in words if word.startswith("output="))
+        (output,) = (one.removeprefix("output=") for one in overrides if one.startswith("output="))
         assert not (folder / output).exists()
-        done = run_command(command, *words, folder=folder)
+        done = run_command(command, *overrides, folder=folder)
         assert done.status == 0, done.errors
         assert done.complaints == []
         assert any((folder / output).iterdir())
 
 
 @pytest.mark.parametrize(
-    "words",
+    "overrides",
     ["model=flat", "guide._target_=my_lab.HerGuide", "+guide.depth=3"],
 )
-def test_what_cannot_be_built_is_told_as_the_page_says(words: str, folder: Path) -> None:
+def test_error_lines_are_those_of_the_page(overrides: str, folder: Path) -> None:
     ((_, line),) = (one for one in commands("mine") if one[0] == "train" and "output=runs/mine" in one[1])
-    told = in_one_line(run_command("train", *line, "output=runs/never", *words.split(), folder=folder))
-    assert is_told(told), told
+    line_of_error = in_one_line(run_command("train", *line, "output=runs/never", *overrides.split(), folder=folder))
+    assert is_told(line_of_error), line_of_error
     assert not (folder / "runs" / "never").exists()
 
 

@@ -67,17 +67,17 @@ def test_it_goes_on_from_the_last_plan(toy: Any) -> None:
 @pytest.mark.parametrize(("command", "options"), LINES)
 def test_the_commands_of_the_page_work(command: str, options: str, tmp_path: Path) -> None:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
-    words = shlex.split(options)
-    done = run_command(command, *words, *SHORT[command], folder=tmp_path)
+    overrides = shlex.split(options)
+    done = run_command(command, *overrides, *SHORT[command], folder=tmp_path)
     assert done.status == 0, done.errors
-    (output,) = (word.removeprefix("output=") for word in words if word.startswith("output="))
+    (output,) = (one.removeprefix("output=") for one in overrides if one.startswith("output="))
     assert any((tmp_path / output).iterdir())
 
 
 def test_an_argument_that_it_does_not_take_is_told_as_the_page_says(tmp_path: Path) -> None:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
-    words = "planner.optimizer._target_=my_lab.EvolutionStrategy", "+planner.optimizer.depth=3"
-    answer = run_command("plan", *words, "output=never", folder=tmp_path)
+    overrides = "planner.optimizer._target_=my_lab.EvolutionStrategy", "+planner.optimizer.depth=3"
+    answer = run_command("plan", *overrides, "output=never", folder=tmp_path)
     assert answer.status == 2
     (line,) = answer.complaints
     assert is_told(line.removeprefix("error: ")), line

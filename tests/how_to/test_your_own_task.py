@@ -55,12 +55,12 @@ def test_the_page_has_a_class_a_layout_and_a_program() -> None:
 
 @pytest.mark.parametrize(("command", "options"), LINES)
 def test_the_commands_of_the_page_work(command: str, options: str, folder: Path) -> None:
-    words = shlex.split(options)
-    done = run_command(command, *words, *SHORT[command], folder=folder)
+    overrides = shlex.split(options)
+    done = run_command(command, *overrides, *SHORT[command], folder=folder)
     assert done.status == 0, done.errors
     assert done.complaints == []
     assert any(line.startswith("sorting") for line in done.output.splitlines()), done.output
-    (output,) = (word.removeprefix("output=") for word in words if word.startswith("output="))
+    (output,) = (one.removeprefix("output=") for one in overrides if one.startswith("output="))
     expected = {"plan": {"plan.png", "plan-above.png", "episode.mp4"}, "evaluate": {"results.json"}}
     assert expected[command] <= {file.name for file in (folder / output).iterdir()}
 
@@ -99,7 +99,9 @@ def test_mistakes_are_told_as_the_page_says(folder: Path) -> None:
             (folder / mistake / name).write_text(text, encoding="utf-8")
     half = FILES["my_tasks.py"].replace("def potential(", "def potency(")
     (folder / "half a task" / "half_a_task.py").write_text(half, encoding="utf-8")
-    answers = run_in_turn({name: Case("plan", [*words, "output=never"]) for name, words in MISTAKES.items()}, folder)
+    answers = run_in_turn(
+        {name: Case("plan", [*overrides, "output=never"]) for name, overrides in MISTAKES.items()}, folder
+    )
     told = {name: in_one_line(answer) for name, answer in answers.items()}
     assert [line for line in told.values() if not is_told(line)] == []
     assert not list(folder.glob("*/never"))

@@ -81,8 +81,8 @@ def spoil_data(folder: Path, good: Path) -> None:
     write_metadata(folder / "foreign_data", {**metadata, "format": "photographs"})
     (folder / "damaged_data" / "metadata.json").write_text("{")
     shutil.copytree(good, folder / "long_data")
-    settings = {**metadata["settings"], "steps": 9}
-    write_metadata(folder / "long_data", {**metadata, "settings": settings})
+    config = {**metadata["configuration"], "steps": 9}
+    write_metadata(folder / "long_data", {**metadata, "configuration": config})
     shutil.copytree(good, folder / "lost_data")
     shard_path(folder / "lost_data", 1).unlink()
     shutil.copytree(good, folder / "corrupt_data")

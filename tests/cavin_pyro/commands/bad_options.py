@@ -50,7 +50,7 @@ BAD_OPTIONS = [
     ("evaluate", "task=juggling", f"choose from {', '.join(TASKS)}"),
     ("check", "sections=[consistency,bliss]", "unknown section 'bliss': choose from "),
     ("check", "sections=[]", "sections must name at least one: choose from "),
-    # Words that are not there.
+    # Unknown options.
     (
         "plan",
         "tsak=crossing",
@@ -72,7 +72,7 @@ BAD_OPTIONS = [
     ("evaluate", "episode=3", "did you mean episodes?"),
     ("check", "window=3", "did you mean windows?"),
     ("check", "sizes.consistency.scene=3", "did you mean scenes? valid under sizes.consistency are"),
-    # Words that Hydra refuses.
+    # Overrides that Hydra refuses.
     ("collect", "transitions", "'transitions': write overrides as name=value"),
     ("collect", "transitions=[1,", "write overrides as name=value"),
     ("plan", "seed=1,2", "seed=1,2"),
@@ -133,7 +133,11 @@ BAD_OPTIONS = [
     ("plan", "planner.idle_distance=-1", "idle_distance must be zero or a positive number, not -1"),
     ("plan", "planner.warm_start=3", "planner.warm_start must be true or false, not 3"),
     ("plan", "planner.compile=3", "planner.compile must be true or false, not 3"),
-    ("plan", "planner.compile=true layout=random", "layout=random has another in every episode: take planner.compile"),
+    (
+        "plan",
+        "planner.compile=true layout=random",
+        "layout=random samples another in every episode: choose planner.compile",
+    ),
     ("plan", "planner.optimizer=3", "optimizer must be one of shooting, cem, icem, mppi, evolution, smc, or an object"),
     ("plan", "planner.robustness.rollouts=0", "rollouts must be at least 1, not 0"),
     ("plan", "planner.robustness.start_noise=-1", "start_noise must be zero or a positive number, not -1"),

@@ -104,28 +104,29 @@ def test_sampled_windows_depend_on_their_seed(check_config: Callable[..., DictCo
 
 def test_a_report_says_whether_the_model_was_trained_on_the_data(own_pushes: Path) -> None:
     metadata, fingerprint = read_metadata(own_pushes), content_fingerprint(own_pushes)
-    entry = {name: metadata[name] for name in ("transitions", "episodes", "settings")}
+    entry = {name: metadata[name] for name in ("transitions", "episodes", "configuration")}
 
-    def told(*entries: dict[str, Any]) -> tuple[bool | None, str]:
+    def verdict(*entries: dict[str, Any]) -> tuple[bool | None, str]:
         compared = compare_data(own_pushes, {"data": list(entries)})
         return compared["same"], compared["verdict"]
 
-    other = {**entry, "settings": {**metadata["settings"], "seed": 9}}
-    assert told({**entry, "fingerprint": fingerprint}) == (True, "the model was trained on these")
-    assert told(other, {**entry, "fingerprint": fingerprint}) == (True, "the model was trained on these")
-    assert told({**entry, "fingerprint": fingerprint, "transitions": 9}) == (
+    other = {**entry, "configuration": {**metadata["configuration"], "seed": 9}}
+    assert verdict({**entry, "fingerprint": fingerprint}) == (True, "the model was trained on these")
+    assert verdict(other, {**entry, "fingerprint": fingerprint}) == (True, "the model was trained on these")
+    assert verdict({**entry, "fingerprint": fingerprint, "transitions": 9}) == (
         True,
         "the model was trained on these, of which it saw 9",
     )
-    assert told({**entry, "mark": fingerprint})[0] is True  # as older checkpoints name it
-    assert told(other)[0] is False
-    assert told({**entry, "fingerprint": "0" * 12})[0] is False
-    assert told(entry)[0] is None
-    assert told()[0] is None
+    older = {"transitions": entry["transitions"], "settings": entry["configuration"], "mark": fingerprint}
+    assert verdict(older)[0] is True  # as older checkpoints name them
+    assert verdict(other)[0] is False
+    assert verdict({**entry, "fingerprint": "0" * 12})[0] is False
+    assert verdict(entry)[0] is None
+    assert verdict()[0] is None
     assert compare_data(own_pushes, {})["same"] is None
     assert compare_data(own_pushes, {"data": "damaged"})["same"] is None
-    write_metadata(own_pushes, {**metadata, "settings": {**metadata["settings"], "seed": 9}})
-    assert told({**entry, "fingerprint": fingerprint})[0] is False
+    write_metadata(own_pushes, {**metadata, "configuration": {**metadata["configuration"], "seed": 9}})
+    assert verdict({**entry, "fingerprint": fingerprint})[0] is False
 
 
 def test_checkpoints_that_cannot_be_checked_are_refused_with_the_reason(small: SimpleNamespace, tmp_path: Path) -> None:

@@ -42,9 +42,9 @@ def test_a_run_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace,
         assert process.wait() == -signal.SIGKILL  # it had neither failed nor ended before
     assert 11 <= len(list(broken.glob("episodes-*.h5"))) < 40
     assert shell.run_command("collect", *overrides, "workers=1", f"output={broken}", folder=tmp_path).status == 0
-    settings = CollectionConfig(seed=5, steps=2, episodes_per_shard=1)
+    config = CollectionConfig(seed=5, steps=2, episodes_per_shard=1)
     whole.mkdir()
-    collect(settings, whole, transitions=80, workers=1)
+    collect(config, whole, transitions=80, workers=1)
     assert data_of(broken) == data_of(whole)
     assert len(data_of(whole)) == 40 + 1
 
@@ -70,7 +70,7 @@ def test_an_episode_depends_on_the_seed_and_its_number_alone(small: SimpleNamesp
 
 def test_episodes_hold_what_the_metadata_say(pushes: Path) -> None:
     metadata = read_metadata(pushes)
-    assert metadata["settings"]["seed"] == 3
+    assert metadata["configuration"]["seed"] == 3
     assert metadata["shape_names"] == list(BUILTIN_NAMES)
     counts = []
     for number in range(metadata["shards"]):
@@ -96,14 +96,14 @@ def test_episodes_hold_what_the_metadata_say(pushes: Path) -> None:
     assert len(set(counts)) > 2
 
 
-def test_other_settings_are_refused_and_change_nothing(small: SimpleNamespace, own_pushes: Path) -> None:
+def test_another_configuration_is_refused_and_changes_nothing(small: SimpleNamespace, own_pushes: Path) -> None:
     before = data_of(own_pushes)
     for changes, said in (
         ({"seed": 4}, "holds a dataset with seed=3, not 4"),
         ({"steps": 7}, "holds a dataset with steps=6, not 7"),
         ({"ranges": replace(small.pushes.ranges, mass=(1.0, 1.0))}, "holds a dataset with ranges="),
     ):
-        with pytest.raises(UserError, match=f"{said}.*: resume with the same settings, or choose another output=DIR"):
+        with pytest.raises(UserError, match=f"{said}.*: resume with the same options, or choose another output=DIR"):
             collect(replace(small.pushes, **changes), own_pushes, transitions=100, workers=1)
     assert data_of(own_pushes) == before
 
@@ -111,11 +111,12 @@ def test_other_settings_are_refused_and_change_nothing(small: SimpleNamespace, o
 def test_a_dataset_of_an_older_version_resumes(small: SimpleNamespace, own_pushes: Path) -> None:
     before = data_of(own_pushes)
     metadata = json.loads((own_pushes / "metadata.json").read_text())
-    del metadata["settings"]["object_set"]
+    del metadata["configuration"]["object_set"]
     for former, name in (("hold", "intent_length"), ("perturbed", "perturbation_rate")):
-        metadata["settings"][former] = metadata["settings"].pop(name)
+        metadata["configuration"][former] = metadata["configuration"].pop(name)
     for name in ("kilograms", "target", "drop_height"):
-        del metadata["settings"]["ranges"][name]
+        del metadata["configuration"]["ranges"][name]
+    metadata["settings"] = metadata.pop("configuration")
     (own_pushes / "metadata.json").write_text(json.dumps(metadata))
     held = metadata["transitions"]
     assert collect(small.pushes, own_pushes, transitions=held, workers=1)["transitions"] == held
@@ -128,10 +129,10 @@ def test_scans_and_builtin_shapes_are_collected_together(
     small: SimpleNamespace, tiny_assets: Path, tmp_path: Path
 ) -> None:
     kinds = {"object_set": "mixed", "ranges": ObjectRanges(("mug", "brick"), clearance=0.12)}
-    settings = replace(small.pushes, **kinds, assets=str(tiny_assets), episodes_per_shard=10, steps=1)
-    metadata = collect(settings, tmp_path, transitions=10, workers=1)
+    config = replace(small.pushes, **kinds, assets=str(tiny_assets), episodes_per_shard=10, steps=1)
+    metadata = collect(config, tmp_path, transitions=10, workers=1)
     assert metadata["shape_names"] == [*BUILTIN_NAMES, "ycb/brick", "ycb/mug", "ycb/angle"]
-    assert "assets" not in metadata["settings"]
+    assert "assets" not in metadata["configuration"]
     shapes = read_shard(shard_path(tmp_path, 0))["shape"]
     drawn = {metadata["shape_names"][shape] for shape in shapes[shapes >= 0]}
     assert drawn == {"mug", "ycb/mug", "ycb/brick"}
@@ -174,10 +175,10 @@ def test_a_full_disk_leaves_whole_files_that_count_and_room_to_go_on(
 
 
 def test_an_empty_dataset_is_begun_again(small: SimpleNamespace, tmp_path: Path) -> None:
-    metadata = {"format": "cavin_pyro episodes", "version": 1, "settings": {"seed": 9}}
+    metadata = {"format": "cavin_pyro episodes", "version": 1, "configuration": {"seed": 9}}
     counts = {"shards": 0, "episodes": 0, "transitions": 0}
     (tmp_path / "metadata.json").write_text(json.dumps({**metadata, **counts}))
-    assert collect(small.pushes, tmp_path, transitions=1, workers=1)["settings"]["seed"] == 3
+    assert collect(small.pushes, tmp_path, transitions=1, workers=1)["configuration"]["seed"] == 3
 
 
 def test_the_time_of_every_file_is_recorded_apart_from_the_data(pushes: Path) -> None:

@@ -129,7 +129,7 @@ def test_a_dataset_without_any_whole_shard_is_refused(own_pushes: Path) -> None:
         ({"shards": 0}, "is empty: collect it again"),
         ({"shards": "three"}, "is damaged"),
         ({"transitions": None}, "is damaged"),
-        ({"settings": 5}, "is damaged"),
+        ({"configuration": 5}, "is damaged"),
     ],
 )
 def test_metadata_of_something_else_are_refused(changes: dict, said: str, own_pushes: Path) -> None:

@@ -50,7 +50,7 @@ def write(folder: Path, *shards: Arrays) -> Path:
         "episodes": sum(len(arrays["length"]) for arrays in shards),
         "transitions": 0,
     }
-    write_metadata(folder, {"settings": {"steps": STEPS}, "shape_names": ["can", "mug", "ycb/mug"], **counts})
+    write_metadata(folder, {"configuration": {"steps": STEPS}, "shape_names": ["can", "mug", "ycb/mug"], **counts})
     return folder
 
 
@@ -170,8 +170,8 @@ def test_a_share_of_the_windows_that_do_not_count_is_kept(tmp_path: Path) -> Non
     folder = write(tmp_path / "data", arrays)
     sizes = {}
     for share in (0.0, 0.25, 1.0):
-        settings = WindowConfig(validation_fraction=0.5, negative_fraction=share)
-        table = load_windows([folder], PointNet(), settings)
+        config = WindowConfig(validation_fraction=0.5, negative_fraction=share)
+        table = load_windows([folder], PointNet(), config)
         assert int(table.sequence_mask.sum()) == 12
         sizes[share] = len(table.starts) - 12
     assert (sizes[0.0], sizes[1.0]) == (0, 396 * 3)
@@ -195,9 +195,9 @@ def test_every_episode_is_either_for_training_or_for_validation(tmp_path: Path) 
 
 
 def test_more_data_do_not_change_what_was_held_out(tmp_path: Path) -> None:
-    settings = WindowConfig(validation_fraction=0.3)
-    few = load_windows([write(tmp_path / "few", episodes(30))], PointNet(), settings)
-    more = load_windows([write(tmp_path / "more", episodes(30), episodes(70, FIRST + 30))], PointNet(), settings)
+    config = WindowConfig(validation_fraction=0.3)
+    few = load_windows([write(tmp_path / "few", episodes(30))], PointNet(), config)
+    more = load_windows([write(tmp_path / "more", episodes(30), episodes(70, FIRST + 30))], PointNet(), config)
     assert {place for place in split(more)[1] if place < 30} == split(few)[1]
     assert max(split(more)[1]) >= 30
 
@@ -233,8 +233,8 @@ def test_a_batch_holds_what_the_arrays_hold(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("length", [1, 2, 5])
 def test_segments_of_any_length_that_an_episode_holds(length: int, tmp_path: Path) -> None:
-    settings = WindowConfig(validation_fraction=0.5, negative_fraction=1.0, minimum_move=0.04)
-    table = load(tmp_path, episodes(), settings, segment_length=length)
+    config = WindowConfig(validation_fraction=0.5, negative_fraction=1.0, minimum_move=0.04)
+    table = load(tmp_path, episodes(), config, segment_length=length)
     assert len(table.starts) == 12 * (POSITIONS - length)
     assert table.batch(torch.arange(2)).segment_length == length
 
@@ -247,7 +247,7 @@ def test_datasets_can_be_joined_if_their_episodes_have_equal_length(tmp_path: Pa
     arrays = episodes(5, first=70)
     np.testing.assert_array_equal(joined.actions[0], arrays["actions"][0, :3])
     np.testing.assert_array_equal(joined.actions[1], arrays["actions"][4, 2:5])
-    write_metadata(second, {"settings": {"steps": 7}, "shards": 1, "episodes": 5, "transitions": 0})
+    write_metadata(second, {"configuration": {"steps": 7}, "shards": 1, "episodes": 5, "transitions": 0})
     with pytest.raises(UserError, match=r"cannot be joined: .*first has steps=5, .*second has steps=7"):
         load_windows([first, second], PointNet(), EVERY)
 
@@ -302,7 +302,7 @@ def test_a_dataset_without_any_held_out_object_counts_in_full(tmp_path: Path) ->
     arrays["shape"] = np.repeat(np.arange(60) % 2, OBJECTS).reshape(60, OBJECTS)
     arrays["scale"] = np.ones((60, OBJECTS), np.float32)
     first, second = write(tmp_path / "first", arrays), write(tmp_path / "second", other)
-    write_metadata(second, {"settings": {"steps": STEPS}, "shards": 1, "episodes": 5, "transitions": 0})
+    write_metadata(second, {"configuration": {"steps": STEPS}, "shards": 1, "episodes": 5, "transitions": 0})
     held_out = replace(EVERY, held_out_objects=("mug",))
     alone, together = load_windows([first], PointNet(), held_out), load_windows([first, second], PointNet(), held_out)
     assert len(together.starts) == len(alone.starts) + 3 * 5

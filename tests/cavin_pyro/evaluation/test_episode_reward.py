@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from cavin_pyro.evaluation.evaluation import evaluate
-from cavin_pyro.evaluation.factory import set_up
+from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.rollout import rollout
 from envs.tasks import TaskReward
 from envs.workspace import tile_center
@@ -16,34 +16,34 @@ RANDOM = ("task=insertion", "layout=random", "planner.samples=8", "planner.horiz
 
 
 def test_a_planner_uses_the_layout_of_the_episode(configure: Any) -> None:
-    setup = set_up(configure(*RANDOM, "reward=dense", "margin=0.03"))
+    runner = make_runner(configure(*RANDOM, "reward=dense", "margin=0.03"))
     layouts = set()
     judged = []
     for seed in range(8):
-        _, info = setup.env.reset(seed=seed)
-        assert setup.planner.reward.task == setup.task == setup.env.task == info["task"]
+        _, info = runner.env.reset(seed=seed)
+        assert runner.planner.reward.task == runner.task == runner.env.task == info["task"]
         fresh = TaskReward(info["task"], reward="dense", margin=0.03)
         mask = torch.ones(3, dtype=torch.bool)
         before, after = 0.3 + 0.6 * torch.rand(2, 50, 3, 3)
         after[0, 0, :2] = torch.tensor(tile_center(info["task"].goal.tiles[0]))
-        told, expected = setup.planner.reward(before, after, mask), fresh(before, after, mask)
+        told, expected = runner.planner.reward(before, after, mask), fresh(before, after, mask)
         for name in ("reward", "success", "failure"):
             assert torch.equal(getattr(told, name), getattr(expected, name))
         layouts.add(info["task"])
         judged.append(fresh(before, after, mask).success.any())
-    setup.env.close()
+    runner.env.close()
     assert len(layouts) > 2 and any(judged)
-    assert (setup.planner.reward.dense, setup.planner.reward.margin) == (True, 0.03)
+    assert (runner.planner.reward.dense, runner.planner.reward.margin) == (True, 0.03)
 
 
 def test_an_earlier_episode_does_not_change_what_is_planned_in_a_later_one(configure: Any) -> None:
     plans = []
     for earlier in ([], [4, 5]):
-        setup = set_up(configure(*RANDOM))
+        runner = make_runner(configure(*RANDOM))
         for seed in [*earlier, 6]:
-            episode = rollout(setup.env, setup.planner, setup.pointnet, seed=seed)
+            episode = rollout(runner.env, runner.planner, runner.pointnet, seed=seed)
         plans.append(episode.plan_records[0].plan)
-        setup.env.close()
+        runner.env.close()
     for one, other in zip(plans[0], plans[1], strict=True):
         if isinstance(one, torch.Tensor):
             assert torch.equal(one, other)

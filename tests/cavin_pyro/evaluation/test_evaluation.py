@@ -11,7 +11,7 @@ import torch
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import episode_row, evaluate
-from cavin_pyro.evaluation.factory import Setup, set_up
+from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import (
     OUTCOMES,
     Episode,
@@ -192,39 +192,39 @@ def test_a_kill_while_an_evaluation_begins_again_loses_no_episode(
     assert (tmp_path / "episodes.jsonl").read_text() == before
 
 
-def parts(setup: Setup) -> SimpleNamespace:
-    setup.env.close()
-    return SimpleNamespace(**vars(setup), task=setup.task)
+def parts(runner: EpisodeRunner) -> SimpleNamespace:
+    runner.env.close()
+    return SimpleNamespace(**vars(runner), task=runner.task)
 
 
 def test_options_reach_the_parts(configure: Any) -> None:
-    setup = parts(set_up(configure(*fast("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7"))))
-    assert isinstance(setup.planner, CavinPlanner)
-    assert (setup.planner.samples, setup.planner.segments) == (8, 2)
-    assert setup.task.name == "insertion"
-    assert setup.planner.reward.dense and setup.env.reward.dense
-    assert (setup.planner.reward.margin, setup.env.reward.margin) == (0.02, 0.0)
-    assert (setup.env.maximum_steps, setup.env.objects) == (7, 2)
-    assert not any(parameter.requires_grad for parameter in setup.planner.model.parameters())
-    setup = parts(set_up(configure("planner=random", "env.ranges.names=[mug]", "env.ranges.scale=[1,1]")))
-    assert isinstance(setup.planner, RandomPlanner)
-    assert {one.name for one in setup.env.scene.objects} == {"mug"}
+    runner = parts(make_runner(configure(*fast("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7"))))
+    assert isinstance(runner.planner, CavinPlanner)
+    assert (runner.planner.samples, runner.planner.segments) == (8, 2)
+    assert runner.task.name == "insertion"
+    assert runner.planner.reward.dense and runner.env.reward.dense
+    assert (runner.planner.reward.margin, runner.env.reward.margin) == (0.02, 0.0)
+    assert (runner.env.maximum_steps, runner.env.objects) == (7, 2)
+    assert not any(parameter.requires_grad for parameter in runner.planner.model.parameters())
+    runner = parts(make_runner(configure("planner=random", "env.ranges.names=[mug]", "env.ranges.scale=[1,1]")))
+    assert isinstance(runner.planner, RandomPlanner)
+    assert {one.name for one in runner.env.scene.objects} == {"mug"}
 
 
 def test_tiles_on_the_command_line_replace_those_of_the_layout(configure: Any) -> None:
-    plain = parts(set_up(configure("planner=random"))).task
-    moved = parts(set_up(configure("planner=random", "tiles.goal=[[1,1],[1,2]]"))).task
+    plain = parts(make_runner(configure("planner=random"))).task
+    moved = parts(make_runner(configure("planner=random", "tiles.goal=[[1,1],[1,2]]"))).task
     assert tuple(moved.goal) == ((1, 1), (1, 2)) != tuple(plain.goal)
     assert moved.region == plain.region
-    setup = parts(set_up(configure(*fast("tiles.goal=[[1,1],[1,2]]"))))
-    assert setup.planner.reward.task == setup.env.task == moved
+    runner = parts(make_runner(configure(*fast("tiles.goal=[[1,1],[1,2]]"))))
+    assert runner.planner.reward.task == runner.env.task == moved
 
 
 @pytest.mark.parametrize("task", ["clearing", "insertion", "crossing"])
 @pytest.mark.parametrize("layout", [0, 1, 2])
 def test_every_builtin_layout_has_room_for_five_objects(task: str, layout: int, configure: Any) -> None:
-    setup = parts(set_up(configure("planner=random", f"task={task}", f"layout={layout}", "objects=5")))
-    assert len(setup.env.scene.objects) == 5
+    runner = parts(make_runner(configure("planner=random", f"task={task}", f"layout={layout}", "objects=5")))
+    assert len(runner.env.scene.objects) == 5
 
 
 def test_a_checkpoint_that_knows_fewer_objects_is_refused(
@@ -234,7 +234,7 @@ def test_a_checkpoint_that_knows_fewer_objects_is_refused(
     config["model"]["maximum_objects"] = 2
     path = tmp_path / "two.safetensors"
     save_checkpoint(path, parts=small.parts(), config=config, provenance={})
-    parts(set_up(configure(f"checkpoint={path}", "objects=2")))
+    parts(make_runner(configure(f"checkpoint={path}", "objects=2")))
     with pytest.raises(UserError, match=r"objects=3, but checkpoint .*two\.safetensors knows at most 2: use objects=2"):
-        set_up(configure(f"checkpoint={path}", "objects=3"))
-    parts(set_up(configure(f"checkpoint={path}", "objects=3", "planner=random")))  # which asks no model
+        make_runner(configure(f"checkpoint={path}", "objects=3"))
+    parts(make_runner(configure(f"checkpoint={path}", "objects=3", "planner=random")))  # which asks no model

@@ -20,7 +20,7 @@ from gymnasium.utils.env_checker import check_env
 from cavin_pyro.config.commands.world import WorldConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import options
-from cavin_pyro.evaluation.factory import set_up
+from cavin_pyro.evaluation.factory import make_runner
 from envs.pushing import PushingEnv
 from envs.tasks import TASKS
 from tests.real_assets import REAL_ASSETS
@@ -56,13 +56,13 @@ def env(request: pytest.FixtureRequest, configure: Any) -> Iterator[PushingEnv]:
     choices = [f"{name}={value}" for name, value in request.param.items()]
     assets = [f"env.assets={REAL_ASSETS}"] if REAL_ASSETS.is_dir() else []
     try:
-        setup = set_up(configure("planner=random", *choices, *assets), render=True)
+        runner = make_runner(configure("planner=random", *choices, *assets), render=True)
     except UserError as error:
         if "assets" in str(error) and not assets:
             pytest.skip(f"no meshes at {REAL_ASSETS}, set CAVIN_ASSETS to their folder: {error}")
         raise
-    yield setup.env
-    setup.env.close()
+    yield runner.env
+    runner.env.close()
 
 
 def test_gymnasiums_checks_pass_and_a_seed_determines_an_episode(env: PushingEnv) -> None:

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from cavin_pyro.config import parts as building
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.factory import Setup, announce_waiting, set_up
+from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, rollout
 from cavin_pyro.storage.checkpoint import save_checkpoint
 from cavin_pyro.visualization.plan import draw_plan
@@ -50,20 +50,20 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture
-def setup(checkpoints: dict[str, Path]) -> Callable[..., Setup]:
-    def build(planner: str, model: str, *further: str) -> Setup:
+def make_small_runner(checkpoints: dict[str, Path]) -> Callable[..., EpisodeRunner]:
+    def make(planner: str, model: str, *further: str) -> EpisodeRunner:
         overrides = [f"planner={planner}", f"checkpoint={checkpoints[model]}", *SMALL, *further]
-        return set_up(compose("evaluate", *overrides, "output=unused"))
+        return make_runner(compose("evaluate", *overrides, "output=unused"))
 
-    return build
+    return make
 
 
 @pytest.mark.parametrize("optimizer", sorted(OPTIMIZERS))
 @pytest.mark.parametrize("planner", sorted(FITTING))
 def test_every_planner_plans_with_every_optimizer(
-    planner: str, optimizer: str, setup: Callable[..., Setup], tmp_path: Path
+    planner: str, optimizer: str, make_small_runner: Callable[..., EpisodeRunner], tmp_path: Path
 ) -> None:
-    parts = setup(planner, FITTING[planner], f"planner.optimizer={optimizer}")
+    parts = make_small_runner(planner, FITTING[planner], f"planner.optimizer={optimizer}")
     episode = rollout(parts.env, parts.planner, parts.pointnet, seed=1)
     assert episode.outcome in OUTCOMES
     plan = episode.plan_records[0].plan
@@ -93,7 +93,7 @@ def test_options_take_effect(planner: str, option: str) -> None:
     plans = []
     for further in ([], [option]):
         overrides = [f"planner={planner}", *SMALL, "planner.samples=64", *further, "output=unused"]
-        parts = set_up(compose("evaluate", *overrides))  # the shipped checkpoint knows something
+        parts = make_runner(compose("evaluate", *overrides))  # the shipped checkpoint knows something
         plans.append(rollout(parts.env, parts.planner, parts.pointnet, seed=1).plan_records[0].plan)
         parts.env.close()
     returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
@@ -102,7 +102,7 @@ def test_options_take_effect(planner: str, option: str) -> None:
 
 @pytest.mark.soak  # tests/planning/backends/test_compiled.py compiles a whole planner of a toy model in every run
 @needs_a_compiler
-def test_compiled_plans_are_those_of_direct_planning(setup: Callable[..., Setup]) -> None:
+def test_compiled_plans_agree_with_eager_plans(make_small_runner: Callable[..., EpisodeRunner]) -> None:
     plans = []
     for compile in ("false", "true"):
         overrides = [
@@ -111,14 +111,14 @@ def test_compiled_plans_are_those_of_direct_planning(setup: Callable[..., Setup]
             f"planner.compile={compile}",
             "task=insertion",
         ]
-        parts = setup("cavin", "cascaded", *overrides)
+        parts = make_small_runner("cavin", "cascaded", *overrides)
         episode = rollout(parts.env, parts.planner, parts.pointnet, seed=1)
         plans.append([record.plan for record in episode.plan_records])
         parts.env.close()
-    for direct, compiled in zip(*plans, strict=True):
-        torch.testing.assert_close(compiled.candidate_returns, direct.candidate_returns)
-        torch.testing.assert_close(compiled.actions, direct.actions, rtol=1e-3, atol=1e-4)
-        torch.testing.assert_close(compiled.predicted_centers, direct.predicted_centers, rtol=1e-3, atol=1e-4)
+    for eager, compiled in zip(*plans, strict=True):
+        torch.testing.assert_close(compiled.candidate_returns, eager.candidate_returns)
+        torch.testing.assert_close(compiled.actions, eager.actions, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(compiled.predicted_centers, eager.predicted_centers, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("planner", ["cavin", "random"])
@@ -134,16 +134,18 @@ def test_flows_are_not_compiled(tmp_path: Path) -> None:
     path = save_untrained(tmp_path / "flow.safetensors", "model=cascaded", "prior=flow")
     config = compose("evaluate", f"checkpoint={path}", "planner.compile=true", "output=unused")
     with pytest.raises(UserError, match=r"the priors in .*flow\.safetensors are flows, which cannot be compiled: take"):
-        set_up(config)
+        make_runner(config)
 
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("planner", sorted(FITTING))
-def test_a_planner_names_the_model_that_it_needs(planner: str, model: str, setup: Callable[..., Setup]) -> None:
+def test_a_planner_names_the_model_that_it_needs(
+    planner: str, model: str, make_small_runner: Callable[..., EpisodeRunner]
+) -> None:
     if planner == "mpc" or FITTING[planner] == model:  # all models have dynamics
-        setup(planner, model).env.close()
+        make_small_runner(planner, model).env.close()
     else:
         with pytest.raises(
             UserError, match=f"needs a checkpoint of model={FITTING[planner]}, but .*{model}.safetensors"
         ):
-            setup(planner, model)
+            make_small_runner(planner, model)

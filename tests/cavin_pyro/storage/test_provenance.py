@@ -35,11 +35,11 @@ def test_the_provenance_of_a_trained_model_names_its_data_and_pointnet(
 ) -> None:
     parts, path = small.parts(), tmp_path / "pointnet.safetensors"
     save_checkpoint(path, parts={"pointnet": parts["pointnet"]}, config={}, provenance={"command": "pretrain"})
-    settings = WindowConfig(minimum_move=0.005, validation_fraction=0.3)
-    windows = load_windows([own_pushes], parts["pointnet"], settings)
+    config = WindowConfig(minimum_move=0.005, validation_fraction=0.3)
+    windows = load_windows([own_pushes], parts["pointnet"], config)
     record = training_provenance([own_pushes], path, windows)
     ((data),) = record["data"]
-    assert (data["transitions"], data["episodes"], data["settings"]["seed"]) == (72, 12, 3)
+    assert (data["transitions"], data["episodes"], data["configuration"]["seed"]) == (72, 12, 3)
     assert record["pointnet"] == {"command": "pretrain"}
     assert record["training_windows"] == len(windows.training) > 0
     # A PointNet out of a whole checkpoint keeps its own record.

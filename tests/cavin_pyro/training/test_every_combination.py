@@ -65,8 +65,8 @@ def composed(model: str, guide: str, prior: str, objective: str, scales: str = "
 def windows(pushes: Path, tmp_path_factory: pytest.TempPathFactory) -> WindowTable:
     torch.manual_seed(0)
     own = shutil.copytree(pushes, tmp_path_factory.mktemp("combinations") / "pushes")  # features go there
-    settings = WindowConfig(validation_fraction=0.4, minimum_move=0.001, negative_fraction=1.0)
-    return load_windows([own], PointNet().requires_grad_(False).eval(), settings, seed=1)
+    config = WindowConfig(validation_fraction=0.4, minimum_move=0.001, negative_fraction=1.0)
+    return load_windows([own], PointNet().requires_grad_(False).eval(), config, seed=1)
 
 
 def validation_loss(model: Any, guide: Any, table: WindowTable) -> float:

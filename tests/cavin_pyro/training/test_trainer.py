@@ -78,13 +78,13 @@ def without_speed(rows: list[Row]) -> list[Row]:
 
 
 def test_a_constant_learning_rate_stays() -> None:
-    settings = TrainerConfig(steps=100, learning_rate=1e-3)
-    assert {settings.rate(step) for step in (0, 50, 99)} == {1e-3}
+    config = TrainerConfig(steps=100, learning_rate=1e-3)
+    assert {config.rate(step) for step in (0, 50, 99)} == {1e-3}
 
 
 def test_a_cosine_falls_from_the_learning_rate_to_a_hundredth() -> None:
-    settings = TrainerConfig(steps=100, learning_rate=1e-3, schedule="cosine")
-    rates = [settings.rate(step) for step in range(101)]
+    config = TrainerConfig(steps=100, learning_rate=1e-3, schedule="cosine")
+    rates = [config.rate(step) for step in range(101)]
     assert rates[0] == 1e-3
     assert rates[50] == pytest.approx(0.505e-3)
     assert rates[100] == pytest.approx(1e-5)
@@ -92,12 +92,12 @@ def test_a_cosine_falls_from_the_learning_rate_to_a_hundredth() -> None:
 
 
 def test_the_optimizer_follows_the_schedule(small: SimpleNamespace, tmp_path: Path) -> None:
-    settings = TrainerConfig(**{**vars(SHORT), "schedule": "cosine"})
-    run = trainer(small, tmp_path / "run", settings)
+    config = TrainerConfig(**{**vars(SHORT), "schedule": "cosine"})
+    run = trainer(small, tmp_path / "run", config)
     run.run()
     (group,) = run._optimizer.param_groups
-    assert group["lr"] == settings.rate(7)
-    assert [row["learning_rate"] for row in run.rows] == [settings.rate(step) for step in (2, 4, 6, 8)]
+    assert group["lr"] == config.rate(7)
+    assert [row["learning_rate"] for row in run.rows] == [config.rate(step) for step in (2, 4, 6, 8)]
 
 
 def test_training_lowers_the_loss_and_reports_every_term(small: SimpleNamespace, tmp_path: Path) -> None:
@@ -164,8 +164,8 @@ def test_gradients_are_clipped(small: SimpleNamespace, tmp_path: Path) -> None:
 
 
 def test_training_stops_when_patience_is_lost(small: SimpleNamespace, tmp_path: Path) -> None:
-    settings = TrainerConfig(**{**vars(SHORT), "steps": 100, "learning_rate": 0.0, "patience": 3})
-    run = trainer(small, tmp_path / "run", settings)
+    config = TrainerConfig(**{**vars(SHORT), "steps": 100, "learning_rate": 0.0, "patience": 3})
+    run = trainer(small, tmp_path / "run", config)
     run.run()
     assert run.best_step == 2  # never better again
     assert run.step == 2 * (1 + 3)
