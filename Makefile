@@ -15,7 +15,7 @@ install := $(bin)/python -m pip install --disable-pip-version-check --no-input -
 installed := .venv/installed
 installed_for_tests := .venv/installed-for-tests
 # The variable switches off a notice about what comes after Material for MkDocs: docs/reference/dependencies.md.
-build_docs := NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict --quiet
+build_docs := NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict
 
 .PHONY: demo test soak docs clean
 
