@@ -1,1 +1,1 @@
-"""What is inferred: inference networks and the Pyro guide programs."""
+"""Inference networks and the Pyro guide programs."""

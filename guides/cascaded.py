@@ -1,4 +1,4 @@
-"""The guide beside `models/cascaded.py` (paper, section 3.3)."""
+"""The guide of `models/cascaded.py` (paper, section 3.3)."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class CascadedGuide(Guide):
     fits = ("cascaded",)
 
     def __init__(self, model: CascadedModel, *, width: int = 64) -> None:
-        """Dimensions are the model's; `width` is that of the guide's own layers.
+        """`width` is that of the guide's own layers; all other dimensions are the model's.
 
-        Raises `ValueError` for a model that this guide does not fit.
+        Raises `ValueError` for an incompatible model.
         """
         super().__init__(model)
         self.effect_inference = effect_inference(model, width=width)
         self.motion_inference = motion_inference(model, width=width, reads_effect=True)
 
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. It infers the codes from the window, also where the model then generates."""
+        """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
         first, last = window.first, window.last
         encoded = self.model.encode(window, generate) if encoded is None else encoded
 

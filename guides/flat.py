@@ -1,4 +1,4 @@
-"""The guide beside `models/flat.py` (paper, appendix A.2)."""
+"""The guide of `models/flat.py` (paper, appendix A.2)."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class FlatGuide(Guide):
     fits = ("flat",)
 
     def __init__(self, model: FlatModel, *, width: int = 64) -> None:
-        """Dimensions are the model's; `width` is that of the guide's own layers.
+        """`width` is that of the guide's own layers; all other dimensions are the model's.
 
-        Raises `ValueError` for a model that this guide does not fit.
+        Raises `ValueError` for an incompatible model.
         """
         super().__init__(model)
         self.motion_inference = motion_inference(model, width=width, reads_effect=False)
 
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. It infers the code from the window, also where the model then generates."""
+        """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
         first = window.first
         encoded = self.model.encode(window, generate) if encoded is None else encoded
 

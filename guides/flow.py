@@ -1,4 +1,4 @@
-"""The cascaded guide with normalizing flows in the place of its Gaussians."""
+"""The cascaded guide with normalizing flows instead of Gaussians."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ class FlowCode(nn.Module):
 
 
 class FlowGuide(CascadedGuide):
-    """Infers the two codes of each window, the motion given the effect, by posteriors that need not be Gaussian.
+    """Infers the two codes of each window, the motion given the effect, with posteriors that need not be Gaussian.
 
     c ~ flow over q_h(c | s, s')      # effect_code
     z ~ flow over q_g(z | s, a, c)    # motion_code
 
-    The flows start as the identity, so before training this guide equals the one that it extends.
+    The flows start as the identity, so before training this guide equals `CascadedGuide`.
     """
 
     def __init__(self, model: CascadedModel, *, width: int = 64, flow_width: int = 32, transforms: int = 4) -> None:
         """`flow_width` is the width of the hidden layer in each of the `transforms` couplings of a flow.
 
-        Raises `ValueError` for a model that this guide does not fit.
+        Raises `ValueError` for an incompatible model.
         """
         super().__init__(model, width=width)
-        # Around the existing Gaussians, so that equal seeds give both guides equal initial weights.
+        # Wraps the existing Gaussians, so that equal seeds give both guides equal initial weights.
         for inference, dimension in (
             (self.effect_inference, model.effect_dimension),
             (self.motion_inference, model.motion_dimension),

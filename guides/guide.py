@@ -9,25 +9,25 @@ from models.program import Program
 
 
 class Guide(Program):
-    """A guide for the models that `fits` names, by their `name`.
+    """A guide for the models in `fits`, by their `name`.
 
-    A guide's `forward(window, generate=False, encoded=None)` has a `pyro.sample` for every code of the model and none
-    for anything else. `encoded` is what `model.encode(window, generate)` returns, computed here if it is not given.
+    A guide's `forward(window, generate=False, encoded=None)` has a `pyro.sample` for every code of the model and no
+    others. `encoded` is the result of `model.encode(window, generate)`, which `forward` computes if it is None.
     """
 
     fits: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, model: Model) -> None:
-        """Raises `ValueError` for a model that this guide does not fit."""
+        """Raises `ValueError` for an incompatible model."""
         super().__init__()
         if not isinstance(model, Model) or model.name not in self.fits:
             raise ValueError(
                 f"guide {type(self).__name__} does not fit model {type(model).__name__}; it fits {', '.join(self.fits)}"
             )
-        # In a tuple, so that the model's parameters are not registered (and saved) here a second time.
+        # In a tuple, so that the model's parameters are not registered (and saved) in the guide as well.
         self._model = (model,)
 
     @property
     def model(self) -> Model:
-        """The model that this guide goes with: it gives dimensions, and networks to share."""
+        """The model of this guide, with its dimensions and shared networks."""
         return self._model[0]

@@ -1,4 +1,4 @@
-"""A guide for `models/cascaded.py` whose two codes both see the actions: an ablation of the cascade."""
+"""A guide for `models/cascaded.py` whose two codes both depend on the actions: an ablation of the cascade."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from models.state import Window
 
 
 class JointGuide(Guide):
-    """Infers the two codes of each window from everything that the model's exact posterior depends on.
+    """Infers the two codes of each window from all inputs of the model's exact posterior.
 
     c ~ q(c | s, s', a)     # effect_code
     z ~ q_g(z | s, a, c)    # motion_code
@@ -22,16 +22,16 @@ class JointGuide(Guide):
     fits = ("cascaded",)
 
     def __init__(self, model: CascadedModel, *, width: int = 64) -> None:
-        """Dimensions are the model's; `width` is that of the guide's own layers.
+        """`width` is that of the guide's own layers; all other dimensions are the model's.
 
-        Raises `ValueError` for a model that this guide does not fit.
+        Raises `ValueError` for an incompatible model.
         """
         super().__init__(model)
         self.effect_inference = effect_inference(model, width=width, reads_actions=True)
         self.motion_inference = motion_inference(model, width=width, reads_effect=True)
 
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. It infers the codes from the window, also where the model then generates."""
+        """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
         first, last = window.first, window.last
         encoded = self.model.encode(window, generate) if encoded is None else encoded
 

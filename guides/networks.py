@@ -18,7 +18,7 @@ def push_features(width: int) -> nn.Sequential:
 
 
 class EffectInference(nn.Module):
-    """q_h(c | s, s'): the effect that turned s into s'; with `reads_actions`, q(c | s, s', a).
+    """q_h(c | s, s'): the effect between s and s'; with `reads_actions`, q(c | s, s', a).
 
     Per object two FC on (s, s' - s), centers and features; masked sum over objects; FC of each push, concatenated over
     T, with `reads_actions`; FC; Gaussian.
@@ -40,7 +40,7 @@ class EffectInference(nn.Module):
         self.code: nn.Module = GaussianCode(effect_dimension, width=width)
 
     def forward(self, state: State, subgoal: State, actions: Tensor | None = None) -> TorchDistribution:
-        """`state, subgoal: [...]`, `actions: [..., T, 4]` -> batch `[...]`; objects count that are real in both."""
+        """`state, subgoal: [...]`, `actions: [..., T, 4]` -> batch `[...]`; counts objects that are real in both."""
         parts = (
             relative_positions(state.centers),
             state.features,
@@ -55,7 +55,7 @@ class EffectInference(nn.Module):
 
 
 class MotionInference(nn.Module):
-    """q_g(z | s, a, c): the motion that brought the effect about; with `effect_dimension=None`, q(z | s, a).
+    """q_g(z | s, a, c): the motion behind the actions; with `effect_dimension=None`, q(z | s, a).
 
     (s, c) pooled as in the action generator; FC of each push, concatenated over T; FC of both; Gaussian.
     """

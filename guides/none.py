@@ -1,4 +1,4 @@
-"""The guide beside `models/dynamics_only.py`."""
+"""The guide of `models/dynamics_only.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guide beside `models/single_latent.py` (paper, appendix A.2)."""
+"""The guide of `models/single_latent.py` (paper, appendix A.2)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class SingleLatentGuide(Guide):
     fits = ("single_latent",)
 
     def __init__(self, model: SingleLatentModel, *, width: int = 64, reads_actions: bool = False) -> None:
-        """Dimensions are the model's; `width` is that of the guide's own layers.
+        """`width` is that of the guide's own layers; all other dimensions are the model's.
 
-        Raises `ValueError` for a model that this guide does not fit.
+        Raises `ValueError` for an incompatible model.
         """
         super().__init__(model)
         self.effect_inference = effect_inference(model, width=width, reads_actions=reads_actions)
 
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. It infers the code from the window, also where the model then generates."""
+        """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
         with windows_plate(window), sequence_mask(window):
             pyro.sample("effect_code", self.effect_inference(window.first, window.last, window.actions))

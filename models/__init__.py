@@ -1,1 +1,1 @@
-"""What is generated: state types, networks, priors and the Pyro model programs."""
+"""State types, networks, priors and the Pyro model programs."""

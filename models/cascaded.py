@@ -27,8 +27,8 @@ class CascadedModel(Model):
     a ~ g(a | s, c, z)               # actions, T pushes
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
-    The first four lines count where `sequence_mask` is set, pair t of the last where `transition_mask` is.
-    Objects count that are real in both states of a term. Padding must be finite and is otherwise ignored.
+    `sequence_mask` masks the first four lines, `transition_mask` masks pair t of the last. A term counts the objects
+    that are real in both of its states. Padding must be finite and is otherwise ignored.
     """
 
     name = "cascaded"
@@ -43,7 +43,7 @@ class CascadedModel(Model):
         motion_prior: Prior | None = None,
         **shared: Any,
     ) -> None:
-        """`shared` are the arguments of `Model`."""
+        """`shared`: the arguments of `Model`."""
         super().__init__(**shared)
         self.effect_dimension = effect_dimension
         self.motion_dimension = motion_dimension
@@ -59,8 +59,8 @@ class CascadedModel(Model):
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` it reads the first states only; it samples subgoals, actions and next states instead of
-        observing them (next states push by push, see `models/transitions.py`). `encoded` is what `encode` returns.
+        With `generate=True` it reads only the first states; it samples subgoals, actions and next states instead of
+        observing them (next states push by push, see `models/transitions.py`). `encoded` is the result of `encode`.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded

@@ -14,7 +14,7 @@ class DynamicsModel(Model):
 
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
-    Pair t counts where `transition_mask` is set, and there the objects that are real in both states.
+    `transition_mask` masks pair t, which counts the objects that are real in both states.
     """
 
     name = "dynamics"
@@ -23,8 +23,8 @@ class DynamicsModel(Model):
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` it reads the first states and the actions only and samples the next states. `encoded` is
-        what `encode` returns.
+        With `generate=True` it reads only the first states and the actions, and samples the next states. `encoded` is
+        the result of `encode`.
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded

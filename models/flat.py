@@ -24,7 +24,7 @@ class FlatModel(Model):
     a ~ g(a | s, z)                  # actions, T pushes
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
-    What counts is as in `CascadedModel`, whose networks these are but for h and the layers that read c.
+    Masks are as in `CascadedModel`, and so are the networks, without h and the layers that read c.
     """
 
     name = "flat"
@@ -37,7 +37,7 @@ class FlatModel(Model):
         motion_prior: Prior | None = None,
         **shared: Any,
     ) -> None:
-        """`shared` are the arguments of `Model`."""
+        """`shared`: the arguments of `Model`."""
         super().__init__(**shared)
         self.motion_dimension = motion_dimension
         self.trunk = EffectTrunk(None, width=self.width, encoder_width=self.width)
@@ -49,8 +49,8 @@ class FlatModel(Model):
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` it reads the first states only and samples all else. `encoded` is what `encode` returns.
-        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        With `generate=True` it reads only the first states and samples everything else. `encoded` is the result of
+        `encode`. Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded
         first = window.first
@@ -66,9 +66,9 @@ class FlatModel(Model):
             self.sample_transitions(window, encoded, actions, generate)
 
     def motion_prior(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
-        """p(z | s): `state: [...]` -> batch `[...]`, event `[Z]`; no effect code is read."""
+        """p(z | s): `state: [...]` -> batch `[...]`, event `[Z]`; the effect code is ignored."""
         return self.prior_of_motions(state)
 
     def actions(self, state: State, effect_code: Tensor | None = None, *, motion_code: Tensor) -> Tensor:
-        """Mean of g: `state: [...]`, `motion_code: [..., Z]` -> `[..., T, 4]`; no effect code is read."""
+        """Mean of g: `state: [...]`, `motion_code: [..., Z]` -> `[..., T, 4]`; the effect code is ignored."""
         return self.action_generator(self.trunk(self.encoder(state)), state.mask, motion_code)

@@ -14,8 +14,8 @@ from torch import Tensor
 class IsotropicNormal(TorchDistribution):
     """N(loc, scale^2 I) for `loc: [..., D]`: batch `[...]`, event `[D]`.
 
-    Equal to `Normal(loc, scale).to_event(1)`, in a third of the passes over memory: the scale stays a
-    number (or a scalar tensor, to be learned), and squared errors are summed before they are weighted.
+    Equal to `Normal(loc, scale).to_event(1)`, with a third of its memory traffic: the scale is a number (or a scalar
+    tensor, if it is learned), and weights the sum of squared errors.
     """
 
     arg_constraints: dict[str, Any] = {"loc": constraints.real_vector}

@@ -25,7 +25,7 @@ class Scales:
     def centers(self, mean: State, mask: Tensor, *, event_dims: int = 1) -> TorchDistribution:
         """Observed centers around `mean`: event `[M, 3]`, or `[T, M, 3]` for `event_dims=2`.
 
-        `mask: [..., M]`: objects that count; the others (padding) contribute nothing.
+        `mask: [..., M]`: objects that count; others (padding) do not contribute.
         """
         return _masked_normal(mean.centers, self.center, mask, event_dims)
 
@@ -41,7 +41,7 @@ class Scales:
 
 @dataclass(frozen=True)
 class LikelihoodScales(Scales):
-    """Fixed standard deviations, which take the place of loss weights (the paper's choice and the default)."""
+    """Fixed standard deviations, instead of loss weights (the paper's choice and the default)."""
 
     center: float = 0.01  # metres
     feature: float = 0.1  # of a vector of unit length
@@ -50,7 +50,7 @@ class LikelihoodScales(Scales):
 
 
 class LearnedScales(Scales, nn.Module):
-    """Standard deviations that are parameters, shared by f and h, and by all windows."""
+    """Learned standard deviations, shared by f and h, and by all windows."""
 
     def __init__(
         self, *, center: float = 0.01, feature: float = 0.1, start: float = 0.077, motion: float = 0.245

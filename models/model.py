@@ -1,4 +1,4 @@
-"""Base class of model programs: what each of them has."""
+"""Base class of model programs."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Model(Program):
     """A process that generates windows of experience, with the dynamics f as its last line.
 
     A model's `forward(window, generate=False, encoded=None)` runs its process for `window: [B]`. With `generate=True`
-    it reads the first states only (and the actions, if it has none of its own) and samples everything else. `encoded`
-    is what `encode(window, generate)` returns: who runs a guide and a model encodes once and hands it to both.
+    it reads only the first states (and the actions, if it generates none) and samples everything else. `encoded` is the
+    result of `encode(window, generate)`: a caller that runs guide and model encodes once and passes it to both.
 
-    `codes` declares which latent sites a model has, and so what a planner can call, by these names and keywords:
+    `codes` declares a model's latent sites, and so the methods that a planner can call, with these keywords:
 
     always          `next_state(state, action)`                   mean of f, `State [...]`
     "effect_code"   `effect_prior(state)`                         p(c | s), batch `[...]`, event `[C]`
@@ -32,13 +32,13 @@ class Model(Program):
     one or both     `actions(state, effect_code, motion_code)`    mean of g, `[..., T, 4]`
 
     with `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]`, `action: [..., 4]`, whose leading
-    dimensions broadcast. A model without one of the codes takes the argument all the same, and never reads it.
+    dimensions broadcast. A model without one of the codes accepts the argument and ignores it.
     """
 
-    name: ClassVar[str]  # guides name by it the models that they fit
+    name: ClassVar[str]  # which guides list in `fits`
     codes: ClassVar[tuple[str, ...]]  # names of the latent sites, in their order
 
-    # Of the models whose `codes` say so:
+    # Only in models with these codes:
     effect_dimension: int  # C
     motion_dimension: int  # Z
     effect_prior: Callable[..., TorchDistribution]
@@ -83,9 +83,9 @@ class Model(Program):
         return self.encoder(window.states.step(slice(0, 1) if generate else slice(0, -1)))
 
     def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
-        """The sites of f, observed or sampled from the first states on (see `models/transitions.py`).
+        """The sites of f, observed, or sampled from the first states (see `models/transitions.py`).
 
-        `encoded` is what `encode` returns, `actions: [..., B, T, 4]` what f reads when it samples.
+        `encoded` is the result of `encode`, `actions: [..., B, T, 4]` the input of f for sampling.
         """
         if generate:
             generate_transitions(self.dynamics, self.encoder, self.scales, window.first, actions)

@@ -1,4 +1,4 @@
-"""Where every program over windows puts its sites: the plate, and the mask of the terms with codes."""
+"""The plate over windows, and the mask of the sites with codes, for all programs."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from models.state import Window
 
 
 def windows_plate(window: Window) -> AbstractContextManager:
-    """Windows of the batch `window: [B]` are independent."""
+    """The plate over the independent windows of a batch `window: [B]`."""
     return pyro.plate("windows", len(window.actions))
 
 
 def sequence_mask(window: Window) -> AbstractContextManager:
-    """Sites within contribute to the loss where `window.sequence_mask: [B]` is set."""
+    """Masks sites by `window.sequence_mask: [B]`."""
     return poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]

@@ -11,10 +11,9 @@ from torch import nn
 class Program(nn.Module):
     """A Pyro program whose networks are its submodules.
 
-    Each call registers the parameters with `pyro.module`, because `SVI` and Pyro's optimizers look for them in Pyro's
-    parameter store. With `pyro.settings.set(module_local_params=True)` nobody looks there: `Trace_ELBO()(model, guide)`
-    is a module like any other, a torch optimizer trains its parameters, and calls skip the registration, about a tenth
-    of a training step.
+    Each call registers the parameters with `pyro.module`, because `SVI` and Pyro's optimizers find them in Pyro's
+    parameter store. `pyro.settings.set(module_local_params=True)` disables the store: `Trace_ELBO()(model, guide)` is
+    then an ordinary module for a torch optimizer, and calls skip the registration, about a tenth of a training step.
     """
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:

@@ -21,14 +21,14 @@ from models.transitions import sample_subgoal
 
 
 class SingleLatentModel(Model):
-    """Effects that determine the pushes as well, for each window with states s = s_0, ..., s_T = s'.
+    """Effects that also determine the pushes, for each window with states s = s_0, ..., s_T = s'.
 
     c ~ p(c | s)                     # effect_code
     s' ~ h(s' | s, c)                # subgoal_centers, subgoal_features
     a ~ g(a | s, c)                  # actions, T pushes; log-density times action_weight
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
-    What counts is as in `CascadedModel`, whose networks these are but for the layers that read z.
+    Masks are as in `CascadedModel`, and so are the networks, without the layers that read z.
     """
 
     name = "single_latent"
@@ -42,11 +42,11 @@ class SingleLatentModel(Model):
         action_weight: float = 1.0,
         **shared: Any,
     ) -> None:
-        """`shared` are the arguments of `Model`.
+        """`shared`: the arguments of `Model`.
 
-        `action_weight` is the balance between the two reconstructions, which the paper says needs care
-        (section 4.2): a weight w is, but for a constant, standard deviations of the pushes divided by sqrt(w).
-        Only with 1 is the objective a bound on the evidence. Raises `ValueError` unless it is above 0.
+        `action_weight` balances the two reconstructions, which the paper tunes with care (section 4.2): up to a
+        constant, a weight w divides the standard deviations of the pushes by sqrt(w). The objective is a bound on the
+        evidence only with 1. Raises `ValueError` unless it is above 0.
         """
         if not 0 < action_weight < math.inf:
             raise ValueError(f"action_weight must be a positive number, not {action_weight}")
@@ -64,8 +64,8 @@ class SingleLatentModel(Model):
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """Run the process for `window: [B]`, a batch of training examples.
 
-        With `generate=True` it reads the first states only and samples all else. `encoded` is what `encode` returns.
-        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        With `generate=True` it reads only the first states and samples everything else. `encoded` is the result of
+        `encode`. Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded
         first = window.first
@@ -93,5 +93,5 @@ class SingleLatentModel(Model):
         return self.meta_dynamics(state, self.meta_dynamics.effect(self.encoder(state), effect_code))
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor | None = None) -> Tensor:
-        """Mean of g: `state: [...]`, `effect_code: [..., C]` -> `[..., T, 4]`; no motion code is read."""
+        """Mean of g: `state: [...]`, `effect_code: [..., C]` -> `[..., T, 4]`; the motion code is ignored."""
         return self.action_generator(self.meta_dynamics.effect(self.encoder(state), effect_code), state.mask)

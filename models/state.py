@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class State(NamedTuple):
-    """What the robot knows of `M` objects (padded to a fixed number) in any batch `[...]` of scenes.
+    """The observed state of `M` objects (padded to a fixed number) in any batch `[...]` of scenes.
 
     `state[0]` is the tuple's first field, not a scene: use `scene`, `step` and `take_plans` to index.
     """
@@ -55,7 +55,7 @@ class State(NamedTuple):
         return single.expand((*self.batch_shape, plans))
 
     def take_plans(self, index: Tensor) -> State:
-        """Choose plans by number, per scene: fields `[B, N, ...]`, `index: [B, n]` int64 -> `[B, n, ...]`."""
+        """Take plans by number, per scene: fields `[B, N, ...]`, `index: [B, n]` int64 -> `[B, n, ...]`."""
         rows = torch.arange(index.shape[0], device=index.device).unsqueeze(-1)
         return self.map(lambda field: field[rows, index])
 
@@ -65,7 +65,7 @@ class Window(NamedTuple):
 
     states: State  # fields with leading [..., T + 1]
     actions: Tensor  # [..., T, 4] normalised pushes (x, y, dx, dy): start and motion
-    transition_mask: Tensor  # [..., T] bool: pairs that count for the dynamics f
+    transition_mask: Tensor  # [..., T] bool: transitions that count for the dynamics f
     sequence_mask: Tensor  # [...] bool: windows that count for the terms with latent variables (h and g)
 
     @property

@@ -1,4 +1,4 @@
-"""The dynamics f and the meta-dynamics h as pieces of Pyro programs (paper, equations 1 and 2)."""
+"""The sites of the dynamics f and the meta-dynamics h in Pyro programs (paper, equations 1 and 2)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from models.state import State, Window, stack_steps
 def sample_subgoal(scales: Scales, mean: State, window: Window, generate: bool) -> None:
     """s' ~ h(. | s, c) for `window: [B]` around `mean: [..., B]`, observed unless `generate`.
 
-    Sites subgoal_centers, event `[M, 3]`, and subgoal_features, event `[M, F]`. Counted are the objects that
-    are real in s and s', or in s alone where s' is sampled.
+    Sites subgoal_centers, event `[M, 3]`, and subgoal_features, event `[M, F]`. They count the objects
+    that are real in s and s', or in s alone if s' is sampled.
     """
     first, last = window.first, window.last
     counted = first.mask if generate else first.mask & last.mask
@@ -25,10 +25,10 @@ def sample_subgoal(scales: Scales, mean: State, window: Window, generate: bool) 
 
 
 def observe_transitions(dynamics: Dynamics, scales: Scales, window: Window, encoded: Tensor) -> None:
-    """s_t+1 ~ f(. | s_t, a_t) at the T observed pairs of `window: [B]`, all at once.
+    """s_t+1 ~ f(. | s_t, a_t) at the T observed transitions of `window: [B]`, all at once.
 
-    Sites next_centers, event `[T, M, 3]`, and next_features, event `[T, M, F]`. Counted are the pairs of
-    `transition_mask`, and there the objects that are real before and after the push.
+    Sites next_centers, event `[T, M, 3]`, and next_features, event `[T, M, F]`. They count the transitions
+    in `transition_mask`, with the objects that are real before and after the push.
 
     Args:
         encoded: `[B, T, M, 3 * width]`, features of the T states before each push.
@@ -45,9 +45,9 @@ def generate_transitions(
 ) -> None:
     """Sample s_t+1 ~ f(. | s_t, a_t) push by push from `state: [B]` under `actions: [..., B, T, 4]`.
 
-    Sites next_centers_t and next_features_t for t = 1, ..., T; next_centers and next_features record them
-    together, in the shapes of `observe_transitions`. A sampled feature is scaled to unit length before f reads
-    it, as observed features are.
+    Sites next_centers_t and next_features_t for t = 1, ..., T; next_centers and next_features record all of
+    them, in the shapes of `observe_transitions`. Sampled features are scaled to unit length before f reads them, like
+    observed ones.
     """
     samples = []
     for step, action in enumerate(actions.unbind(-2), start=1):

@@ -1,8 +1,8 @@
-"""What is chosen: planners over a learned model and a reward, for many environments at once.
+"""Planners over a learned model and a reward, for many environments at once.
 
-`planning/cavin.py` is Algorithm 1. Its rooms: `rollouts` (candidates, segment by segment), `optimizers` (how candidates
-are searched), `extensions` (our additions), `baselines` (the planners that the paper compares with) and `backends` (how
-inner functions run).
+`planning/cavin.py` is Algorithm 1. The subpackages: `rollouts` (candidates, segment by segment), `optimizers` (which
+search candidates), `extensions` (our additions), `baselines` (the planners that the paper compares with) and `backends`
+(which run the inner functions).
 """
 
 from planning.baselines.cvae_mpc import CvaeMpcPlanner

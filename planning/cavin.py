@@ -44,19 +44,19 @@ class CavinPlanner(SearchingPlanner):
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
-    stride_limits: metres, two of them; a subgoal towards which every object moves less than the first, or any more
-        than the second, ends the plan as a violation does (published implementation: 0.1 and 0.3); None in the paper.
+    stride_limits: two distances in metres; a subgoal that moves every object less than the first, or any object more
+        than the second, ends the plan like a violation (published implementation: 0.1 and 0.3); None in the paper.
     motion_horizon: `full_horizon` plans motions for all K segments and compares them with all K subgoals (paper);
-        `first_segment` plans and compares only what is executed before the next plan (published implementation).
+        `first_segment` plans and compares only the executed segment (published implementation).
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
     warm_start: our addition to line 5: the last plan's noise is among the candidates.
     reachability: our addition to line 7: rescores the best effect codes by f; None trusts h (paper).
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
-    idle_distance: metres; our addition to line 11: pushes that f predicts to move no object as far come last; 0 keeps
-        g's order (paper).
-    compile: native code for the inner functions, after one or two minutes of compilation.
+    idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
+        last; 0 keeps g's order (paper).
+    compile: compile the inner functions to native code, which takes one or two minutes.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
     `reward_at`, limits out of order, and a `feature_weight` or an `idle_distance` that is negative or not finite.
@@ -83,7 +83,7 @@ class CavinPlanner(SearchingPlanner):
         super().__init__(model, reward, samples, horizon, **options)
         self.model: PlanningModel = model
         if motion_horizon not in MOTION_HORIZONS:
-            raise ValueError(f"unknown motion_horizon '{motion_horizon}': take {' or '.join(MOTION_HORIZONS)}")
+            raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
         check_weight("idle_distance", idle_distance)
         self.motion_optimizer = self.optimizer
@@ -99,7 +99,7 @@ class CavinPlanner(SearchingPlanner):
     @chunked
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
-        """Algorithm 1 for observed scenes `state: [B]`; `generators`: one per environment, which the call advances.
+        """Algorithm 1 for observed scenes `state: [B]`; the call advances `generators`, one per environment.
 
         `previous`: the last plans of the same episodes, whose first pushes have been executed, for the warm start. An
         environment's plan depends on its own state, generator and last plan only. For errors see
@@ -227,12 +227,12 @@ class TrackingState(NamedTuple):
 
     @property
     def failed(self) -> Tensor:
-        """`[B, n]` bool: none, for Algorithm 1 replaces no motions."""
+        """`[B, n]` bool: none, because Algorithm 1 replaces no motions."""
         return torch.zeros_like(self.finite)
 
     @property
     def active(self) -> Tensor:
-        """`[B, n]` bool: all, for line 9 predicts whole sequences."""
+        """`[B, n]` bool: all, because line 9 predicts whole sequences."""
         return torch.ones_like(self.finite)
 
 
@@ -247,12 +247,12 @@ class TrackingCost(NamedTuple):
     feature_weight: float
 
     def start(self, plans: State) -> TrackingState:
-        """Of candidates without a segment, `plans: [B, n]`."""
+        """The state of candidates without a segment, `plans: [B, n]`."""
         nothing = plans.centers.new_zeros(plans.batch_shape)
         return TrackingState(nothing, nothing, torch.ones_like(nothing, dtype=torch.bool))
 
     def advance(self, state: TrackingState, segment: int, before: State, rollout: SegmentRollout) -> TrackingState:
-        """After one more segment from `before: [B, n]`."""
+        """The state after one more segment from `before: [B, n]`."""
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
         subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
         distance = squared_distance(rollout.states, subgoal, feature_weight=self.feature_weight)
@@ -263,5 +263,5 @@ class TrackingCost(NamedTuple):
         return TrackingState(cost, torch.where(executed, cost, state.executed_cost), finite)
 
     def early_stopped(self, state: TrackingState) -> Tensor:
-        """`[B]` bool: nowhere, for no sequence ends before the others."""
+        """`[B]` bool: none, because no sequence ends before the others."""
         return torch.zeros_like(state.finite[:, 0])

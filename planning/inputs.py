@@ -1,4 +1,4 @@
-"""Checks at the planners' public boundary: one clear line for bad input."""
+"""Checks of the planners' arguments: one clear line for bad input."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def check_horizon(horizon: int, segment_length: int) -> None:
         nearest = [str(valid) for valid in (below, below + segment_length) if valid > 0]
         raise ValueError(
             f"horizon={horizon} is not divisible by the model's segment length T={segment_length}: "
-            f"take {' or '.join(nearest)}"
+            f"choose {' or '.join(nearest)}"
         )
 
 

@@ -1,4 +1,4 @@
-"""What a planner hands back."""
+"""The result of a planner."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from models.state import State
 
 
 class Plan(NamedTuple):
-    """The chosen plan of every environment, and what was considered (for drawing).
+    """The chosen plan of every environment, and the candidates (for pictures).
 
-    S is the number of segments with motions: K, or 1 where only the first one is planned at the motion space.
-    C and Z are the codes' numbers. What a planner does not have is empty: without effect codes K = 0 for these and
-    the subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for
-    its pushes, and no codes, states or candidates.
+    S is the number of segments with motions: K, or 1 if motions are planned for the first segment only. C and Z are the
+    dimensions of the codes. Fields that a planner lacks are empty: without effect codes K = 0 for these and the
+    subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for its pushes,
+    and no codes, states or candidates.
     """
 
-    actions: Tensor  # [B, T, 4] the first segment; all of it, or its first pushes, are executed before planning anew
-    planned_actions: Tensor  # [B, S T, 4] a*, of which `actions` is the beginning
+    actions: Tensor  # [B, T, 4] the first segment; it, or its first pushes, are executed before the next plan
+    planned_actions: Tensor  # [B, S T, 4] a*, which begins with `actions`
     effect_codes: Tensor  # [B, K, C] c*
     motion_codes: Tensor  # [B, S, Z] z*
     subgoals: State  # [B, K, M, .] chosen subgoals; those after the plan's end repeat the last one
-    segments: Tensor  # [B] int64: segments until the chosen plan ends, 1..K; what comes later means nothing
+    segments: Tensor  # [B] int64: segments until the chosen plan ends, 1..K; later ones have no meaning
     predicted_centers: Tensor  # [B, S T, M, 3] metres, predicted by f after each of the planned actions
     expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
     expected_success: Tensor  # [B] bool: the chosen plan reaches the goal

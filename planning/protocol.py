@@ -1,4 +1,4 @@
-"""What planning needs of a model and of a task, and what it offers: structural types, not to be inherited.
+"""Protocols of the models, rewards and planners of this package: structural types, not to be inherited.
 
 Letters used in all of `planning`: B environments, N candidates, K segments of T steps each, H = K T steps
 of horizon, M objects (padding included).
@@ -21,14 +21,14 @@ from planning.plan import Plan
 class DynamicsModel(Protocol):
     """The dynamics f alone (paper, equation 1), of which planners take the mean.
 
-    Leading dimensions `[...]` of the arguments broadcast: planners hand over states `[B, 1]` with codes or
-    actions `[B, N]` where all candidates are in one state, else `[B, N]` for all. Priors are asked for `[N]`, an
+    Leading dimensions `[...]` of the arguments broadcast: planners pass states `[B, 1]` with codes or
+    actions `[B, N]` if all candidates are in one state, else `[B, N]` for all. They call priors with `[N]`, one
     environment at a time.
     """
 
     @property
     def segment_length(self) -> int:
-        """`T`, the number of pushes that lead from a state to its subgoal."""
+        """`T`, the number of pushes from a state to its subgoal."""
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., 4]`."""
@@ -39,13 +39,13 @@ class EffectModel(DynamicsModel, Protocol):
 
     @property
     def effect_dimension(self) -> int:
-        """C, the numbers of an effect code."""
+        """C, the dimension of an effect code."""
 
     def effect_prior(self, state: State) -> Distribution:
         """p(c | s), or p(c): batch `[...]`, event `[C]`."""
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
-        """Mean of the meta-dynamics h(s' | s, c), the state T steps on: `[...]`; `effect_code: [..., C]`."""
+        """Mean of the meta-dynamics h(s' | s, c), the state T steps ahead: `[...]`; `effect_code: [..., C]`."""
 
 
 class PlanningModel(EffectModel, Protocol):
@@ -53,7 +53,7 @@ class PlanningModel(EffectModel, Protocol):
 
     @property
     def motion_dimension(self) -> int:
-        """Z, the numbers of a motion code."""
+        """Z, the dimension of a motion code."""
 
     def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
         """p(z | s, c), or p(z): batch `[...]`, event `[Z]`; `effect_code: [..., C]`."""
@@ -74,7 +74,7 @@ class FlatModel(DynamicsModel, Protocol):
 
     @property
     def motion_dimension(self) -> int:
-        """Z, the numbers of a motion code."""
+        """Z, the dimension of a motion code."""
 
     def motion_prior(self, state: State) -> Distribution:
         """p(z | s), or p(z): batch `[...]`, event `[Z]`."""
@@ -85,10 +85,10 @@ class FlatModel(DynamicsModel, Protocol):
 
 @dataclass(frozen=True)
 class ModelRequirements:
-    """What a planner asks of its model; a class attribute `requires` of every planner that searches.
+    """Requirements of a planner on its model: the class attribute `requires` of every planner that searches.
 
-    model: the choice of `model=` that was made for the planner. methods: which the model must have. excluded: codes
-    that the planner would not choose, so the model must not have them.
+    model: the choice of `model=` for the planner. methods: which the model must have. excluded: codes that the planner
+    does not choose, so the model must not have them.
     """
 
     model: str
@@ -106,9 +106,9 @@ class ModelRequirements:
 
 @runtime_checkable
 class Reparameterized(Protocol):
-    """A distribution that says itself how standard normal noise becomes its samples.
+    """A distribution with its own reparameterisation.
 
-    Torch's normal distributions and their transforms need not: `planning.rollouts.sampling.reparameterize`.
+    Torch's normal distributions and their transforms do not need it: `planning.rollouts.sampling.reparameterize`.
     """
 
     def reparameterize(self, noise: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ class Reparameterized(Protocol):
 
 
 class Outcome(Protocol):
-    """What a task says of one step, in any batch `[...]`. Success and failure both end the episode."""
+    """The outcome of one step, in any batch `[...]`. Success and failure both end the episode."""
 
     @property
     def reward(self) -> Tensor:
@@ -132,10 +132,10 @@ class Outcome(Protocol):
 
 
 class RewardFunction(Protocol):
-    """R(s_{t+1}) of the paper (section 2), with the state before it for rewards of progress."""
+    """R(s_{t+1}) of the paper (section 2); it also takes the state before, for rewards of progress."""
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, /) -> Outcome:
-        """Judge the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool.
+        """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool.
 
         Object 0 is the target.
         """
@@ -143,7 +143,7 @@ class RewardFunction(Protocol):
 
 @runtime_checkable
 class BoundedReward(RewardFunction, Protocol):
-    """A reward function that knows an upper bound, which lets searches stop early."""
+    """A reward function with an upper bound on returns, for early stopping."""
 
     @property
     def maximum_return(self) -> float:
@@ -161,17 +161,17 @@ class EpisodicReward(RewardFunction, Protocol):
 
 @runtime_checkable
 class PathReward(RewardFunction, Protocol):
-    """A reward function that can also judge whole paths, which looks at every state once instead of twice."""
+    """A reward function that can also evaluate whole paths, which reads every state once instead of twice."""
 
     def along(self, states: Tensor, mask: Tensor, /) -> Outcome:
-        """Judge the T steps of paths `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` bool: fields `[..., T]`.
+        """Evaluate the T steps of paths `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` bool: fields `[..., T]`.
 
-        The same as calls for one step after another.
+        Equal to a call for each step.
         """
 
 
 class Planner(Protocol):
-    """Anything that turns observed states into pushes."""
+    """Turns observed states into pushes."""
 
     @property
     def segment_length(self) -> int:

@@ -1,4 +1,4 @@
-"""Choosing and joining plans in records: named tuples, nested or not, of tensors `[B, N, ...]` or None."""
+"""Indexing and concatenating records: named tuples, nested or not, of tensors `[B, N, ...]` or None."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Record = TypeVar("Record", bound=tuple)
 
 
 def apply(record: Record, function: Callable[[Any], Any]) -> Record:
-    """The same function of every field; None stays None. Tuples without names will do, too."""
+    """Apply one function to every field; None stays None. Plain tuples are allowed, too."""
 
     def applied(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -24,10 +24,10 @@ def apply(record: Record, function: Callable[[Any], Any]) -> Record:
 
 
 def take(record: Record, numbers: Tensor) -> Record:
-    """Plans by number, per environment: fields `[B, N, ...]`, `numbers: [B, n]` int64 -> `[B, n, ...]`."""
+    """Take plans by number, per environment: fields `[B, N, ...]`, `numbers: [B, n]` int64 -> `[B, n, ...]`."""
     environments = torch.arange(len(numbers), device=numbers.device).unsqueeze(-1)
 
-    def chosen(field: Tensor) -> Tensor:  # a row at a time: faster than field[environments, numbers]
+    def chosen(field: Tensor) -> Tensor:  # one row at a time: faster than field[environments, numbers]
         rows = (numbers + environments * field.shape[1]).flatten()
         return field.flatten(0, 1).index_select(0, rows).unflatten(0, numbers.shape)
 
@@ -35,7 +35,7 @@ def take(record: Record, numbers: Tensor) -> Record:
 
 
 def join(records: Sequence[Record], dimension: int = 1) -> Record:
-    """The plans of several records of one kind, one after the other: `[B, N_1, ...], ... -> [B, N_1 + ..., ...]`.
+    """Concatenate the plans of several records of one kind: `[B, N_1, ...], ... -> [B, N_1 + ..., ...]`.
 
     With `dimension=0` the environments: `[B_1, ...], ... -> [B_1 + ..., ...]`.
     """
@@ -53,7 +53,7 @@ def where(chosen: Tensor, record: Any, other: Any) -> Any:
 
 
 def _combine(records: Sequence[Any], function: Callable[[Sequence[Any]], Any]) -> Any:
-    """The same function of every field of several records; None where one of them has None."""
+    """Apply one function to every field of several records; None where one of them has None."""
     first = records[0]
     if isinstance(first, tuple):
         parts = [_combine(values, function) for values in zip(*records, strict=True)]

@@ -1,4 +1,4 @@
-"""What planners that search have in common: their options, and the search itself."""
+"""Base class of planners that search: their options, and the search itself."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from planning.rollouts.segment import Objective, SearchSpace
 class SearchingPlanner:
     """Searches N = `samples` plans of K = `horizon` / T segments for the highest cumulative reward.
 
-    The options are those of `planning.cavin.CavinPlanner`, which explains them.
+    See `planning.cavin.CavinPlanner` for the options.
     """
 
-    requires: ClassVar[ModelRequirements]  # what a planner asks of its model
-    strides: ClassVar[str] = "segments"  # what `stride_limits` limits, or "pushes"
+    requires: ClassVar[ModelRequirements]  # of the planner on its model
+    strides: ClassVar[str] = "segments"  # unit of `stride_limits`: "segments" or "pushes"
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class SearchingPlanner:
         self.reward_at, self.stride_limits = reward_at, stride_limits
         self.backend: Backend = Compiled() if compile else eager
         self.reparameterized = warm_start or compile
-        self.cumulative_reward()  # refuses a name or limits now, not in the first plan
+        self.cumulative_reward()  # refuses bad options now, not in the first plan
         self.warm_start = warm_start
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
@@ -85,10 +85,10 @@ class SearchingPlanner:
         warm_start: Tensor | None = None,
         best_only: bool = False,
     ) -> Candidates:
-        """All candidates `[B, N]` that the optimizer, by default `self.optimizer`, has evaluated.
+        """All candidates `[B, N]` that the optimizer evaluates, by default `self.optimizer`.
 
         segments: by default K. warm_start, best_only: see `planning.rollouts.candidates.SearchProblem`.
-        Raises ValueError for codes whose prior cannot be reparameterized, where that is needed.
+        Raises ValueError if codes must be reparameterised and their prior cannot be.
         """
         problem = SearchProblem(
             space,
@@ -112,7 +112,7 @@ class SearchingPlanner:
 
 
 def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
-    """What every `Plan` tells of its search: the fields from `segments` to `candidate_returns`.
+    """The fields of a `Plan` about its search, from `segments` to `candidate_returns`.
 
     candidates: `[B, N]`, evaluated by cumulative reward. best: `[B]` int64, the number of the chosen one.
     """

@@ -200,5 +200,6 @@ def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
         )
     if options.get("compile") and any(isinstance(part, FlowPrior) for part in model.modules()):
         raise UserError(
-            f"planner.compile=true, but the priors in {path} are flows, which cannot be compiled: take compile=false"
+            f"planner.compile=true, but the priors in {path} are flows, which cannot be compiled: "
+            "choose planner.compile=false"
         )

@@ -1,1 +1,1 @@
-"""Networks that the programs are made of (paper, appendix A.1)."""
+"""Networks of the programs (paper, appendix A.1)."""

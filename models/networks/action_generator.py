@@ -1,4 +1,4 @@
-"""Action generator g: pushes that bring about an effect (paper, equation 3, appendix A.1)."""
+"""Action generator g: the pushes of a segment (paper, equation 3, appendix A.1)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from models.networks.layers import ObjectPool, fully_connected
 
-START_LIMIT = 5.0  # normalised; a soft clip far outside the reachable box [-1, 1] that keeps starts bounded
+START_LIMIT = 5.0  # normalised; soft clip of starts, far outside of the reachable box [-1, 1]
 
 
 class ActionGenerator(nn.Module):
@@ -18,7 +18,7 @@ class ActionGenerator(nn.Module):
     transformed = mean(pooled) + scale(pooled) * z
     starts      = 5 tanh(x / 5) of FC(transformed), motions = tanh of FC(transformed)
 
-    With `motion_dimension=None` there is no motion code, and the pushes are functions of the pooled feature.
+    With `motion_dimension=None` there is no motion code, and the pushes depend on the pooled feature only.
     """
 
     def __init__(self, *, segment_length: int = 3, motion_dimension: int | None = 16, width: int = 64) -> None:

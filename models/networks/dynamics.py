@@ -1,4 +1,4 @@
-"""Networks that change states: dynamics f and meta-dynamics h (paper, equations 1 and 2, appendix A.1)."""
+"""State transitions: dynamics f and meta-dynamics h (paper, equations 1 and 2, appendix A.1)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from torch import Tensor, nn
 from models.networks.layers import fully_connected, unit
 from models.state import State
 
-PUSH_RANGE = 0.15  # metres, the most that one push moves an object along an axis
-SUBGOAL_RANGE = 0.5  # metres, the most that a segment of pushes moves an object along an axis
+PUSH_RANGE = 0.15  # metres, maximum displacement by one push along an axis
+SUBGOAL_RANGE = 0.5  # metres, maximum displacement by a segment along an axis
 
 
 class EffectTrunk(nn.Module):
-    """Effect feature of each object: what a context (an action or an effect code) does to it.
+    """Effect feature of each object: the effect of a context (an action or an effect code) on it.
 
-    With `context_dimension=None` the feature depends on the state alone, and the context's layers are absent.
+    With `context_dimension=None` there are no layers for the context: the feature depends on the state alone.
     """
 
     def __init__(self, context_dimension: int | None, *, width: int = 64, encoder_width: int = 64) -> None:
@@ -38,7 +38,7 @@ class EffectTrunk(nn.Module):
 
 
 class StateChange(nn.Module):
-    """Head that moves each object, with one gate per object.
+    """Predicts the change of each object, with one gate per object.
 
     center'  = center + gate * maximum_displacement * tanh(change of center)
     feature' = unit(feature + gate * change of feature)
@@ -51,7 +51,7 @@ class StateChange(nn.Module):
         self.head = nn.Linear(width, sum(self.parts))
 
     def forward(self, state: State, effect: Tensor) -> State:
-        """`effect: [..., M, width]` -> predicted state; leading dimensions broadcast, padding stays put."""
+        """`effect: [..., M, width]` -> predicted state; leading dimensions broadcast, padding does not change."""
         gate, motion, turn = self.head(effect).split(self.parts, -1)
         gate = gate.sigmoid() * state.mask.unsqueeze(-1)
         centers = state.centers + gate * (

@@ -20,7 +20,7 @@ class StateEncoder(nn.Module):
     geometric_i = FC(feature_i)
     relation_i  = sum over other real objects j of FC(FC(center_j - center_i))
 
-    Reordering the objects reorders the features; padding does not touch the features of real objects.
+    Equivariant to the order of objects; padding does not affect the features of real objects.
     """
 
     def __init__(self, *, feature_dimension: int = 64, width: int = 64, maximum_objects: int = 5) -> None:
@@ -35,7 +35,7 @@ class StateEncoder(nn.Module):
     def forward(self, state: State) -> Tensor:
         """`state: [...]` of `M` objects -> `[..., M, 3 * width]`.
 
-        Raises `ValueError` for more objects than the model was made for, or features of another length.
+        Raises `ValueError` for more objects than `maximum_objects`, or features of another length.
         """
         if state.objects > self.maximum_objects:
             raise ValueError(f"state has {state.objects} objects; this model knows at most {self.maximum_objects}")
@@ -46,10 +46,10 @@ class StateEncoder(nn.Module):
             )
         positions = relative_positions(state.centers)
         spatial = self.spatial(positions)
-        # Linear in the difference: W p_j - (W p_i - b) takes M products instead of M squared.
+        # The layer is linear in the difference: W p_j - (W p_i - b) takes M products instead of M squared.
         others = functional.linear(positions, self.difference.weight)
         own = others - self.difference.bias
-        related = [  # pairs are visited by cyclic shifts, so that no object meets itself
+        related = [  # cyclic shifts visit all pairs of different objects
             self.relation((others.roll(-shift, -2) - own).relu_()) * state.mask.roll(-shift, -1).unsqueeze(-1)
             for shift in range(1, state.objects)
         ]

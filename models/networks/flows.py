@@ -10,7 +10,7 @@ from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-# zuko switches argument checks off for every distribution of the process when it is imported.
+# Importing zuko disables argument checks of all distributions in the process.
 _checks_arguments = Distribution._validate_args
 import zuko  # noqa: E402
 
@@ -18,10 +18,10 @@ Distribution.set_default_validate_args(_checks_arguments)
 
 
 class FlowDistribution(TorchDistribution):
-    """A base pushed through an invertible transform: batch `[...]`, event `[D]`.
+    """A base distribution under an invertible transform: batch `[...]`, event `[D]`.
 
-    The density of the last sample is cached, so scoring it costs nothing. No KL divergence has a closed form here, so
-    `TraceMeanField_ELBO` takes the one-sample estimate that `Trace_ELBO` takes. (`pyro.contrib.zuko.ZukoToPyro` has no
+    The density of the last sample is cached, so scoring it is free. Its KL divergences have no closed form, so
+    `TraceMeanField_ELBO` uses the one-sample estimate of `Trace_ELBO`. (`pyro.contrib.zuko.ZukoToPyro` has no
     `sample`, which planning calls, and its cache grows without bound.)
     """
 
@@ -38,10 +38,10 @@ class FlowDistribution(TorchDistribution):
         return FlowDistribution(self.flow.expand(torch.Size(batch_shape)), validate_args=self._validate_args)
 
     def sample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
-        return self.flow.sample(torch.Size(sample_shape))  # without the density that `rsample` computes
+        return self.flow.sample(torch.Size(sample_shape))  # skips the density that `rsample` computes
 
     def reparameterize(self, noise: Tensor) -> Tensor:
-        """The sample that standard normal `noise: [..., D]` gives if the base is N(0, I): `[..., D]`, for planners."""
+        """The sample `[..., D]` from standard normal `noise: [..., D]`, for planners; the base must be N(0, I)."""
         return self.flow.transform.inv(noise)
 
     def rsample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
@@ -51,7 +51,8 @@ class FlowDistribution(TorchDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         if self._scored_sample is not None and value is self._scored_sample[0]:
             density = self._scored_sample[1]
-            if density.requires_grad or not torch.is_grad_enabled():  # else sampled without gradients, scored with them
+            # A sample without gradients may be scored with them.
+            if density.requires_grad or not torch.is_grad_enabled():
                 return density
         if self._validate_args:
             self._validate_sample(value)
@@ -59,12 +60,12 @@ class FlowDistribution(TorchDistribution):
 
 
 class CodeFlow(nn.Module):
-    """Turns a base distribution over a code into a richer one, given a context; the identity to begin with.
+    """Transforms a base distribution over a code, given a context; initialised to the identity.
 
-    Each coupling transforms one half of a code, x_b' = exp(s) x_b + t, where (s, t) come from the other half and the
-    context through a network with one hidden layer; halves alternate. Couplings are equally fast in both directions,
-    and both are needed: guides sample, training scores, planning samples. An autoregressive flow needs D passes in one
-    of the two.
+    Each coupling transforms one half of a code, x_b' = exp(s) x_b + t, where a network with one hidden layer computes
+    (s, t) from the other half and the context; halves alternate. Couplings are equally fast in both directions, and
+    both are needed: guides sample, training scores, planning samples. An autoregressive flow takes D passes in one of
+    them.
 
     `from_base` is the direction of the couplings. From base to code (guides), sampling with its density takes one pass
     and scoring another code takes two; from code to base (priors), scoring any code takes one pass.

@@ -1,4 +1,4 @@
-"""Small layers that every network of the cascade is made of (paper, appendix A.1)."""
+"""Small layers that the networks share (paper, appendix A.1)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 TABLE_CENTER = (0.6, 0.0, 0.0)  # metres, in the robot's base frame
-POSITION_UNIT = 0.1  # metres; a push moves things by about this much, so networks see numbers of size one
-SCALE_FLOOR = 1e-6  # keeps the density of a code finite
+POSITION_UNIT = 0.1  # metres; about the length of a push, so that inputs of networks are of order one
+SCALE_FLOOR = 1e-6  # lower bound on standard deviations, so that densities stay finite
 
 
 def fully_connected(inputs: int, outputs: int) -> nn.Sequential:
@@ -23,28 +23,28 @@ def fully_connected(inputs: int, outputs: int) -> nn.Sequential:
 def relative_positions(centers: Tensor) -> Tensor:
     """`centers: [..., 3]` metres -> positions from the table's centre, in units of 0.1 m.
 
-    Raw coordinates of some 0.6 m differ by a few centimetres from case to case; centred and scaled,
-    what is near and what touches becomes visible to a network.
+    Raw coordinates of about 0.6 m differ by only a few centimetres; centring and scaling makes such differences visible
+    to a network.
     """
     return (centers - centers.new_tensor(TABLE_CENTER)) / POSITION_UNIT
 
 
 def unit(values: Tensor) -> Tensor:
-    """Scaled to unit length along the last dimension; zeros stay zeros."""
+    """Scale to unit length along the last dimension; zeros stay zeros."""
     return functional.normalize(values, dim=-1)
 
 
 class ObjectPool(nn.Module):
-    """Softmax-weighted mean over the real objects, whatever their order."""
+    """Softmax-weighted mean over the real objects, invariant to their order."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
-        self.score = nn.Linear(width, 1, bias=False)  # softmax would not see a bias
+        self.score = nn.Linear(width, 1, bias=False)  # softmax is invariant to a bias
 
     def forward(self, objects: Tensor, mask: Tensor) -> Tensor:
         """`objects: [..., M, width]`, `mask: [..., M]` bool -> `[..., width]`."""
         scores = self.score(objects).squeeze(-1)
-        # The smallest finite number, not -inf, so that a scene without objects gives no NaN.
+        # The smallest finite number, not -inf: a scene without objects must not give NaN.
         scores = scores.masked_fill(~mask, torch.finfo(scores.dtype).min)
         return (scores.softmax(-1).unsqueeze(-1) * objects).sum(-2)
 
@@ -63,7 +63,7 @@ class GaussianCode(nn.Module):
         return distributions.Normal(mean, functional.softplus(scale.contiguous()) + SCALE_FLOOR).to_event(1)
 
     def initialize_standard(self) -> GaussianCode:
-        """Set the weights so that the code is N(0, I) for every feature; returns itself."""
+        """Initialise the weights so that the code is N(0, I) for every feature; returns self."""
         mean, scale = self.head.bias.detach().chunk(2)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(mean)

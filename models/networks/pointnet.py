@@ -17,7 +17,7 @@ class PointNet(nn.Module):
     def __init__(self, feature_dimension: int = 64) -> None:
         super().__init__()
         self.points = nn.Sequential(fully_connected(3, 16), fully_connected(16, 32), fully_connected(32, 64))
-        # Without ReLU, so that features may point anywhere on the sphere and never vanish.
+        # Without ReLU, so that features can be anywhere on the sphere and never vanish.
         self.feature = nn.Linear(64, feature_dimension)
 
     def forward(self, clouds: Tensor) -> Tensor:
@@ -53,6 +53,6 @@ def chamfer_distance(a: Tensor, b: Tensor) -> Tensor:
 
     Mean squared distance from each point of `a` to its nearest in `b`, plus the same from `b` to `a`.
     """
-    # By differences, not by matrix products: those lose the small distances to rounding.
+    # By differences: matrix products would lose small distances to rounding.
     squared = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").square()
     return squared.amin(-1).mean(-1) + squared.amin(-2).mean(-1)

@@ -1,4 +1,4 @@
-"""A scene in a few numbers, for learned priors."""
+"""A small feature of a scene, for learned priors."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from models.state import State
 
 
 class SceneContext(nn.Module):
-    """Feature of a state, and of an effect code if there is one; cheap enough for every candidate of a planner.
+    """Feature of a state and, optionally, an effect code; cheap enough to compute for every candidate of a planner.
 
-    Per object two FC on (center, feature, effect code); sum over real objects; FC. Neither the order of objects nor the
-    content of padding matters.
+    Per object two FC on (center, feature, effect code); sum over real objects; FC. Invariant to the order of objects
+    and to padding.
     """
 
     def __init__(self, *, feature_dimension: int, effect_dimension: int | None, width: int) -> None:
@@ -26,7 +26,7 @@ class SceneContext(nn.Module):
     def forward(self, state: State, effect_code: Tensor | None) -> Tensor:
         """`state: [...]`, `effect_code: [..., C]` -> `[..., width]`; leading dimensions broadcast.
 
-        Raises `ValueError` for an effect code where none is wanted, and for none where one is.
+        Raises `ValueError` for a missing or an unexpected effect code.
         """
         hidden = self.from_object(torch.cat((relative_positions(state.centers), state.features), -1))
         if self.from_code is not None and effect_code is not None:

@@ -1,1 +1,1 @@
-"""Priors of the codes, p(c | s) and p(z | s, c): a choice of the configuration."""
+"""Priors of the codes, p(c | s) and p(z | s, c)."""

@@ -1,4 +1,4 @@
-"""A learned Gaussian prior of a code, in the place of the paper's N(0, I)."""
+"""A learned Gaussian prior of a code, instead of the paper's N(0, I)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from models.state import State
 class ConditionalPrior(nn.Module):
     """Diagonal Gaussian p(c | s) or p(z | s, c).
 
-    It begins at N(0, I), so training starts where the paper's does. `TraceMeanField_ELBO` finds the divergence of
+    It is initialised to N(0, I), the paper's prior. `TraceMeanField_ELBO` computes the divergence of
     Gaussian guides from it in closed form.
     """
 

@@ -1,4 +1,4 @@
-"""A normalizing flow as the prior of a code, in the place of the paper's N(0, I)."""
+"""A normalizing flow as the prior of a code, instead of the paper's N(0, I)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from models.state import State
 
 
 class FlowPrior(nn.Module):
-    """Normalizing flow p(c | s) or p(z | s, c): N(0, I) through couplings that see s and c.
+    """Normalizing flow p(c | s) or p(z | s, c): N(0, I) through couplings conditioned on s and c.
 
-    It begins at N(0, I), so training starts where the paper's does. No divergence from a flow has a closed form:
-    `TraceMeanField_ELBO` takes the one-sample estimate that `Trace_ELBO` takes.
+    It is initialised to N(0, I), the paper's prior. Divergences from a flow have no closed form:
+    `TraceMeanField_ELBO` uses the one-sample estimate of `Trace_ELBO`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a model needs of a prior."""
+"""The interface of priors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from models.state import State
 class Prior(Protocol):
     """p(c | s) or p(z | s, c). A structural type: derive a prior from `torch.nn.Module`, not from this.
 
-    Configuration builds a prior for each code of a model, with the keywords
+    `build_model` constructs a prior for each code of a model, with the keywords
 
     `dimension`            of the code
     `feature_dimension`    F of the states
@@ -23,6 +23,6 @@ class Prior(Protocol):
     def __call__(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
         """`state: [...]`, `effect_code: [..., C]` for p(z | s, c) -> batch `[...]`, event `[dimension]`.
 
-        Leading dimensions broadcast. Warm starts and searches in a planner need a Gaussian, or a distribution with a
-        method `reparameterize(noise)`.
+        Leading dimensions broadcast. A planner's warm start and its optimizers other than `shooting` need a Gaussian,
+        or a distribution with a method `reparameterize(noise)`.
         """

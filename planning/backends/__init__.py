@@ -1,6 +1,5 @@
 """How planning's inner functions run: eager or compiled, and many environments in chunks.
 
-`eager` calls them as they are written. `compiled` exports each one to a graph (`torch.export`), rewrites what native
-code needs otherwise (`passes`), and lets torch's Inductor write the code. Models, priors, rewards and planners know of
-neither.
+`eager` calls them directly. `compiled` exports each one to a graph (`torch.export`), rewrites the graph for fast native
+code (`passes`), and compiles it with torch's Inductor. Models, priors, rewards and planners do not depend on either.
 """

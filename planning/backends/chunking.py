@@ -1,4 +1,4 @@
-"""Many environments in chunks, which bound the memory."""
+"""Plans for many environments in chunks, to bound the memory."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from planning.backends.eager import Backend
 from planning.inputs import NoFiniteCandidateError, check_scenes
 from planning.plan import Plan
 
-# Measured: a plan of 1,024 samples fills a processor's caches, and sixteen of them in one pass take 1.6 times as long
-# each. Products of other numbers of rows may also round differently, and a plan must not depend on its neighbours.
+# Measured: a plan of 1,024 samples fills a processor's caches; sixteen plans in one pass take 1.6 times as long per
+# plan. Matrix products of another number of rows may also round differently, and a plan must not depend on its
+# neighbours.
 ENVIRONMENTS_ON_PROCESSOR = 1
 PLANS_ON_ACCELERATOR = 131_072  # samples of all environments of a chunk
 
 
 class Sampling(Protocol):
-    """A planner that considers N = `samples` plans per environment; its backend goes from chunk to chunk."""
+    """A planner with N = `samples` candidates per environment; its backend runs the chunks."""
 
     samples: int
     backend: Backend
@@ -33,8 +34,8 @@ PlanMethod = Callable[..., Plan]  # (self, state, generators, previous)
 def chunked(plan: PlanMethod) -> PlanMethod:
     """Let a planner's method `plan` take any number of environments `[B]`, in chunks of whole environments.
 
-    The chunks' plans are joined to one. Raises ValueError for a state that is not a batch of scenes, for another
-    number of generators than B, and, naming it, for an environment without a finite candidate.
+    It concatenates the plans of the chunks. Raises ValueError for a state that is not a batch of scenes, for another
+    number of generators than B, and for an environment without a finite candidate, which it names.
     """
 
     @wraps(plan)

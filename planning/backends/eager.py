@@ -1,7 +1,7 @@
-"""Backends: how planning's inner functions run, and how several environments follow one another.
+"""Backends, which run planning's inner functions and loop over chunks of environments.
 
-An inner function is a pure function of tensors, of named tuples of such, and of constants (a model, a reward, a number
-that options set), which are told apart by `==`. Random numbers are sampled before and passed in.
+An inner function is a pure function of tensors, named tuples of tensors, and constants (a model, a reward, a number
+from the options), which are compared by `==`. Callers sample random numbers and pass them in.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ class Backend(Protocol):
         """`function(*arguments)`."""
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-        """`function(item)` of each, in order; `function` calls the backend in its turn."""
+        """`function(item)` of each item, in order; `function` may call the backend."""
 
 
 class Eager:
-    """One operation of torch at a time, with all of torch's threads."""
+    """Eager execution, one operation of torch at a time."""
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Backend`."""

@@ -1,9 +1,9 @@
-"""What is rewritten in exported graphs, so that torch's Inductor makes fast code of them.
+"""Passes that rewrite exported graphs, so that torch's Inductor generates fast code.
 
-Models, priors, rewards and planners have one body each, written as in the paper and run as it stands by the eager
-backend. What only native code needs is done here, to the graph that `torch.export` makes of that body. Every pass takes
-a graph and changes it in place; results stay the same but for the rounding of sums. Inductor does the rest by option
-(`planning.backends.compiled.COMPILING`): for example, it unrolls the minima over a layout's rectangles.
+Models, priors, rewards and planners have one body each, written as in the paper, which the eager backend runs
+unchanged. These passes transform the graph that `torch.export` makes of that body. Every pass changes a graph in place;
+results stay the same up to rounding of sums. Inductor does the rest by option (`planning.backends.compiled.COMPILING`):
+for example, it unrolls the minima over a layout's rectangles.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from torch.nn import functional
 
 aten: Any = torch.ops.aten
 
-FEW = 4  # numbers that are added up one by one: x, y and z, or a push
-EXACT = 64  # dividing as many numbers costs nothing, and stays exact
+FEW = 4  # inputs of a small layer, at most: x, y and z, or a push
+EXACT = 64  # divisions of at most as many numbers stay: they cost little, and are exact
 
 
 def rewrite(module: GraphModule) -> None:
-    """Apply all passes to a graph, and to the graphs within it (`torch.autocast` makes one of all that it rounds)."""
+    """Apply all passes to a graph and its subgraphs (`torch.autocast` makes one of the operations that it rounds)."""
     for part in module.modules():
         if isinstance(part, GraphModule):
             for change in PASSES:
@@ -36,16 +36,16 @@ def rewrite(module: GraphModule) -> None:
 
 
 def drop_checks(graph: Graph) -> None:
-    """Leave out what export adds to see that types stay: `expand_small_layers` changes some on purpose."""
+    """Remove the type checks that export adds: `expand_small_layers` changes some types on purpose."""
     for node in _calls(graph, aten._assert_tensor_metadata.default):
         graph.erase_node(node)
 
 
 def expand_small_layers(graph: Graph) -> None:
-    """A linear layer of few inputs becomes a sum of products, in float32 also where products are rounded.
+    """Replace a linear layer of few inputs by a sum of products, always in float32.
 
-    Calling a matrix product costs 30 microseconds, however small it is. Numbers that are added up one by one cost
-    little more than writing the result, if each is read from memory (hence the copy) and not computed for each output.
+    A call of a matrix product costs 30 microseconds, even for small ones. The sum costs little more than writing the
+    result, if each input is read from memory (hence the copy) and not recomputed for each output.
     """
     for node in _calls(graph, aten.linear.default):
         inputs, weight, *bias = _arguments(node)
@@ -56,11 +56,11 @@ def expand_small_layers(graph: Graph) -> None:
                 _replace(node, reduce(add, [*map(tensor, bias), *products]))
 
 
-def split_joined_inputs(graph: Graph) -> None:
-    """A linear layer of few and of many joined numbers becomes a layer of the many, plus the few times their weights.
+def split_concatenated_inputs(graph: Graph) -> None:
+    """Split a linear layer of concatenated inputs into a layer of the wide input and products of the narrow ones.
 
-    The inputs are then not joined, and the share of the few is added where the sum is read anyway. The first layer of a
-    learned prior reads a position and 64 features.
+    This avoids the concatenation; the products are added where the sum is read anyway. The first layer of a learned
+    prior reads a position and 64 features.
     """
     for node in _calls(graph, aten.linear.default):
         inputs, weight, *bias = _arguments(node)
@@ -80,8 +80,8 @@ def split_joined_inputs(graph: Graph) -> None:
             _replace(node, reduce(add, products, layer))
 
 
-def round_joined(graph: Graph) -> None:
-    """What was joined in bfloat16 is rounded before: `expand_small_layers` leaves float32, twice as much to write."""
+def round_concatenated(graph: Graph) -> None:
+    """Round the inputs of concatenations in bfloat16: float32 of `expand_small_layers` has twice the memory traffic."""
     for node in _calls(graph, aten.cat.default):
         if _value(node).dtype == torch.bfloat16:
             parts, *dimension = _arguments(node)
@@ -90,9 +90,9 @@ def round_joined(graph: Graph) -> None:
 
 
 def invert_shared_divisors(graph: Graph) -> None:
-    """A division by what several numbers share becomes a product with its reciprocal.
+    """Replace a division by a broadcast divisor by a product with its reciprocal.
 
-    A division takes several times as long as a product. 64 features are divided by one length, positions by a unit.
+    A division takes several times as long as a product. Examples: 64 features by one length, positions by a unit.
     """
     for node in _calls(graph, aten.div.Tensor):
         dividend, divisor = _arguments(node)
@@ -105,11 +105,11 @@ def invert_shared_divisors(graph: Graph) -> None:
                 _replace(node, tensor(dividend) * inverse)
 
 
-def lay_plans_side_by_side(graph: Graph) -> None:
-    """What is joined along time is written so that all plans' first numbers come first, then all plans' second ones.
+def move_plans_innermost(graph: Graph) -> None:
+    """Lay out a concatenation along time in memory with the plans innermost.
 
-    Native code computes sixteen numbers at a time where they lie side by side in memory. Of paths `[B, n, T, M, 3]` it
-    would take the three coordinates of one object; of paths so laid out it takes sixteen plans.
+    Vectorised code computes sixteen numbers at a time if they are adjacent in memory. Of paths `[B, n, T, M, 3]` it
+    would take the three coordinates of one object; in this layout it takes sixteen plans.
     """
     for node in _calls(graph, aten.cat.default):
         parts, *_ = _arguments(node)
@@ -125,15 +125,15 @@ def lay_plans_side_by_side(graph: Graph) -> None:
 PASSES: Sequence[Callable[[Graph], None]] = (
     drop_checks,
     expand_small_layers,
-    split_joined_inputs,
-    round_joined,
+    split_concatenated_inputs,
+    round_concatenated,
     invert_shared_divisors,
-    lay_plans_side_by_side,
+    move_plans_innermost,
 )
 
 
 def _calls(graph: Graph, operator: Any) -> Sequence[Node]:
-    """All calls of an operator that are in the graph by now."""
+    """All current calls of an operator in the graph."""
     return tuple(graph.find_nodes(op="call_function", target=operator))
 
 
@@ -142,38 +142,38 @@ def _arguments(node: Node) -> Sequence[Any]:
 
 
 def _value(node: Any) -> Tensor:
-    """Shape and type of what a node stands for."""
+    """Shape and type of a node's result."""
     return node.meta["val"]
 
 
 @contextmanager
 def _before(node: Node) -> Iterator[Callable[[Node], Any]]:
-    """What is computed with the results of nodes becomes part of the graph, before `node`."""
+    """Yield proxies of nodes; operations on them are inserted into the graph before `node`."""
     tracer = GraphAppendingTracer(node.graph)
     with node.graph.inserting_before(node):
         yield lambda other: Proxy(other, tracer)
 
 
 def _joined(node: Node) -> Sequence[Any]:
-    """What a node joins along the last dimension; nothing if it does something else."""
+    """The inputs of a concatenation along the last dimension; none for other nodes."""
     last = node.target is aten.cat.default and _dimension(node) == _value(node).ndim - 1
     return _arguments(node)[0] if last else ()
 
 
 def _dimension(cat: Node) -> int:
-    """Along which `torch.cat` joins, counted from the first."""
+    """The dimension of a `torch.cat`, counted from the first."""
     _, *dimension = _arguments(cat)
     return int(*dimension) % _value(cat).ndim
 
 
 def _written(inputs: Any) -> Any:
-    """The same, which Inductor then writes to memory: it does so with what is joined."""
+    """The same values, written to memory: Inductor materialises concatenations."""
     return torch.cat([inputs[..., :1], inputs[..., 1:]], -1)
 
 
 def _products(inputs: Any, weight: Any, count: int) -> list[Any]:
     """Each of the `count` inputs `[..., count]` times its weights, which are a column of `weight: [outputs, count]`."""
-    columns = weight.t().contiguous()  # side by side in memory
+    columns = weight.t().contiguous()  # adjacent in memory
     return [inputs[..., number : number + 1] * columns[number] for number in range(count)]
 
 

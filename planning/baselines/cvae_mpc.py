@@ -37,7 +37,7 @@ class FlatMotionSpace(NamedTuple):
 
 
 class CvaeMpcPlanner(PushSearch):
-    """Sequences of K motion codes z ~ p(z | s), T pushes g(s, z) for each, and what f predicts of all H pushes.
+    """Sequences of K motion codes z ~ p(z | s), T pushes g(s, z) for each, and f's prediction for all H pushes.
 
     model: p(z | s), g without effect codes, f. For the options and errors see `PushSearch`.
     """

@@ -48,9 +48,9 @@ class PushSpace(NamedTuple):
 
 
 class MpcPlanner(PushSearch):
-    """Sequences of H raw pushes, and what f predicts of them, step by step.
+    """Sequences of H raw pushes, and the states that f predicts for them, step by step.
 
-    model: f alone is asked, so any model will do. proposal: `uniform` over the action space (paper), or `heuristic`,
+    model: any model, since only f is used. proposal: `uniform` over the action space (paper), or `heuristic`,
     pushes that are likely to move something (a stronger variant, see `HeuristicPushes`), which needs `box`.
     For the other options and errors see `PushSearch`.
     """
@@ -74,7 +74,7 @@ def _proposal(name: str, box: PushBox | None) -> Proposal:
     if name == "uniform":
         return UniformPushes()
     if name != "heuristic":
-        raise ValueError(f"unknown proposal '{name}': take {' or '.join(PROPOSALS)}")
+        raise ValueError(f"unknown proposal '{name}': choose {' or '.join(PROPOSALS)}")
     if box is None:
         raise ValueError("proposal heuristic needs the box that pushes start in")
     return HeuristicPushes(box)

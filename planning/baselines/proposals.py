@@ -1,4 +1,4 @@
-"""Where raw pushes come from: standard normal noise made into pushes `[..., 4]` in [-1, 1]."""
+"""Proposal distributions of raw pushes: functions from standard normal noise to pushes `[..., 4]` in [-1, 1]."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.state import State
 
-SPREAD = math.pi / 4  # radians; how far a push may turn from its run's angle, either way
+SPREAD = math.pi / 4  # radians; largest difference from the segment's angle, either way
 JITTER = 0.3  # on each normalised motion component
 ASIDE = 0.03  # metres between a push's path and the object's centre, at most
 BEFORE = (0.05, 0.12)  # metres between a push's start and the object's centre
@@ -39,7 +39,7 @@ class UniformPushes:
 
 @dataclass(frozen=True)
 class PushBox:
-    """What normalised pushes mean: starts span the box from `low` to `high`, motions up to `motion`, in metres."""
+    """The scale of normalised pushes: starts span the box from `low` to `high`, motions up to `motion`, in metres."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -47,11 +47,11 @@ class PushBox:
 
 
 class HeuristicPushes:
-    """Pushes that are likely to move something: the idea of the data-collecting policy, without its rejections.
+    """Pushes that are likely to move something, as the data-collecting policy makes them, without its rejections.
 
     A segment has one object and one angle. Each push starts 5 to 12 cm before the object's (predicted) centre, at most
-    3 cm aside, and goes towards it, turned by up to 45 degrees, with noise of 0.3 on the motion. Starts are clipped to
-    the box; starts on top of other objects are left to f. Not in the paper, whose MPC samples uniformly.
+    3 cm aside, and goes towards it, rotated by up to 45 degrees, with noise of 0.3 on the motion. Starts are clipped to
+    the box; f has to predict the failure of starts on other objects. Not in the paper, whose MPC samples uniformly.
     """
 
     shared, own = 2, 5

@@ -1,4 +1,4 @@
-"""Planning in one level: sequences of pushes, ranked by the reward of what f predicts (the paper's flat baselines)."""
+"""Flat planning: sequences of pushes, ranked by the return of the states that f predicts (the paper's baselines)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from planning.searching import SearchingPlanner, summary
 
 
 class PushSearch(SearchingPlanner):
-    """What CVAE-MPC and MPC share: everything but the source of pushes.
+    """The common part of CVAE-MPC and MPC, everything but the source of pushes.
 
-    space: makes the pushes of a segment, and predicts their states with f. stride_limits: metres per push, as published
-    0.01 and 0.15; None in the paper. For the other options see `CavinPlanner`.
+    space: generates the pushes of a segment, and predicts their states with f. stride_limits: metres per push, as
+    published 0.01 and 0.15; None in the paper. For the other options see `CavinPlanner`.
 
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
     """
@@ -38,7 +38,7 @@ class PushSearch(SearchingPlanner):
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
         candidates = self.search_by_reward(self.space, state, generators, previous)
-        # A sum is finite only where everything in it is.
+        # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
         best = best_of(torch.where(finite, candidates.returns, -torch.inf), "returns of push sequences")
         chosen = candidates.take(best.unsqueeze(-1))

@@ -1,4 +1,4 @@
-"""The floor that any method must beat: pushes that ignore the scene."""
+"""Random pushes, which ignore the scene: a lower bound for any method."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RandomPlanner:
 
     @torch.inference_mode()
     def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
-        """Sample `[B, T, 4]` pushes for the scenes `state: [B]`; nothing is predicted or chosen.
+        """Sample `[B, T, 4]` pushes for the scenes `state: [B]`; without prediction or choice.
 
         Raises ValueError unless there is one generator per environment.
         """

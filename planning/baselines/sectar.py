@@ -19,10 +19,10 @@ from planning.searching import SearchingPlanner, summary
 
 
 class SectarPlanner(SearchingPlanner):
-    """Effect codes ranked by reward, as in `CavinPlanner`; the pushes are what g generates from the chosen code alone.
+    """Effect codes ranked by reward, as in `CavinPlanner`; g generates the pushes from the chosen code alone.
 
-    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). f only predicts where the
-    pushes lead, for drawing.
+    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). f only predicts the states
+    after the pushes, for pictures.
 
     model: p(c | s), h, g without motion codes, f. For the options see `CavinPlanner`. Raises ValueError for counts
     below 1, a horizon that T does not divide, and unknown names.

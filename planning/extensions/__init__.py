@@ -1,1 +1,1 @@
-"""Our additions to Algorithm 1, one file each; a planner leaves each of them out with None, false or 0."""
+"""Our additions to Algorithm 1, one file each; None, false or 0 turns each of them off."""

@@ -1,4 +1,4 @@
-"""Motions along which f predicts no failure (our addition to Algorithm 1, line 10)."""
+"""Avoidance of motions with a predicted failure (our addition to Algorithm 1, line 10)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from planning.rollouts.ranking import prefer
 from planning.rollouts.returns import Progress
 from planning.rollouts.segment import Objective, SegmentRollout
 
-FAILURE = 1e3  # square metres that a predicted failure costs an optimizer: more than any distance on the table
+FAILURE = 1e3  # square metres, the cost of a predicted failure: more than any distance on the table
 
 
 class FailureState(NamedTuple):
@@ -26,7 +26,7 @@ class FailureState(NamedTuple):
 
     @property
     def returns(self) -> Tensor:
-        """`[B, n]` minus the tracking cost, less where a failure is predicted, least where it is executed."""
+        """`[B, n]` minus the tracking cost; lower with a predicted failure, lowest with one in the executed segment."""
         return self.tracking.returns - FAILURE * (self.progress.failed.int() + self.failed_in_executed.int())
 
     @property
@@ -41,22 +41,22 @@ class FailureState(NamedTuple):
 
 
 class AvoidFailures(NamedTuple):
-    """An objective that also judges, step by step, whether f predicts a failure."""
+    """An objective that also checks f's predictions for failures, step by step."""
 
     objective: Objective  # `planning.cavin.TrackingCost`
     segments: Tensor  # [B] int64: segments until the effect plan ends; later failures do not count
     reward: RewardFunction
 
     def start(self, plans: State) -> FailureState:
-        """Of candidates without a segment, `plans: [B, n]`."""
+        """The state of candidates without a segment, `plans: [B, n]`."""
         progress = returns.start(plans.centers)
         return FailureState(self.objective.start(plans), progress, progress.failed)
 
     def advance(self, state: FailureState, segment: int, before: State, rollout: SegmentRollout) -> FailureState:
-        """After one more segment from `before: [B, n]`."""
+        """The state after one more segment from `before: [B, n]`."""
         tracking = self.objective.advance(state.tracking, segment, before, rollout)
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
-        progress = state.progress._replace(succeeded=state.progress.succeeded | ~counts)  # nothing left to fail
+        progress = state.progress._replace(succeeded=state.progress.succeeded | ~counts)  # later segments cannot fail
         progress = returns.advance(progress, self.reward, before.centers, rollout.path, before.mask)
         executed = torch.as_tensor(segment == 0, device=counts.device)
         return FailureState(tracking, progress, torch.where(executed, progress.failed, state.failed_in_executed))
@@ -67,9 +67,9 @@ class AvoidFailures(NamedTuple):
 
 
 def prefer_no_failure(state: FailureState) -> tuple[Any, Tensor]:
-    """The tracking state, and scores `[B, n]` by which motions without a predicted failure win.
+    """The tracking state, and scores `[B, n]` that rank motions without a predicted failure first.
 
-    Where every motion fails in some segment, those that fail in the executed one lose against the others.
+    If every motion fails in some segment, those that fail in the executed one rank last.
     """
     scores = prefer(state.tracking.returns, ~state.failed_in_executed)
     return state.tracking, prefer(scores, ~state.progress.failed)

@@ -1,4 +1,4 @@
-"""Pushes that move nothing come last (our addition to Algorithm 1, line 11)."""
+"""Idle pushes last (our addition to Algorithm 1, line 11)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def idle_last(
 ) -> tuple[Tensor, Tensor]:
     """The same actions and states, but in the first segment idle pushes come last.
 
-    A push is idle if f predicts that it moves no object by `distance` metres. Both groups keep their order. No object
-    moves by more than `distance` where an idle push is left out, so the predictions for the others hold to that extent.
-    A planner that plans anew after every push would otherwise execute an idle push and be where it was.
+    A push is idle if f predicts that it moves no object by `distance` metres. Both groups keep their order. An idle
+    push moves no object by more than `distance`, so the predictions for the other pushes stay valid up to that
+    distance. A planner that plans again after every push would otherwise execute an idle push and gain nothing.
 
     actions: `[B, H, 4]`. path: `[B, H, M, 3]` metres. state: `[B]`, before the first push. segment_length: T.
     """

@@ -1,4 +1,4 @@
-"""Motions that still work if the tool meets the object a little elsewhere (our addition to Algorithm 1, line 10)."""
+"""Robust motions by perturbed rollouts (our addition to Algorithm 1, line 10)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from planning.rollouts.dynamics import predict_states
 from planning.rollouts.sampling import noise_each
 from planning.rollouts.segment import actions_of
 
-QUARTER = 4  # one in so many continues in the next round, with so many times as many rollouts
+QUARTER = 4  # one in four candidates continues in the next round, with four times as many rollouts
 
 
 @dataclass(frozen=True)
@@ -26,17 +26,18 @@ class PerturbedRollouts:
     """Ranks the best motions by rollouts with perturbed pushes and perturbed outcomes.
 
     The best of a thousand motions is often one about which f errs: a push that just meets the object according to f,
-    and just misses it on the table. Perturbing its start tells the two apart. And the farther f moves an object, the
-    farther it errs: a long push past a forbidden place fails more often than a short one.
+    and just misses it on the table. A perturbed start reveals such pushes. The error of f also grows with the distance
+    that an object moves: a long push past a forbidden place fails more often than a short one.
 
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts: after each round the best quarter
     continues, with four times as many rollouts each.
 
     candidates: motions with perturbed rollouts, the best by line 10. rollouts: of each candidate in the first round.
-    rounds: of equally many rollouts, for fewer and fewer candidates, until one is left. 1 treats all alike.
+    rounds: of equally many rollouts in total, for fewer and fewer candidates; 1 gives every candidate the same number.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
-    outcome_noise: standard deviation, in x and in y, of the centre of an object after a push, per metre that f predicts
-        it to move. A rollout fails by the perturbed centres; its distance to the subgoal is f's.
+    outcome_noise: standard deviation, in x and in y, of an object's centre after a push, per metre of its predicted
+        move. The perturbed centres decide whether a rollout fails; its distance to the subgoal is that of f's
+        prediction.
     failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal.
 
     Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
@@ -91,8 +92,8 @@ def sequential_halving(
     """Number of the motion with the lowest cost on average, `[B]` int64.
 
     state: `[B]`, where all motions begin. goal: `[B, 1]`, the first subgoal. scores: `[B, N]`, the higher the better.
-    actions: `[B, N, T, 4]`, the segment that will be executed. later: `[B, N]` square metres that the segments after it
-    cost. A motion whose score or whose cost is not finite loses.
+    actions: `[B, N, T, 4]`, the segment that will be executed. later: `[B, N]` square metres, the cost of the segments
+    after it. A motion whose score or whose cost is not finite loses.
     """
     best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
     numbers, count, done = best.indices, robustness.rollouts, 0
@@ -100,7 +101,7 @@ def sequential_halving(
     total = torch.zeros_like(best.values)  # cost of all rollouts so far
     for number in range(robustness.rounds):
         if number and total.shape[-1] == 1:
-            break  # the choice is made
+            break  # one candidate is left
         if number:
             going = (total / done).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
             numbers, infinite, total = (field.gather(1, going) for field in (numbers, infinite, total))
@@ -137,9 +138,9 @@ def perturbed_rollouts(
     feature_weight: float = 0.0,
     backend: Backend = eager,
 ) -> tuple[Tensor, Tensor]:
-    """What f predicts of `actions: [B, R, T, 4]`, each perturbed `count` times.
+    """Rollouts of `actions: [B, R, T, 4]` by f from `state: [B]`, each perturbed `count` times.
 
-    `state: [B]`. Square metres to the `goal: [B, 1]`, `[B, R, count]`, and whether a rollout fails, alike.
+    Returns the square metres to the `goal: [B, 1]` and whether a rollout fails, `[B, R, count]` each.
     """
     pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
     pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
@@ -160,7 +161,7 @@ def _rollout_costs(
     errors: Tensor | None,
     feature_weight: float,
 ) -> tuple[Tensor, Tensor]:
-    """What f predicts of `pushes: [B, n, T, 4]`: square metres to the `goal`, `[B, n]`, and whether they fail, bool."""
+    """Rollouts of `pushes: [B, n, T, 4]` by f: square metres to the `goal` and whether they fail, `[B, n]` each."""
     plans = state.expand_plans(pushes.shape[1])
     before, mask = plans.centers, plans.mask
     here, path = predict_states(model, state.expand_plans(1), pushes)
@@ -172,7 +173,7 @@ def _rollout_costs(
 def outcomes(start: Tensor, path: Tensor, errors: Tensor) -> Tensor:
     """Perturbed centres after every push, instead of f's `path: [B, n, T, M, 3]` from `start: [B, n, M, 3]`.
 
-    errors: `[B, n, T, M, 2]`, metres in x and in y per metre that f moves an object. Heights stay.
+    errors: `[B, n, T, M, 2]`, metres in x and in y per metre that f moves an object. Heights do not change.
     """
     strides = (path - returns.before_each(start, path))[..., :2].norm(dim=-1, keepdim=True)
     return torch.cat([path[..., :2] + strides * errors, path[..., 2:]], -1)

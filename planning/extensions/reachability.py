@@ -1,4 +1,4 @@
-"""Effects that motions can bring about (our addition to Algorithm 1, line 7)."""
+"""Reachable effects (our addition to Algorithm 1, line 7)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PredictEffect = Callable[[State, State, Tensor], SegmentRollout]  # `planning.ca
 
 @dataclass(frozen=True)
 class Reachability:
-    """Rescores the best effect plans by what f predicts of their first segment, instead of h.
+    """Rescores the best effect plans with f's prediction of their first segment, in place of h's.
 
-    h promises some subgoals that no pushes reach. candidates: effect plans that are rescored, the best by line 7.
-    motions: codes sampled for the first segment of each; the one counts that f predicts closest to the subgoal. From
-    there on h continues with the plan's other effect codes.
+    h predicts some subgoals that no pushes reach. candidates: number of effect plans to rescore, the best by line 7.
+    motions: codes sampled for the first segment of each plan, of which the one closest to the subgoal by f counts.
+    From its last state h continues with the plan's other effect codes.
 
     Raises ValueError for counts below 1.
     """
@@ -43,7 +43,7 @@ class Reachability:
 def most_reachable(
     options: Reachability, effects: Candidates, predict: PredictEffect, model: PlanningModel, reward: RewardFunction
 ) -> Tensor:
-    """The effect plan `[B]` int64 with the highest return by f and then h, of equals the one that f comes closest to.
+    """The effect plan `[B]` int64 with the highest return by f and then h; among equals, the closest by f.
 
     effects: effect plans `[B, N]` of K segments; predict: h and the interpolation; the reward is that of motions.
     Raises ValueError where no rescored plan of an environment has a finite return.
@@ -67,7 +67,7 @@ def most_reachable(
 def _first_segment(
     options: Reachability, effects: Candidates, codes: Tensor, model: PlanningModel, reward: RewardFunction
 ) -> tuple[SegmentRollout, Tensor]:
-    """Of each effect plan the motion `[B, F]` that comes closest to its first subgoal, and its square metres."""
+    """The motion `[B, F]` that comes closest to each effect plan's first subgoal, and its squared distance."""
     state, count = effects.problem.state, effects.count
     plans = state.expand_plans(count * options.motions)
     repeated = codes.repeat_interleave(options.motions, dim=1)  # [B, F m, C]
@@ -95,7 +95,7 @@ def _first_segment(
 class _FixedFirstSegment:
     """Given plans: f has predicted the first segment, h predicts the others from there."""
 
-    dimension = 0  # there is nothing to search
+    dimension = 0  # no noise to search
 
     def __init__(self, predict: PredictEffect, first: SegmentRollout, codes: Tensor) -> None:
         self.predict, self.first, self.codes = predict, first, codes

@@ -13,24 +13,25 @@ from planning.rollouts.sampling import noise_each
 
 
 def chosen_noise(chosen: Candidates) -> Tensor:
-    """The noise `[B, K, D]` of the chosen candidates `[B, 1]`; K = 0 for candidates not made from noise."""
+    """The noise `[B, K, D]` of the chosen candidates `[B, 1]`; K = 0 for candidates that were not reparameterised."""
     if any(segment.noise is None for segment in chosen.segments):
         return chosen.plans.centers.new_empty(len(chosen.plans.mask), 0, 0)
     return chosen.noise[:, 0]
 
 
 def warm_start_noise(previous: Plan | None, generators: Sequence[torch.Generator]) -> Tensor | None:
-    """Candidates from the last plan, some or all of whose first segment was executed: `[B, 1 + K, K, D]`, or None.
+    """Candidates from the last plan, after a part of its first segment was executed: `[B, 1 + K, K, D]`, or None.
 
-    First the plan as it was, for callers that execute one push of many. Then the plan without its first segment,
-    without its second, and so on, each with one fresh segment at the end: so a plan that succeeds loses the segments
-    that it does not need, one at a time.
+    The first candidate is the unchanged plan, for callers that execute one push of many. The others are the plan
+    without its first segment, without its second, and so on, each with one fresh segment at the end. So a successful
+    plan loses the segments that it does not need, one at a time.
     """
     if previous is None or previous.noise.shape[1] == 0:
         return None
     segments = previous.noise.shape[1]
     fresh = noise_each((1, previous.noise.shape[-1]), generators)
-    longer = torch.cat([previous.noise, fresh], 1)  # of these K + 1 segments one is left out, the fresh one first
+    # Each candidate omits one of these K + 1 segments, the first candidate the fresh one.
+    longer = torch.cat([previous.noise, fresh], 1)
     return torch.stack(
         [torch.cat([longer[:, :out], longer[:, out + 1 :]], 1) for out in (segments, *range(segments))], 1
     )

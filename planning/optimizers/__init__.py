@@ -1,7 +1,6 @@
-"""How candidates are searched: optimizers see noise and returns, and nothing of what these mean.
+"""Optimizers, which search candidates by their noise and returns only.
 
-Codes and pushes are searched as standard normal noise `[B, n, K, D]`, so the prior is kept, and bounds are, whatever an
-optimizer does.
+Standard normal noise `[B, n, K, D]` determines codes and pushes, so every optimizer respects the prior and the bounds.
 """
 
 from planning.optimizers.cross_entropy import CrossEntropy

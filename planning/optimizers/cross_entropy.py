@@ -16,11 +16,11 @@ MINIMUM_SCALE = 1e-3  # so that a search never collapses onto a point
 
 @dataclass(frozen=True)
 class CrossEntropy:
-    """Samples around the elites of the last iteration, beginning with the prior.
+    """Samples from a Gaussian fitted to the elites of the last iteration; the first iteration samples the prior.
 
-    iterations: they share the samples. elite_fraction: of an iteration's candidates, to which the next distribution is
-    fitted. momentum: weight of the last mean and scale in the next. replacement: failed candidates become copies of
-    active ones, as in shooting.
+    iterations: share the samples equally. elite_fraction: fraction of an iteration's candidates for the next fit.
+    momentum: weight of the last mean and scale in the next. replacement: failed candidates become copies of active
+    ones, as in shooting.
 
     Raises ValueError for counts below 1 and fractions outside of their range.
     """
@@ -36,7 +36,7 @@ class CrossEntropy:
         check_fraction("momentum", self.momentum)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
-        """See `Optimizer`; the last candidate is the last mean, unless that was replaced."""
+        """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""
         mean = scale = None
         for number in range(self.iterations):
             count = samples_of_iteration(samples, self.iterations, number)
@@ -53,7 +53,7 @@ class CrossEntropy:
 def refit(elites: Population, mean: Tensor | None, scale: Tensor | None, momentum: float) -> tuple[Tensor, Tensor]:
     """Mean and scale `[B, 1, K, D]` of the elites `[B, n]`, mixed with the last ones (zero and one at first).
 
-    Elites whose return is not finite do not count.
+    Elites without a finite return do not count.
     """
     counts = torch.isfinite(elites.returns)[..., None, None]
     noise = torch.where(counts, elites.noise, 0.0)

@@ -1,4 +1,4 @@
-"""Evolution of whole plans: random ones first, then changed copies of the best (Perez et al., GECCO 2013)."""
+"""Evolution of whole plans: random ones first, then mutated copies of the best (Perez et al., GECCO 2013)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from planning.rollouts.sampling import noise_each, uniform_each
 class Evolution:
     """Parents are the best candidates so far; offspring lose some of a parent's segments and mutate others.
 
-    Under a sparse reward a random plan that reaches the goal does much that the goal does not need. Deletion makes
-    room for fresh segments at the end, so that offspring are as long as their parents.
+    Under a sparse reward a random plan that reaches the goal has many superfluous segments. Fresh segments at the end
+    replace the deleted ones, so offspring are as long as their parents.
 
     generations: after the initial one, which is sampled from the prior. initial_fraction: of the samples, for the
     initial generation. parents: how many, at most. deletion_rate, mutation_rate: segments per offspring, on average.
@@ -51,7 +51,7 @@ class Evolution:
 
     @property
     def iterations(self) -> int:
-        """How many times at least one sample is needed."""
+        """Number of generations, each of which needs at least one sample."""
         return 1 + self.generations
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
@@ -60,7 +60,7 @@ class Evolution:
         noise = problem.noise(initial)
         warm = min(initial, math.ceil(self.warm_start * initial))
         if warm and problem.warm_start is not None:
-            # In the last places: of equal candidates, such as all that do not reach the goal, a new one wins.
+            # In the last places: among equal candidates, such as all that miss the goal, a new one wins.
             known = torch.cat([problem.warm_start, self._offspring(problem, problem.warm_start, warm)], 1)
             noise[:, initial - warm :] = known[:, :warm]
         candidates = problem.evaluate(noise, replacement=self.replacement)
@@ -72,7 +72,7 @@ class Evolution:
             population = records.join([population, Population(noise, problem.evaluate(noise).returns)])
 
     def _offspring(self, problem: SearchProblem, parents: Tensor, count: int) -> Tensor:
-        """`parents: [B, p, K, D]` -> `[B, n, K, D]`, each of one parent sampled uniformly."""
+        """`parents: [B, p, K, D]` -> `[B, n, K, D]`, each of one uniformly sampled parent."""
         segments = problem.segments
         whose, how_many, which, changed = uniform_each((4, count, segments), problem.generators).unbind(1)
         fresh, last = noise_each((2, count, segments, problem.dimension), problem.generators).unbind(1)

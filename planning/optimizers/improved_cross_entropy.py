@@ -18,12 +18,12 @@ from planning.rollouts.candidates import SearchProblem
 class ImprovedCrossEntropy:
     """The cross-entropy method with kept elites and noise that is coloured over a plan's segments.
 
-    Of the published method: coloured noise, elites that compete again in the next iteration, and the mean as a
-    candidate of the last. Not: elites carried over from the last plan.
+    From the published method: coloured noise, elites that compete again in the next iteration, and the mean as a
+    candidate of the last iteration. Omitted: elites carried over from the last plan.
 
-    iterations, elite_fraction, momentum, replacement: as `CrossEntropy`. kept_elite_fraction: of the elites, that
-    compete again.
-    exponent: the noise's power falls as frequency^-exponent; 0 is white, 2 makes neighbouring segments alike.
+    iterations, elite_fraction, momentum, replacement: as `CrossEntropy`. kept_elite_fraction: fraction of the elites
+    that compete again.
+    exponent: the noise's power falls as frequency^-exponent; 0 is white, 2 makes neighbouring segments similar.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -43,7 +43,7 @@ class ImprovedCrossEntropy:
         check_weight("exponent", self.exponent)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
-        """See `Optimizer`; the last candidate is the last mean, unless that was replaced."""
+        """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""
         mean = scale = None
         elites: Population | None = None
         for number in range(self.iterations):

@@ -14,9 +14,9 @@ from planning.rollouts.candidates import SearchProblem
 
 @dataclass(frozen=True)
 class PathIntegral:
-    """Samples around the mean of the last samples, weighted by exp(return / temperature); beginning with the prior.
+    """Samples around the last mean, weighted by exp(return / temperature); the first iteration samples the prior.
 
-    iterations: they share the samples. temperature: in units of the return; None adapts it so that the weights'
+    iterations: share the samples equally. temperature: in units of the return; None adapts it so that the weights'
     effective sample size is `effective_sample_size`, a fraction of the candidates. shrink: factor from one iteration's
     scale to the next's. replacement: as `CrossEntropy`.
 
@@ -37,7 +37,7 @@ class PathIntegral:
             raise ValueError(f"temperature must be a positive number or null, not {self.temperature}")
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
-        """See `Optimizer`; the last candidate is the last mean, unless that was replaced."""
+        """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""
         mean = None
         for number in range(self.iterations):
             noise = problem.noise(samples_of_iteration(samples, self.iterations, number))
@@ -50,7 +50,7 @@ class PathIntegral:
                 _, logarithms = adapt_temperature(candidates.returns, self.effective_sample_size)
             else:
                 logarithms = candidates.returns / self.temperature
-            # Where no candidate counts the mean stays: all weights are zero.
+            # Without a finite candidate all weights are zero, and the mean stays.
             weights = torch.softmax(logarithms, -1).nan_to_num(0.0).to(noise.dtype)[..., None, None]
             old = torch.zeros_like(noise[:, :1]) if mean is None else mean
             found = (weights > 0).any(1, keepdim=True)

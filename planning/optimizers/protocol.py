@@ -1,4 +1,4 @@
-"""What an optimizer offers: one method."""
+"""The interface of optimizers: one method."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from planning.rollouts.candidates import Candidates, SearchProblem
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """Anything that searches; docs/how-to/your-own-optimizer.md shows one of 30 lines."""
+    """Searches candidates; docs/how-to/your-own-optimizer.md shows an example of 30 lines."""
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
-        """Search for candidates of high return, in the work of N = `samples` whole candidates.
+        """Search for candidates of high return, with the budget of N = `samples` whole candidates.
 
-        `problem(noise)` takes candidates, standard normal noise `[B, n, K, D]`, and gives their returns `[B, n]`;
+        `problem(noise)` takes candidates, standard normal noise `[B, n, K, D]`, and returns their returns `[B, n]`;
         -inf means that a prediction was not finite. `problem.noise(n)` samples the prior, `problem.generators` are the
         only randomness to use, and `problem.warm_start` is None or noise `[B, h, K, D]` from the last plan. The
-        planner chooses the best of all candidates that were evaluated, so there is nothing to return.
+        planner chooses the best of all candidates that were evaluated, so this method returns nothing.
         """
 
 

@@ -1,4 +1,4 @@
-"""Optimizers by name, and what a planner's option `optimizer` may be."""
+"""Optimizers by name, and the checks of a planner's option `optimizer`."""
 
 from __future__ import annotations
 

@@ -22,11 +22,11 @@ from planning.rollouts.sampling import noise_each, uniform_each
 
 @dataclass(frozen=True)
 class SequentialMonteCarlo:
-    """Particles that are extended, weighted, resampled and moved, a segment at a time.
+    """Extends, weights, resamples and moves particles, a segment at a time.
 
     effective_sample_size: the temperature after a segment is the lowest at which the weights' effective sample size is
     this fraction of the particles that have not failed. moves: of every particle after every segment. block:
-    last segments that a move changes. step: of a move, in (0, 1]; 1 forgets where it begins.
+    last segments that a move changes. step: of a move, in (0, 1]; 1 samples independently of the current value.
 
     Extending n particles over K segments and moving their last ones costs as much as N samples of shooting.
 
@@ -54,7 +54,7 @@ class SequentialMonteCarlo:
         """See `Optimizer`; at most N = `samples` candidates are whole."""
         count = self.particles(samples, problem.segments)
         particles = problem.begin(count)
-        tempered = torch.zeros_like(particles.returns).double()  # log weights by which they were sampled
+        tempered = torch.zeros_like(particles.returns).double()  # log weights of the last resampling
         for number in range(1, problem.segments + 1):
             particles = particles.extend(noise_each((count, problem.dimension), problem.generators))
             returns = active_returns(particles)
@@ -69,11 +69,11 @@ class SequentialMonteCarlo:
             tempered = inverse.unsqueeze(-1) * active_returns(particles).nan_to_num(neginf=0.0)
 
     def _move(self, particles: Candidates, inverse: Tensor) -> tuple[Candidates, Candidates]:
-        """One Metropolis step of every particle, and what was proposed; `inverse: [B]` temperatures."""
+        """One Metropolis step of every particle, and the proposals; `inverse: [B]` temperatures."""
         problem = particles.problem
         length = min(self.block, len(particles.segments))
         shape = (particles.count, length, problem.dimension)
-        # The proposal leaves N(0, I) invariant, so that the prior cancels and returns alone decide.
+        # The proposal leaves N(0, I) invariant, so the prior cancels and only the returns decide.
         fresh = noise_each(shape, problem.generators)
         noise = math.sqrt(1.0 - self.step**2) * particles.noise[:, :, -length:] + self.step * fresh
         proposed = particles.back(length)
@@ -88,7 +88,7 @@ class SequentialMonteCarlo:
 
 
 def active_returns(candidates: Candidates) -> Tensor:
-    """Returns `[B, n]`, -inf for failed candidates where others have not failed, whose copies replace them."""
+    """Returns `[B, n]`, -inf for failed candidates if others have not failed, so that copies replace them."""
     finite = torch.isfinite(candidates.returns)
     valid = finite & ~candidates.score_state.failed
     return torch.where(valid | ~valid.any(-1, keepdim=True), candidates.returns, -torch.inf)

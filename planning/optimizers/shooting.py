@@ -11,8 +11,8 @@ from planning.rollouts.candidates import SearchProblem
 class Shooting:
     """All samples at once from the prior.
 
-    The warm start takes the last places, so that of equal candidates a new one wins: under a sparse reward all that do
-    not reach the goal are equal, and an old one would be chosen for ever.
+    The warm start takes the last places, so a new candidate wins among equals: under a sparse reward all candidates
+    that miss the goal are equal, and the planner would repeat an old one for ever.
 
     replacement: "episodes which fail early will be replaced by duplicating episodes that are still active" (section
     3.2); false leaves failed candidates as they are.

@@ -1,4 +1,4 @@
-"""What optimizers make of returns: the best candidates, and the weight of each."""
+"""The best candidates, and weights of candidates, from their returns."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 from planning import records
 
 TEMPERATURES = 97  # inverse temperatures on a grid, evenly spaced in the logarithm
-RANGE = (1e-3, 1e9)  # of them, times the range of the returns, which one violation can make a million times too wide
-SAME = 1.05  # effective sample sizes that differ by less than this factor are the same
+RANGE = (1e-3, 1e9)  # of inverse temperatures times the range of returns, which one violation can widen a million times
+SAME = 1.05  # effective sample sizes within this factor count as equal
 
 
 class Population(NamedTuple):
@@ -28,7 +28,7 @@ def best(population: Population, count: int) -> Population:
 
 
 def samples_of_iteration(samples: int, iterations: int, number: int) -> int:
-    """How many of N = `samples` fall to iteration `number` of `iterations`; the first ones take what is left over.
+    """The number of the N = `samples` for iteration `number` of `iterations`; the first iterations take the remainder.
 
     Raises ValueError if there are fewer samples than iterations.
     """
@@ -38,7 +38,7 @@ def samples_of_iteration(samples: int, iterations: int, number: int) -> int:
 
 
 def effective_sample_size(log_weights: Tensor) -> Tensor:
-    """(sum w)^2 / sum w^2, how many equally weighted candidates say as much: `[..., n] -> [...]`; 0 without any."""
+    """(sum w)^2 / sum w^2, the equivalent number of equally weighted candidates: `[..., n] -> [...]`; 0 without any."""
     weights = torch.softmax(log_weights, -1).nan_to_num(0.0)
     return (1.0 / weights.square().sum(-1)).nan_to_num(0.0, posinf=0.0)
 
@@ -46,12 +46,12 @@ def effective_sample_size(log_weights: Tensor) -> Tensor:
 def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The lowest temperature at which the weights keep `fraction` of the effective sample size, and the log weights.
 
-    Where many share the highest return, much lower temperatures give the same weights; then the highest of those.
+    If many share the highest return, much lower temperatures give the same weights; the highest of those is chosen.
 
-    Weights are exp(return / temperature), divided by `exp(before)` (`[B, n]`, zero by default), by which the
-    candidates were sampled already. returns: `[B, n]`, -inf for those that do not count; the fraction is of the
-    others. Gives inverse temperatures `[B]` and log weights `[B, n]`, which are -inf where the returns are, as
-    float64, for large returns at low temperatures leave little of float32.
+    Weights are exp(return / temperature), divided by `exp(before)` (`[B, n]`, zero by default), for
+    earlier resampling by these weights. returns: `[B, n]`, -inf for those that do not count; the fraction is of the
+    others. Returns inverse temperatures `[B]` and log weights `[B, n]`, which are -inf where the returns are, in
+    float64, because large returns at low temperatures exceed the precision of float32.
     """
     returns = returns.double()
     counts = torch.isfinite(returns)
@@ -67,7 +67,7 @@ def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = 
     sizes = effective_sample_size(logarithms)
     enough = sizes >= fraction * counts.sum(-1, keepdim=True).clamp(min=1)
     ranks = torch.arange(TEMPERATURES, device=returns.device)
-    # Where no temperature keeps enough, the one that keeps most.
+    # If no temperature keeps enough, take the one that keeps most.
     number = torch.where(enough.any(-1), torch.where(enough, ranks, -1).amax(-1), sizes.argmax(-1))
     weighs_the_same = enough & (sizes <= SAME * sizes.gather(-1, number.unsqueeze(-1)))
     number = torch.where(weighs_the_same.any(-1), weighs_the_same.int().argmax(-1), number)

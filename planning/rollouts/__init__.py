@@ -1,1 +1,1 @@
-"""Rollouts of candidates: segments, what ends and replaces them, and what they are worth."""
+"""Rollouts of candidates: segments, termination, replacement and returns."""

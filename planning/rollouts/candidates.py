@@ -1,4 +1,4 @@
-"""Candidate plans, rolled out segment by segment: the one place where every planner and every optimizer does so."""
+"""Candidate plans, rolled out segment by segment, for every planner and every optimizer."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from planning.rollouts.segment import Objective, SearchSpace, SegmentRecord, Seg
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """A search for plans of K segments from `state: [B]`; all that an optimizer is given.
+    """A search for plans of K segments from `state: [B]`, the argument of an optimizer.
 
     An optimizer needs `noise`, `generators`, `warm_start` and the call itself: noise `[B, n, K, D]` in, returns
-    `[B, n]` out. `evaluate` and `sample` also replace failed candidates; `begin` lets an optimizer extend candidates
-    segment by segment. Whatever was evaluated is in `considered`, from which the planner chooses.
+    `[B, n]` out. `evaluate` and `sample` also replace failed candidates; with `begin` an optimizer extends candidates
+    segment by segment. `considered` collects all evaluated candidates, from which the planner chooses.
     """
 
     space: SearchSpace
@@ -32,10 +32,10 @@ class SearchProblem:
     state: State
     generators: Sequence[torch.Generator]  # one per environment
     segments: int  # K
-    reparameterized: bool = False  # candidates must be made from noise (needed by warm start and compilation)
+    reparameterized: bool = False  # force reparameterised sampling (needed by warm start and compilation)
     warm_start: Tensor | None = None  # [B, h, K, D] noise of promising candidates, from the last plan
-    best_only: bool = False  # the caller reads no candidate but the best one
-    backend: Backend = eager  # runs the extension of candidates made from noise
+    best_only: bool = False  # the caller reads only the best candidate
+    backend: Backend = eager  # runs the extension of reparameterised candidates
     considered: list[Candidates] = field(default_factory=list, init=False, compare=False)  # whole candidates
 
     def __call__(self, noise: Tensor) -> Tensor:
@@ -54,7 +54,7 @@ class SearchProblem:
 
     @property
     def dimension(self) -> int:
-        """D, the numbers of noise per segment."""
+        """D, the dimension of the noise per segment."""
         return self.space.dimension
 
     def noise(self, count: int) -> Tensor:
@@ -77,16 +77,16 @@ class SearchProblem:
         return self._roll_out(noise.shape[1], noise.unbind(2), replacement, early_stopped)
 
     def begin(self, count: int) -> Candidates:
-        """n = `count` candidates without a segment. Their extensions are considered once `consider` is called."""
+        """n = `count` candidates without a segment. Call `consider` with their extensions."""
         plans = self.state.expand_plans(count)
         return Candidates(self, plans, self.objective.start(plans))
 
     def consider(self, candidates: Candidates) -> None:
-        """Let the planner choose among these whole candidates, too."""
+        """Add whole candidates, from which the planner then also chooses."""
         self.considered.append(candidates)
 
     def take_considered(self) -> Candidates:
-        """All whole candidates so far, in order, which the problem then forgets (they refer to it).
+        """Remove and return all whole candidates so far, in order (they refer to this problem).
 
         Raises ValueError if there are none.
         """
@@ -116,10 +116,10 @@ class SearchProblem:
 
 @dataclass(frozen=True)
 class Candidates:
-    """n candidates per environment, k segments long, that can be extended, chosen among, joined and taken back.
+    """n candidates per environment, k segments long: extend, select, concatenate and truncate them.
 
-    Each segment is recorded once, under the numbers that candidates had there; `ancestors` map the numbers from one
-    segment to the next. Copies of a candidate cost nothing.
+    Each segment is stored once, under the numbers of its candidates then; `ancestors` map the numbers from one segment
+    to the next. Copies of a candidate cost nothing.
     """
 
     problem: SearchProblem
@@ -127,7 +127,7 @@ class Candidates:
     score_state: Any  # fields [B, n]
     segments: tuple[SegmentRecord, ...] = ()  # k of them, of [B, R, ...]
     # k of [B, .] int64: for each candidate of the next segment (after the last, for each of `plans`) the number of
-    # its ancestor; None where the numbers stay.
+    # its ancestor; None if the numbers do not change.
     ancestors: tuple[Tensor | None, ...] = ()
 
     @property
@@ -142,7 +142,7 @@ class Candidates:
 
     @property
     def codes(self) -> Tensor:
-        """`[B, n, k, D]` effect or motion codes, or the pushes of each segment in a row."""
+        """`[B, n, k, D]` effect or motion codes, or the concatenated pushes of each segment."""
         return self.history(lambda segment: segment.rollout.code)
 
     @property
@@ -169,7 +169,7 @@ class Candidates:
 
     @property
     def noise(self) -> Tensor:
-        """`[B, n, k, D]`; only of candidates made from noise."""
+        """`[B, n, k, D]`; only for reparameterised candidates."""
 
         def noise_of(segment: SegmentRecord) -> Tensor:
             assert segment.noise is not None
@@ -179,7 +179,7 @@ class Candidates:
 
     @cached_property
     def rows(self) -> tuple[Tensor | None, ...]:
-        """The numbers that candidates had in each segment, k of `[B, n]` int64; None where they have them still."""
+        """The numbers of the candidates in each segment, k of `[B, n]` int64; None if they did not change since."""
         rows: list[Tensor | None] = []
         later: Tensor | None = None
         for ancestor in reversed(self.ancestors):
@@ -196,11 +196,11 @@ class Candidates:
     ) -> tuple[Candidates, Tensor | None]:
         """One more segment; then copies of active candidates, by `chances: [B, n]` in [0, 1), replace failed ones.
 
-        Without chances, and after the `last` segment, failed candidates stay. In environments that are
-        `early_stopped: [B]` bool, if it is given, all stay. Also returns which environments have stopped afterwards.
+        Without chances, and after the `last` segment, failed candidates stay. In
+        `early_stopped: [B]` environments, if given, all stay. Also returns the environments that have stopped by then.
         """
         problem, before, number = self.problem, self.plans, len(self.segments)
-        # Until the first segment all candidates are in one state, which the model then reads once.
+        # In the first segment all candidates start from one state, which the model reads once.
         here = before if self.segments else problem.state.expand_plans(1)
         what = problem.space, problem.objective, number, here, before, self.score_state, noise, chances, early_stopped
         after = extend_segment(*what, problem.generators) if noise is None else problem.backend(extend_segment, *what)
@@ -225,7 +225,7 @@ class Candidates:
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
 
     def take(self, numbers: Tensor) -> Candidates:
-        """Candidates by number, `[B, m]` int64: m candidates, copies where a number comes twice."""
+        """Candidates by number, `[B, m]` int64; a repeated number gives copies."""
         plans, score_state = records.take((self.plans, self.score_state), numbers)
         ancestors = self.ancestors
         if ancestors:
@@ -244,13 +244,13 @@ class Candidates:
         return Candidates(self.problem, last.rollout.states, last.score_state, self.segments[:left], ancestors)
 
     def compact(self) -> Candidates:
-        """The same candidates, with every segment recorded under their present numbers."""
+        """The same candidates, with every segment stored under their current numbers."""
         pairs = zip(self.segments, self.rows, strict=True)
         segments = tuple(segment if row is None else records.take(segment, row) for segment, row in pairs)
         return Candidates(self.problem, self.plans, self.score_state, segments, (None,) * len(segments))
 
     def at(self, segment: int, read: Callable[[SegmentRecord], Tensor]) -> Tensor:
-        """One segment of every candidate: `read` takes `[B, R, ...]` from its record -> `[B, n, ...]`."""
+        """A field of one segment for every candidate: `read` gets `[B, R, ...]` from the record -> `[B, n, ...]`."""
         row, values = self.rows[segment], read(self.segments[segment])
         return values if row is None else values[self._environments, row]
 
@@ -261,12 +261,12 @@ class Candidates:
         return torch.arange(len(mask), device=mask.device).unsqueeze(-1)
 
     def history(self, read: Callable[[SegmentRecord], Tensor]) -> Tensor:
-        """The same of all k segments: `[B, n, k, ...]`."""
+        """The same field for all k segments: `[B, n, k, ...]`."""
         return torch.stack([self.at(segment, read) for segment in range(len(self.segments))], dim=2)
 
 
 def join(parts: Sequence[Candidates]) -> Candidates:
-    """Candidates of one problem and one length, one after the other: `[B, n_1], [B, n_2], ... -> [B, n_1 + ...]`."""
+    """Concatenate candidates of one problem and one length: `[B, n_1], [B, n_2], ... -> [B, n_1 + ...]`."""
     if len(parts) == 1:
         return parts[0]
     compact = [part.compact() for part in parts]

@@ -20,8 +20,8 @@ REWARD_AT = ("path", "subgoals")
 STRIDE_PENALTY = -100.0  # of a step, as for a violation (published code)
 
 
-class Judgement(NamedTuple):
-    """`Outcome` of steps in any batch `[...]`."""
+class StepOutcome(NamedTuple):
+    """The `Outcome` of steps in any batch `[...]`."""
 
     reward: Tensor
     success: Tensor
@@ -32,8 +32,8 @@ class Judgement(NamedTuple):
 class CumulativeReward:
     """Scores plans by the reward of all their steps, up to the one that ends a plan.
 
-    reward: the task's. at: `path` judges every step of a segment, interpolated ones too (paper); `subgoals` only its
-    end, as one step (published code).
+    reward: the task's. at: `path` evaluates every step of a segment, interpolated ones too (paper); `subgoals` only
+    its end, as one step (published code).
 
     Raises ValueError for an unknown `at`.
     """
@@ -43,21 +43,21 @@ class CumulativeReward:
 
     def __post_init__(self) -> None:
         if self.at not in REWARD_AT:
-            raise ValueError(f"unknown reward_at '{self.at}': take {' or '.join(REWARD_AT)}")
+            raise ValueError(f"unknown reward_at '{self.at}': choose {' or '.join(REWARD_AT)}")
 
     def start(self, plans: State) -> Progress:
-        """Of candidates without a segment, `plans: [B, n]`."""
+        """Progress of candidates without a segment, `plans: [B, n]`."""
         return returns.start(plans.centers)
 
     def advance(self, score_state: Progress, segment: int, before: State, rollout: SegmentRollout) -> Progress:
-        """After one more segment from `before: [B, n]`."""
+        """Progress after one more segment from `before: [B, n]`."""
         path = rollout.path if self.at == "path" else rollout.path[..., -1:, :, :]
         return returns.advance(score_state, self.reward, before.centers, path, before.mask)
 
     def early_stopped(self, score_state: Progress) -> Tensor:
-        """`[B]` bool: where no active candidate can still reach a higher return than the best terminated one.
+        """`[B]` bool: no active candidate can still reach a higher return than the best terminated one.
 
-        Nowhere, unless the reward function is a `planning.protocol.BoundedReward`.
+        Always false, unless the reward function is a `planning.protocol.BoundedReward`.
         """
         ended = torch.where(score_state.active, -torch.inf, score_state.returns).amax(-1)
         possible = torch.where(
@@ -89,20 +89,20 @@ class StrideLimits:
 
     @property
     def maximum_return(self) -> float:
-        """Upper bound on any return: as without limits, which only lower it."""
+        """Upper bound on any return, as without limits, which only lower returns."""
         return maximum_return_of(self.reward)
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
-        """Judge the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
+        """Evaluate the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
         outcome = self.reward(previous, centers, mask)
         if self.of == "pushes":
             outside = self._outside(previous, centers, mask)
         else:
             whole = self._outside(previous[..., 0, :, :], centers[..., -1, :, :], mask[..., -1, :])
             outside = torch.zeros_like(outcome.failure)
-            outside[..., 0] = whole  # from its first step on: nothing counts on the way to where nothing gets
+            outside[..., 0] = whole  # from its first step on: no reward counts in a segment that fails
         outside = outside & ~outcome.failure
-        return Judgement(
+        return StepOutcome(
             torch.where(outside, STRIDE_PENALTY, outcome.reward),
             outcome.success & ~outside,
             outcome.failure | outside,

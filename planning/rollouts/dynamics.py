@@ -1,4 +1,4 @@
-"""The states that f predicts of actions (paper, equation 1; Algorithm 1, line 9)."""
+"""The states that f predicts for actions (paper, equation 1; Algorithm 1, line 9)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from planning.protocol import DynamicsModel
 def predict_states(model: DynamicsModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
     """T `pushes: [B, n, T, 4]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]` and the path `[B, n, T, M, 3]`.
 
-    Recursively, an action at a time; the path is in metres.
+    Step by step; the path is in metres.
     """
     steps = []
     for push in pushes.unbind(-2):

@@ -19,7 +19,7 @@ class ExtendedSegment(NamedTuple):
 
     rollout: SegmentRollout
     score_state: Any  # after the segment
-    ancestors: Tensor | None  # [B, n] int64, where copies of active candidates replace failed ones
+    ancestors: Tensor | None  # [B, n] int64, if copies of active candidates replace failed ones
     plans: State  # [B, n] after replacement
     next_score_state: Any  # after replacement
     early_stopped: Tensor | None  # [B] bool, see `planning.rollouts.candidates.SearchProblem.evaluate`
@@ -37,10 +37,10 @@ def extend_segment(
     early_stopped: Tensor | None,
     generators: Sequence[torch.Generator] = (),
 ) -> ExtendedSegment:
-    """Roll out segment `number` of candidates that have come to `before: [B, n]`; terminated ones stay.
+    """Roll out segment `number` of candidates in the states `before: [B, n]`; terminated ones stay.
 
     For `chances` and `early_stopped` see `Candidates.extend_and_replace`, for `here` see `SearchSpace.extend`. The
-    `generators` are read where there is no noise.
+    `generators` are used without noise only.
     """
     rollout = space.extend(number, here, before, noise, generators)
     going = score_state.active
@@ -62,7 +62,7 @@ def extend_segment(
 
 
 def _stay(rollout: SegmentRollout, before: State, active: Tensor) -> SegmentRollout:
-    """Keep terminated candidates, not `active: [B, n]`, where they are."""
+    """Keep the states of terminated candidates, those outside `active: [B, n]`."""
     going = active[..., None, None]
     states = State(
         torch.where(going, rollout.states.centers, before.centers),

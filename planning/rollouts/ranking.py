@@ -1,4 +1,4 @@
-"""Choosing among candidates, per environment."""
+"""Choice among candidates, per environment."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from planning.inputs import NoFiniteCandidateError
 
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
-    """Sum over real objects of the squared distance to where they should be: `[...]` square metres.
+    """Sum over real objects of the squared distance to their goals: `[...]` square metres.
 
     `states`, `goals`: `[...]`, whose leading dimensions broadcast; the mask is the goals'. `feature_weight`:
-    square metres per squared unit of distance between features; 0 leaves the features out.
+    square metres per squared unit of distance between features; 0 ignores features.
     """
     per_object = (states.centers - goals.centers).square().sum(-1)
     if feature_weight:
@@ -22,19 +22,19 @@ def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0
 
 
 def prefer(scores: Tensor, preferred: Tensor) -> Tensor:
-    """Scores `[B, N]` with -inf for candidates outside `preferred: [B, N]`, in environments that have such plans.
+    """Scores `[B, N]` with -inf for candidates outside `preferred: [B, N]`, in environments with a preferred one.
 
-    A preferred plan whose score is not finite does not count.
+    A preferred candidate without a finite score does not count.
     """
     preferred = preferred & torch.isfinite(scores)
     return torch.where(preferred | ~preferred.any(-1, keepdim=True), scores, -torch.inf)
 
 
 def best_of(scores: Tensor, what: str) -> Tensor:
-    """Number of the plan with the highest score, the first one of equals: `[B]` int64, from `scores: [B, N]`.
+    """Number of the plan with the highest score, the first among equals: `[B]` int64, from `scores: [B, N]`.
 
-    Scores that are not finite lose. Raises ValueError, naming the environment and `what` was ranked, where
-    none is finite: nothing that follows from such a choice should reach a robot.
+    Scores that are not finite lose. Raises ValueError with the environment and `what` was ranked if none is finite:
+    no plan from such a choice may reach a robot.
     """
     finite = torch.isfinite(scores)
     infinite = (~finite.any(-1)).nonzero().flatten().tolist()

@@ -11,14 +11,14 @@ from torch import Tensor
 
 
 def choose_ancestors(failed: Tensor, active: Tensor, chances: Tensor) -> Tensor:
-    """Every candidate's ancestor, the number of the candidate that it continues: `[B, N]` int64.
+    """The ancestor of every candidate, the number of the candidate that it continues: `[B, N]` int64.
 
     `failed`, `active`: `[B, N]` bool. `chances`: `[B, N]`, uniform in [0, 1). A failed candidate continues an active
     one, all equally likely; every other candidate continues itself, successful ones too. An environment without an
     active candidate keeps all of its candidates.
     """
     own = torch.arange(failed.shape[-1], device=failed.device).expand_as(failed)
-    actives = active.cumsum(-1)  # of the first plans, up to and including each
+    actives = active.cumsum(-1)  # counts active candidates up to and including each
     number = actives[:, -1:]
     rank = (chances * number).long().clamp(max=(number - 1).clamp(min=0))  # a product may be rounded up to its factor
     ancestors = torch.searchsorted(actives, rank + 1).clamp(max=failed.shape[-1] - 1)

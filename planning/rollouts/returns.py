@@ -50,7 +50,7 @@ def interpolate(start: Tensor, end: Tensor, steps: int) -> Tensor:
 
 
 def before_each(start: Tensor, centers: Tensor) -> Tensor:
-    """Where objects are before each of T steps: `start: [..., M, 3]`, after each `centers: [..., T, M, 3]` metres."""
+    """Positions before each of T steps: `start: [..., M, 3]`, after each `centers: [..., T, M, 3]` metres."""
     return torch.cat([start.unsqueeze(-3), centers[..., :-1, :, :]], dim=-3)
 
 
@@ -60,12 +60,12 @@ def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: 
     `progress`: fields `[...]`; `start: [..., M, 3]` metres, the state before the segment;
     `centers: [..., T, M, 3]` metres, the T states of the segment; `mask: [..., M]` bool.
     A step that is both a success and a failure is a failure. A step with a centre (of a real object) or a
-    reward that is not finite is a failure of reward -inf, whatever the reward function says of it: no
+    reward that is not finite is a failure with reward -inf, even if the reward function disagrees: no
     comparison holds for NaN, so "no object is in the region" would be a success.
     """
     states = torch.cat([start.unsqueeze(-3), centers], dim=-3)  # [..., T + 1, M, 3]
     outcome = judge(reward, states, mask)
-    # A sum is finite only where everything in it is.
+    # A sum is finite only if all of its terms are.
     real = centers.where(mask[..., None, :, None], 0.0)
     finite = torch.isfinite(outcome.reward + real.sum((-2, -1)))
     failure = outcome.failure | ~finite

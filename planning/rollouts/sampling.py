@@ -20,8 +20,8 @@ def sample_each(
 ) -> Tensor:
     """One sample per candidate from `prior(*conditions)`, each environment with its own generator: `[B, N, 16]`.
 
-    `conditions`: what the prior is given, states and codes with leading dimensions `[B, N]`. The prior is
-    asked per environment, so that neither its randomness nor its distribution sees the rest of the batch.
+    `conditions`: the arguments of the prior, states and codes with leading dimensions `[B, N]`. The prior is
+    called once per environment, so its samples do not depend on the rest of the batch.
     """
     return torch.stack(
         [
@@ -37,7 +37,7 @@ def sample_codes(
     noise: Tensor | None,
     generators: Sequence[torch.Generator],
 ) -> Tensor:
-    """Codes `[B, N, D]` of `prior(*conditions)`: those that `noise: [B, N, D]` determines, or samples without noise."""
+    """Codes `[B, N, D]` of `prior(*conditions)`: reparameterised from `noise: [B, N, D]`, or sampled without noise."""
     if noise is None:
         return sample_each(prior, conditions, generators)
     return reparameterize_each(prior, conditions, noise)
@@ -58,8 +58,8 @@ def reparameterize_each(
 ) -> Tensor:
     """The codes `[B, N, D]` that standard normal `noise: [B, N, D]` determines, distributed as the prior.
 
-    The prior is asked per environment, as in `sample_each`. Raises ValueError for a prior that cannot be written as a
-    function of such noise.
+    The prior is called once per environment, as in `sample_each`. Raises ValueError for a prior that cannot be written
+    as a function of such noise.
     """
     return torch.stack(
         [
@@ -87,13 +87,13 @@ def reparameterize(prior: Distribution, noise: Tensor) -> Tensor:
         return code
     raise ValueError(
         f"codes of a prior of type {type(prior).__name__} can be sampled, but not reparameterized: it is neither "
-        "normal nor a transformed normal, and has no method reparameterize; take the optimizer shooting and "
+        "normal nor a transformed normal, and has no method reparameterize; choose the optimizer shooting and "
         "warm_start=false"
     )
 
 
 def _is_reparameterizable(prior: Distribution) -> bool:
-    """Whether `reparameterize` knows this prior."""
+    """Whether `reparameterize` supports this prior."""
     if isinstance(prior, Reparameterized):
         return True
     if isinstance(prior, Independent | TransformedDistribution):
@@ -115,7 +115,7 @@ def _scene(condition: State | Tensor, index: int) -> State | Tensor:
 
 @contextmanager
 def _global_randomness_from(generator: torch.Generator) -> Iterator[None]:
-    """Let a generator stand in for torch's global one: `Distribution.sample` takes no generator of its own."""
+    """Use a generator as torch's global one: `Distribution.sample` takes no generator."""
     device = generator.device
     if device.type == "cuda":
         with torch.random.fork_rng(devices=[device]):

@@ -1,4 +1,4 @@
-"""One segment of candidates: what is predicted, what is recorded, and the protocols of search spaces and objectives."""
+"""One segment of candidates, and the protocols of search spaces and objectives."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from models.state import State
 class SegmentRollout(NamedTuple):
     """One segment of n candidates, T steps long."""
 
-    code: Tensor  # [B, n, D] effect or motion codes; raw pushes have the T pushes in a row
-    actions: Tensor | None  # [B, n, T, 4], where the search space has any
+    code: Tensor  # [B, n, D] effect or motion codes; or the concatenated T raw pushes
+    actions: Tensor | None  # [B, n, T, 4], if the search space has actions
     states: State  # [B, n, M, .] at the end of the segment
     path: Tensor  # [B, n, T, M, 3] metres, after every step
 
 
 class SearchSpace(Protocol):
-    """What is searched: effect codes, motion codes or raw pushes. A named tuple, so that a backend can compile it."""
+    """Effect codes, motion codes or raw pushes. A named tuple, so that a backend can compile it."""
 
     @property
     def dimension(self) -> int:
-        """D, the numbers of noise that determine one segment."""
+        """D, the dimension of the noise of one segment."""
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """Roll out segment number `segment` of candidates that have come to `plans: [B, n]`.
+        """Roll out segment number `segment` of candidates in the states `plans: [B, n]`.
 
-        `here`: the same, or `[B, 1]` where all are in one state. `noise: [B, n, D]`, standard normal, determines
+        `here`: the same states, or `[B, 1]` if all are equal. `noise: [B, n, D]`, standard normal, determines
         the segment; None samples the prior with the `generators`.
         """
 
@@ -42,11 +42,11 @@ class ScoreState(Protocol):
 
     @property
     def returns(self) -> Tensor:
-        """`[B, n]` the higher the better; -inf for candidates with a prediction that is not finite."""
+        """`[B, n]`, higher is better; -inf for candidates with a prediction that is not finite."""
 
     @property
     def failed(self) -> Tensor:
-        """`[B, n]` bool: terminated by a failure, so that a copy of an active candidate may take the place."""
+        """`[B, n]` bool: terminated by a failure, so that a copy of an active candidate may replace it."""
 
     @property
     def active(self) -> Tensor:
@@ -54,7 +54,7 @@ class ScoreState(Protocol):
 
 
 class Objective(Protocol):
-    """What candidates are ranked by. A named tuple or a frozen dataclass, so that a backend can compile it."""
+    """Scores candidates. A named tuple or a frozen dataclass, so that a backend can compile it."""
 
     def start(self, plans: State) -> Any:
         """`ScoreState` of candidates without a segment, `plans: [B, n]`."""
@@ -67,7 +67,7 @@ class Objective(Protocol):
 
 
 class SegmentRecord(NamedTuple):
-    """What is kept of one segment of R candidates."""
+    """One segment of R candidates."""
 
     noise: Tensor | None  # [B, R, D]
     rollout: SegmentRollout

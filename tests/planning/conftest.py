@@ -125,7 +125,7 @@ class Placed:
         return SegmentRollout(noise, None, states, centers.unsqueeze(-3))
 
 
-class Judgement(NamedTuple):
+class StepOutcome(NamedTuple):
     reward: Tensor
     success: Tensor
     failure: Tensor
@@ -144,13 +144,13 @@ class GoalDisc:
         self.goal, self.radius, self.forbidden_below, self.dense = goal, radius, forbidden_below, dense
         self.maximum_return = torch.inf if dense else 99.0
 
-    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
         success = self.distance(centers) <= self.radius
         failure = ((centers[..., 1] < self.forbidden_below) & mask).any(-1)
         reward = 100.0 * success - 100.0 * failure - 1.0
         if self.dense:
             reward = reward + self.distance(previous) - self.distance(centers)
-        return Judgement(reward, success, failure)
+        return StepOutcome(reward, success, failure)
 
     def distance(self, centers: Tensor) -> Tensor:
         return (centers[..., 0, :2] - torch.tensor(self.goal, dtype=centers.dtype)).norm(dim=-1)
@@ -162,19 +162,19 @@ class Hill:
     def __init__(self, top: tuple[float, float]) -> None:
         self.top = top
 
-    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
         distance = (centers[..., 0, :2] - torch.tensor(self.top, dtype=centers.dtype)).square().sum(-1)
         never = torch.zeros_like(distance, dtype=torch.bool)
-        return Judgement(-distance, never, never)
+        return StepOutcome(-distance, never, never)
 
 
 class Line:
     """The target, on a line, succeeds from x = 1 on and fails up to x = -0.5."""
 
-    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Judgement:
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
         x = centers[..., 0, 0]
         success, failure = x >= 1.0, x <= -0.5
-        return Judgement(100.0 * success - 100.0 * failure - 1.0, success, failure)
+        return StepOutcome(100.0 * success - 100.0 * failure - 1.0, success, failure)
 
 
 def standard_normal(state: State) -> Distribution:
@@ -221,6 +221,6 @@ def environments_in_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def toy() -> SimpleNamespace:
-    worlds: list[Callable] = [PointMass, Flat, Tabled, Placed, GoalDisc, Hill, Line, Judgement]
+    worlds: list[Callable] = [PointMass, Flat, Tabled, Placed, GoalDisc, Hill, Line, StepOutcome]
     names = [*worlds, plain, move, scenes, generators]
     return SimpleNamespace(**{name.__name__: name for name in names}, REACH=REACH)

@@ -204,13 +204,13 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"horizon": 31}, "horizon=31 is not divisible by the model's segment length T=3: take 30 or 33"),
-        ({"horizon": 2}, "horizon=2 is not divisible by the model's segment length T=3: take 3"),
+        ({"horizon": 31}, "horizon=31 is not divisible by the model's segment length T=3: choose 30 or 33"),
+        ({"horizon": 2}, "horizon=2 is not divisible by the model's segment length T=3: choose 3"),
         ({"horizon": 0}, "horizon must be at least 1, not 0"),
         ({"horizon": -3}, "horizon must be at least 1, not -3"),
         ({"samples": 0}, "samples must be at least 1, not 0"),
         ({"samples": -5}, "samples must be at least 1, not -5"),
-        ({"motion_horizon": "last"}, "unknown motion_horizon 'last': take full_horizon or first_segment"),
+        ({"motion_horizon": "last"}, "unknown motion_horizon 'last': choose full_horizon or first_segment"),
         ({"feature_weight": -1.0}, "feature_weight must be zero or a positive number, not -1.0"),
         ({"feature_weight": float("nan")}, "feature_weight must be zero or a positive number, not nan"),
     ],

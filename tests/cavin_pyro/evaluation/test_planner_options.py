@@ -133,7 +133,9 @@ def test_compilation_is_announced(planner: str, capsys: pytest.CaptureFixture[st
 def test_flows_are_not_compiled(tmp_path: Path) -> None:
     path = save_untrained(tmp_path / "flow.safetensors", "model=cascaded", "prior=flow")
     config = compose("evaluate", f"checkpoint={path}", "planner.compile=true", "output=unused")
-    with pytest.raises(UserError, match=r"the priors in .*flow\.safetensors are flows, which cannot be compiled: take"):
+    with pytest.raises(
+        UserError, match=r"the priors in .*flow\.safetensors are flows, which cannot be compiled: choose"
+    ):
         make_runner(config)
 
 

@@ -81,7 +81,7 @@ def test_a_layer_of_few_and_many_numbers_does_not_join_them(order: tuple[int, in
         both = (few, many)
         return layer(torch.cat([both[number] for number in order], -1))
 
-    module = changed(passes.split_joined_inputs, of_both, *parts)
+    module = changed(passes.split_concatenated_inputs, of_both, *parts)
     module.graph.eliminate_dead_code()
     module.recompile()
     assert (calls(traced(of_both, *parts), "cat"), calls(module, "cat")) == (1, 0)
@@ -90,7 +90,7 @@ def test_a_layer_of_few_and_many_numbers_does_not_join_them(order: tuple[int, in
 
 def test_a_layer_of_many_joined_numbers_stays() -> None:
     layer, parts = nn.Linear(12, 8), (torch.randn(4, 6), torch.randn(4, 6))
-    module = changed(passes.split_joined_inputs, lambda *both: layer(torch.cat(both, -1)), *parts)
+    module = changed(passes.split_concatenated_inputs, lambda *both: layer(torch.cat(both, -1)), *parts)
     assert calls(module, "cat") == 1
 
 
@@ -117,7 +117,7 @@ def test_what_is_joined_along_time_lies_plan_by_plan() -> None:
     def states(start: Tensor, path: Tensor) -> Tensor:
         return torch.cat([start.unsqueeze(-3), path], -3)
 
-    found = changed(passes.lay_plans_side_by_side, states, start, path)(start, path)
+    found = changed(passes.move_plans_innermost, states, start, path)(start, path)
     assert torch.equal(found, states(start, path))
     assert found.stride() == (7, 1, 2 * 7 * 9, 2 * 7 * 3, 2 * 7)
 
@@ -129,7 +129,7 @@ def test_what_is_joined_otherwise_lies_as_it_did() -> None:
         def joined(first: Tensor, second: Tensor, dimension: int = dimension) -> Tensor:
             return torch.cat([first, second], dimension)
 
-        module = changed(passes.lay_plans_side_by_side, joined, values, -values)
+        module = changed(passes.move_plans_innermost, joined, values, -values)
         assert module(values, -values).is_contiguous()
 
 

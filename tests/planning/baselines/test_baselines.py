@@ -145,11 +145,11 @@ def test_mpc_replaces_the_dead_and_repeats_with_its_seed(toy: SimpleNamespace, p
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"proposal": "best"}, "unknown proposal 'best': take uniform or heuristic"),
+        ({"proposal": "best"}, "unknown proposal 'best': choose uniform or heuristic"),
         ({"proposal": "heuristic"}, "proposal heuristic needs the box that pushes start in"),
         ({"samples": 0}, "samples must be at least 1, not 0"),
-        ({"horizon": 31}, "horizon=31 is not divisible by the model's segment length T=3: take 30 or 33"),
-        ({"reward_at": "end"}, "unknown reward_at 'end': take path or subgoals"),
+        ({"horizon": 31}, "horizon=31 is not divisible by the model's segment length T=3: choose 30 or 33"),
+        ({"reward_at": "end"}, "unknown reward_at 'end': choose path or subgoals"),
     ],
 )
 def test_bad_options_are_one_clear_line(toy: SimpleNamespace, options: dict, message: str) -> None:

@@ -70,7 +70,7 @@ def test_bad_limits_are_one_clear_line(toy: SimpleNamespace, limits: object) -> 
 
 
 def test_an_unknown_place_of_reward_is_one_clear_line(toy: SimpleNamespace) -> None:
-    with pytest.raises(ValueError, match="^unknown reward_at 'goal': take path or subgoals$"):
+    with pytest.raises(ValueError, match="^unknown reward_at 'goal': choose path or subgoals$"):
         CumulativeReward(toy.Line(), "goal")
 
 

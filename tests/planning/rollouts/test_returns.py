@@ -76,7 +76,7 @@ def test_rewards_after_a_failure_do_not_count(toy: SimpleNamespace) -> None:
 def test_a_step_that_succeeds_and_fails_is_a_failure(toy: SimpleNamespace) -> None:
     def contradictory(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
         both = torch.ones(centers.shape[:-2], dtype=torch.bool)
-        return toy.Judgement(torch.zeros(both.shape), both, both)
+        return toy.StepOutcome(torch.zeros(both.shape), both, both)
 
     path = walk(toy, 0.0)
     ended = returns.advance(returns.start(path[0]), contradictory, path[0], path, torch.ones(1, dtype=torch.bool))
@@ -89,7 +89,7 @@ def test_the_reward_sees_each_step_with_the_state_before_it(toy: SimpleNamespace
         moved = (centers - previous)[..., 0, 0]
         seen.append(moved)
         never = torch.zeros(moved.shape, dtype=torch.bool)
-        return toy.Judgement(moved, never, never)
+        return toy.StepOutcome(moved, never, never)
 
     seen: list[torch.Tensor] = []
     path = walk(toy, 0.5, 0.75, 2.0)
@@ -117,11 +117,11 @@ def test_a_reward_that_judges_whole_paths_is_asked_once_for_each(toy: SimpleName
 def test_a_plan_that_leaves_the_numbers_fails_whatever_the_reward_says(toy: SimpleNamespace) -> None:
     def cheerful(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
         always = torch.ones(centers.shape[:-2], dtype=torch.bool)
-        return toy.Judgement(torch.full(always.shape, 99.0), always, ~always)
+        return toy.StepOutcome(torch.full(always.shape, 99.0), always, ~always)
 
     def endless(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
         never = torch.zeros(centers.shape[:-2], dtype=torch.bool)
-        return toy.Judgement(torch.full(never.shape, torch.inf), never, never)
+        return toy.StepOutcome(torch.full(never.shape, torch.inf), never, never)
 
     mask = torch.ones(1, dtype=torch.bool)
     for reward, position in ((cheerful, torch.nan), (cheerful, torch.inf), (endless, 0.0)):
