@@ -1,4 +1,4 @@
-"""What is real: the table, the objects on it, the robot that pushes, the camera above, the tasks."""
+"""The world: the table, the objects on it, the robot that pushes, the camera above, the tasks."""
 
 import gymnasium
 
@@ -8,4 +8,4 @@ for _name in TASKS:
     gymnasium.register(
         id=f"cavin/{_name.capitalize()}-v0", entry_point="envs.pushing:PushingEnv", kwargs={"task": _name}
     )
-gymnasium.register(id="cavin/Pushing-v0", entry_point="envs.pushing:PushingEnv")  # task= as PushingEnv takes it
+gymnasium.register(id="cavin/Pushing-v0", entry_point="envs.pushing:PushingEnv")  # with PushingEnv's arguments

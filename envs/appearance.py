@@ -1,4 +1,4 @@
-"""What the bodies of a scene look like, as triangles, for 3D viewers."""
+"""The appearance of bodies as triangles, for 3D viewers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Part:
     """One rigid shape.
 
     Attributes:
-        body, link: whose it is, in the simulator's numbers; link -1 is the body's base.
+        body, link: its numbers in the simulator; link -1 is the body's base.
         vertices: [V, 3] metres in the link's frame. triangles: [F, 3] numbers of vertices.
         color: red, green, blue, opacity in [0, 1].
     """
@@ -30,7 +30,7 @@ class Part:
 
 
 def parts_of(world: PhysicsWorld) -> list[Part]:
-    """Every shape in the world; `PhysicsWorld.link_poses` tells where its frame is at any time.
+    """Every shape in the world; `PhysicsWorld.link_poses` has the current pose of its frame.
 
     Raises:
         ValueError: a mesh file that the simulator has read cannot be read as triangles.
@@ -51,7 +51,7 @@ def _mesh(visual: Visual) -> trimesh.Trimesh:
     if visual.kind == "cylinder":
         return trimesh.creation.cylinder(radius=sizes[1], height=sizes[0])
     if visual.kind == "capsule":
-        # Bullet's is centred on its middle, and so is this one.
+        # Both Bullet's and this one are centred on their middle.
         return trimesh.creation.capsule(radius=sizes[1], height=sizes[0])
     if visual.kind == "sphere":
         return trimesh.creation.icosphere(subdivisions=2, radius=sizes[0])

@@ -1,4 +1,4 @@
-"""When to take the frames of a push's film."""
+"""The timing of frames in a video of pushes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import count
 
 from envs.robots import TIP_HEIGHT, Robot
 
-FRAME_STEPS = 10  # physics steps between two frames of a film
+FRAME_STEPS = 10  # physics steps between two frames of a video
 TRAVEL_FRAME_STEPS = 40  # the same while the tool is in the air; an arm travels four fifths of the time
 
 FrameHook = Callable[[], None]
@@ -15,7 +15,7 @@ FrameHook = Callable[[], None]
 
 
 def film(robot: Robot, on_frame: FrameHook) -> Callable[[], None]:
-    """What the world calls after each step of a push; the first step and every `FRAME_STEPS`th from it is a frame."""
+    """A callback for the world after each step of a push; it makes the first step and every `FRAME_STEPS`th a frame."""
     steps = count()
 
     def after_step() -> None:

@@ -1,7 +1,7 @@
-"""The layout, painted on the table in colour pictures for people: never in the depth image nor in the mask.
+"""The tiles of a layout in colour pictures for people; never in the depth image or in the mask.
 
-The tiles are painted into the finished picture, on those pixels that show the table's top, instead of being bodies of
-the simulator: so nothing can touch them, the depth image cannot see them, and objects hide them as they should.
+`paint_tiles` colours the pixels of a rendered picture that show the table's top. The tiles are not bodies of the
+simulator: nothing can touch them, they are not in the depth image, and objects occlude them.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE, Tile
 
-LEVEL = 0.002  # metres; the table's top is what lies at most this far from z = 0
-BORDER = 0.003  # metres on either side of a tile's edge that are painted opaque
+LEVEL = 0.002  # metres; points at most this far from z = 0 belong to the table's top
+BORDER = 0.003  # metres on either side of a tile's edge with an opaque line
 
 
 class TileGroup(NamedTuple):
-    """Tiles that mean the same: a name for legends, colour, how opaque the fill is, and where they lie."""
+    """Tiles of one meaning: name for legends, colour, opacity of the fill, and the tiles."""
 
     name: str
     color: str

@@ -13,7 +13,7 @@ from envs.sensors import DepthImage
 from envs.sensors.camera import sample_cloud
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
-MINIMUM_PIXELS = 8  # fewer pixels than this do not show where an object is
+MINIMUM_PIXELS = 8  # minimum to locate an object
 
 
 @dataclass(frozen=True)

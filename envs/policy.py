@@ -19,20 +19,20 @@ CANDIDATES = 2048  # pushes sampled at once
 SPREAD = np.radians(45.0)  # radians; how far a push may turn from the base angle, either way
 NOISE = 0.3  # on each normalised motion component
 START_CLEARANCE = 0.05  # metres from every object's centre to a push's start
-CLOUD_CLEARANCE = 0.005  # metres between the tool and every visible point where it comes down
+CLOUD_CLEARANCE = 0.005  # metres between the tool and every visible point where it touches down
 NEAR = 0.01  # metres; margin between the tool and the target object along the push
 CENTRAL_FRACTION = 0.7  # of pushes aim at the middle of the target; the others may just graze it
 CENTRAL = 0.03  # metres between a push's path and the target's centre that count as aiming at its middle
-COMPARED = 8  # passing pushes, at most, of which the one is made that goes farthest after it meets the target
-PERTURBATION = 0.04  # metres; standard deviation, on each axis, of how far a perturbed push's start is moved
-PROPOSALS = 20  # targets and angles tried before a uniformly random push is made instead
+COMPARED = 8  # valid pushes to compare, at most; the policy makes the one that goes farthest after it meets the target
+PERTURBATION = 0.04  # metres; standard deviation of a perturbed push's start, on each axis
+PROPOSALS = 20  # targets and angles sampled before the policy makes a uniformly random push instead
 
 
 @dataclass
 class Intent:
-    """What a series of pushes shares, so that they add up to one effect.
+    """The common target and direction of a series of pushes, so that they add up to one effect.
 
-    target: number of the object, -1 for a push at random that has none. angle: radians.
+    target: number of the object, -1 for a uniformly random push. angle: radians.
     """
 
     target: int
@@ -44,9 +44,9 @@ class HeuristicPushingPolicy:
 
     Args:
         generator: all of the policy's randomness. intent_length: pushes that share a target and a base angle.
-        perturbation_rate: fraction of pushes whose start is moved at random, so that many of them come down on an
+        perturbation_rate: fraction of pushes with a perturbed start, so that many of them touch down on an
             object, graze one or miss. A planner picks, among thousands of pushes, those with the best prediction;
-            a dynamics model that has never been trained on failing pushes predicts too much of them.
+            a dynamics model trained without failing pushes is too optimistic about them.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class HeuristicPushingPolicy:
         close = clear & (_distance_to_path(center, start, end) <= (CENTRAL if central else extent + reach))
         scene = observation.clouds[observation.mask][:, ::4, :2].reshape(-1, 2)
         wanted, travels = int(generator.integers(1, COMPARED + 1)), {}
-        for candidate in np.flatnonzero(close):  # in the order sampled: the first that pass are fair samples
+        for candidate in np.flatnonzero(close):  # in the order of sampling, so that the first valid ones are unbiased
             path = start[None, candidate], end[None, candidate]
             touches = _distance_to_path(cloud[:, None], *path).min() <= reach
             safe = np.linalg.norm(scene - start[candidate], axis=-1).min() >= STICK_RADIUS + CLOUD_CLEARANCE
@@ -116,7 +116,7 @@ class HeuristicPushingPolicy:
 
 
 def _travel_after_contact(cloud: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-    """Metres that the tool still goes after it first meets the cloud [P, 2]; 0 if it passes by."""
+    """Metres of the push after it first meets the cloud [P, 2]; 0 if it misses."""
     line = end - start
     length = max(float(np.linalg.norm(line)), 1e-6)
     along = (cloud - start) @ line / length

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: a scene, a task's reward, and when an episode ends."""
+"""The Gymnasium environment: a scene, a task's reward, and the end of an episode."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
 
     `info` of a reset: `steps`, which is 0, and the episode's `task` in its layout. `info` of a step: `steps` so far,
-    `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable" and not begun,
-    "blocked" by something in its way, contact with the "table"; "" if it did not), `success`, `violation`, `fall`,
+    `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable", not begun;
+    "blocked" by an obstacle; contact with the "table"; "" if it did not), `success`, `violation`, `fall`,
     and `terms`, the named terms of the reward. An episode terminates at success, violation or fall, and is truncated
     after `maximum_steps`.
 
     Args:
         task, layout, tiles: see `envs.layouts.possible_tasks`; `tiles` replaces fields of the layout.
-            `layout="random"` is sampled anew at every reset. A `Task` that has been built brings its own layout.
+            `layout="random"` is sampled at every reset. A `Task` object has its own layout.
         reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
-        robot: what pushes, one of `envs.robots.ROBOTS`.
-        object_set: where the objects come from, a key of `envs.objects.object_sets.OBJECT_SETS`.
+        robot: one of `envs.robots.ROBOTS`.
+        object_set: a key of `envs.objects.object_sets.OBJECT_SETS`.
         camera, segmentation: see `envs.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
@@ -85,7 +85,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         if isinstance(task, Task) and (layout != 0 or tiles):
-            raise ValueError("a task that has been built has its layout: give its class, or neither layout nor tiles")
+            raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
         self.tasks = (task,) if isinstance(task, Task) else possible_tasks(task, layout, tiles)
         self._rewards = [TaskReward(one, reward=reward) for one in self.tasks]
         self.task, self.reward = self.tasks[0], self._rewards[0]  # of the episode
@@ -111,10 +111,10 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ObservationDict, dict[str, Any]]:
-        """Sample a layout, and a scene in which the episode has not ended before it begins.
+        """Sample a layout, and a scene in which the episode has not already ended.
 
         Args:
-            options: `layout`, the number of one of the environment's `tasks` to take instead of a random one.
+            options: `layout`, the number of one of the environment's `tasks`, instead of a random one.
 
         Raises:
             ValueError: the layout has no room for the objects, or there is no layout of that number.
@@ -164,7 +164,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         return _as_dict(observation), sum(terms.values()), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A colour image of the table [424, 512, 3] in mode rgb_array."""
+        """Return a colour image of the table [424, 512, 3] in mode rgb_array."""
         if self.render_mode != "rgb_array":
             return None
         return self.scene.photograph(self.scene.camera.resized(*VIDEO_SIZE))
@@ -189,7 +189,7 @@ def _areas(tiles: TileSet, jitter: float) -> Area:
 
 def _as_dict(observation: Observation) -> ObservationDict:
     return {
-        "clouds": observation.clouds.copy(),  # what a caller does to them must not change the next step's reward
+        "clouds": observation.clouds.copy(),  # a copy: changes by the caller must not affect the next step's reward
         "centers": observation.centers.copy(),
         "mask": observation.mask.astype(np.int8),
         "visible": observation.visible.astype(np.int8),

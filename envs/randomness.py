@@ -1,10 +1,10 @@
-"""Where every random number of an episode comes from: streams with a purpose, all derived from one seed.
+"""Random streams of an episode, one for each purpose, all derived from one seed.
 
 A stream is a `numpy.random.Generator` known by its entropy and its spawn key (numpy's `SeedSequence`). Streams of
-different keys are independent, so that sampling more or fewer numbers for one purpose changes no other purpose:
-planners and policies are compared on the very same scenes.
+different keys are independent, so sampling more or fewer numbers for one purpose does not change the others:
+planners and policies are compared on equal scenes.
 
-| purpose | of what | entropy | spawn key |
+| purpose | for | entropy | spawn key |
 | --- | --- | --- | --- |
 | scene | one reset of an environment, the k-th since it was seeded | `seed` | `(k,)` |
 | layout | of that reset, where the layout is random | `seed` | `(k, LAYOUT)` |
@@ -13,11 +13,11 @@ planners and policies are compared on the very same scenes.
 | objects | the a-th scene sampled until one is acceptable: shapes, masses, poses | as its scene | `(*scene, 2 a)` |
 | points | of that scene: which pixels make a cloud, over the whole episode | as its scene | `(*scene, 2 a + 1)` |
 | sensor | of that scene: the camera's pose and noise | as its scene | `(*points, SENSOR)` |
-| planner | one episode: one word of it seeds torch's generator | `[seed, 1]` | none |
+| planner | one episode: its first number seeds torch's generator | `[seed, 1]` | none |
 
-`LAYOUT` and `SENSOR` are larger than any number that `Generator.spawn` counts to, so that asking for them changes
-neither the streams that are spawned nor their order. Published success rates and collected data depend on this table:
-purposes may be added, but none may be derived in another way.
+`LAYOUT` and `SENSOR` are larger than any number that `Generator.spawn` counts to, so they change
+neither the spawned streams nor their order. Published success rates and collected data depend on this table:
+you may add purposes, but must not change the derivation of the existing ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _PLANNER = 1  # last word of the planner's entropy
 
 
 def named_stream(parent: np.random.Generator, name: int) -> np.random.Generator:
-    """The stream below `parent` with the last key `name`; the parent's own numbers stay what they were."""
+    """The stream below `parent` with the last key `name`; the parent's own numbers do not change."""
     sequence = parent.bit_generator.seed_seq
     assert isinstance(sequence, np.random.SeedSequence)
     return np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, name)))
@@ -39,14 +39,14 @@ def next_scene_stream(environment: np.random.Generator) -> np.random.Generator:
     """The scene's stream of an environment's next reset.
 
     Args:
-        environment: Gymnasium's `np_random`, which `reset(seed=...)` has made of the seed.
+        environment: Gymnasium's `np_random`, which `reset(seed=...)` creates from the seed.
     """
     (scene,) = environment.spawn(1)
     return scene
 
 
 def layout_stream(scene: np.random.Generator) -> np.random.Generator:
-    """Which layout a scene's episode has."""
+    """The stream for a scene's random layout."""
     return named_stream(scene, LAYOUT)
 
 
@@ -68,5 +68,5 @@ def collection_streams(seed: int, episode: int) -> tuple[np.random.Generator, np
 
 
 def planner_seed(seed: int) -> int:
-    """What seeds torch's generator for the planner of an episode; independent of the episode's scene."""
+    """The seed of torch's generator for the planner of an episode; independent of the episode's scene."""
     return int(np.random.SeedSequence([seed, _PLANNER]).generate_state(1)[0])

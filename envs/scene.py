@@ -1,4 +1,4 @@
-"""A table with objects, a robot that pushes them and a camera above: the world without any task.
+"""A table with objects, a robot that pushes them and a camera above: the world without a task.
 
 Data flows one way: poses in the simulator, a depth image, segmented points, an `Observation`.
 """
@@ -28,7 +28,7 @@ from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.sensors.camera import Camera
 from envs.workspace import MAXIMUM_OBJECTS, push_endpoints
 
-MOVED = 0.005  # metres; less motion than this counts as none
+MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians
 FALLEN = -0.02  # metres; an object whose centre is lower has left the table
 SCENE_SAMPLES = 50  # scenes sampled, at most, to find an acceptable one
@@ -39,10 +39,11 @@ COLORS = ((0.93, 0.42, 0.10), *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in 
 
 @dataclass(frozen=True)
 class PushReport:
-    """What a push did, from the simulator's own knowledge.
+    """The result of a push, from the simulator's ground truth.
 
     Attributes:
-        unsafe: the tool would have come down on an object, so nothing was done. ineffective: no object moved.
+        unsafe: the tool would have touched down on an object, so the push was not executed. ineffective: no object
+            moved.
         moved: [objects] metres. fallen: an object left the table.
         stopped: why the robot ended the push early, see `envs.robots.robot.Stopped`; "" if it did not.
     """
@@ -55,14 +56,14 @@ class PushReport:
 
 
 class Scene:
-    """One simulated world: sample scenes in it, push, and observe.
+    """A simulated world: sample scenes, push, and observe.
 
     Args:
         camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
         segmentation: a name in `envs.segmentation.SEGMENTERS`.
-        object_set: what the objects' names mean, the builtin shapes by default.
+        object_set: the set of the objects' names, by default the builtin shapes.
         on_frame: called a few times during every push, to film it.
-        robot: what pushes, one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
+        robot: one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
 
     Raises:
         ValueError: unknown camera, segmentation or robot, or its files are missing.
@@ -87,12 +88,12 @@ class Scene:
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
-        # Where the CPU time went, summed.
+        # CPU time by purpose, in seconds.
         self.seconds = dict.fromkeys(("physics", "rendering", "segmentation", "points"), 0.0)
 
     @property
     def camera(self) -> Camera:
-        """Where the camera was meant to be mounted; pictures for people are taken from there."""
+        """The nominal camera, which takes the pictures for people."""
         return self.sensor.nominal
 
     def close(self) -> None:
@@ -110,11 +111,11 @@ class Scene:
         """Sample scenes until one settles with every object on the table, in view and acceptable.
 
         Args:
-            areas: where each object may start; the first is the target.
-            generator: the scene's randomness, from which that of objects and points is derived (`envs.randomness`).
+            areas: start area of each object; the first is the target.
+            generator: the scene's stream, from which those of objects and points derive (`envs.randomness`).
 
         Raises:
-            ValueError: the areas hold no such scene.
+            ValueError: no such scene was found.
         """
         for _ in range(SCENE_SAMPLES):
             scene_generator, point_generator = next_sample_streams(generator)
@@ -145,7 +146,7 @@ class Scene:
         return self._observe(first=True)
 
     def push(self, action: NDArray[np.floating]) -> PushReport:
-        """Carry out one normalised push [4] and wait until the objects rest.
+        """Execute one normalised push [4] and wait until the objects rest.
 
         Raises:
             ValueError: the action is not four finite numbers.
@@ -207,7 +208,7 @@ class Scene:
         return image
 
     def true_masks(self) -> list[NDArray[np.bool_]]:
-        """Ground truth of the latest image: the pixels [height, width] of each body. No robot has it."""
+        """Ground truth of the latest image: the pixels [height, width] of each body. A real robot lacks it."""
         return [self._body_image == body for body in self.bodies]
 
     def point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
@@ -215,12 +216,12 @@ class Scene:
         rows, columns = np.nonzero(self.true_masks()[0] & (image.depth > 0.0))
         if len(rows) < MINIMUM_PIXELS:
             return None
-        # Of its pixels the one nearest to their middle, which need not lie on the object itself.
+        # The object's pixel nearest to their middle, which need not lie on the object.
         nearest = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
         return int(rows[nearest]), int(columns[nearest])
 
     def _put_in_order(self, found: list[Pixels]) -> None:
-        """Number the bodies as the segmentation numbers its objects, so that reports can refer to both."""
+        """Order the bodies like the segmentation's objects, so that reports can refer to both."""
         named: list[int] = []
         for pixels in found[: len(self.bodies)]:
             counts = np.bincount(self._body_image[pixels] + 1, minlength=1)

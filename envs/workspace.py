@@ -1,4 +1,4 @@
-"""The table, the tool's reach and the tile grid: the fixed geometry that everything else refers to.
+"""The table, the tool's reach and the tile grid: the fixed geometry.
 
 All coordinates are metres in the robot's base frame; the table's top lies at z = 0. Source: the published
 implementation.

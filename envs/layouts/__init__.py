@@ -1,8 +1,8 @@
-"""Where a task happens: files that list the tiles of a task's fields.
+"""Layouts: files that list the tiles of a task's fields.
 
 `TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout.
 
-    task: crossing            # may be left out
+    task: crossing            # optional
     region: [[2, 2], [2, 3]]  # the fields of `envs.tasks.crossing.Crossing`
     goal: [[2, 2]]
     target_start: [[2, 3]]
@@ -26,10 +26,10 @@ _FOLDER = Path(__file__).parent
 
 
 def task_class(task: str | type[Task]) -> type[Task]:
-    """The class of a task's name; a class is taken as it is.
+    """The class of a task, by its name; a class is returned unchanged.
 
     Raises:
-        ValueError: unknown name, or a class that is no whole task.
+        ValueError: unknown name, or a class with missing methods.
     """
     if isinstance(task, str):
         if task not in TASKS:
@@ -43,7 +43,7 @@ def task_class(task: str | type[Task]) -> type[Task]:
 
 
 def layout_numbers(task: str | type[Task]) -> tuple[int, ...]:
-    """The layouts of a task that this folder holds."""
+    """The layouts of a task in this folder."""
     prefix = f"{task_class(task).name}_"
     numbers = [path.stem.removeprefix(prefix) for path in _FOLDER.glob(f"{prefix}*.yaml")]
     return tuple(sorted(int(number) for number in numbers if number.isdecimal()))
@@ -59,7 +59,7 @@ def possible_tasks(
             in this folder.
 
     Raises:
-        ValueError: as `load_task` does, or tiles are to replace those of a random layout.
+        ValueError: as `load_task`, or tiles for `layout=random`.
     """
     if layout != RANDOM:
         return (load_task(task, layout, tiles),)
@@ -81,8 +81,8 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
         tiles: fields that replace those of the layout; None values are ignored.
 
     Raises:
-        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, or tiles that make no
-            sense.
+        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, or tiles that contradict
+            the task.
     """
     kind = task_class(task)
     path = _path(kind, layout)
@@ -101,7 +101,7 @@ def parse_task(task: str | type[Task], content: Mapping[str, Any], *, where: str
     """A task in the layout that `content`, lists of tiles by field, describes.
 
     Raises:
-        ValueError: a key is unknown or missing, or tiles make no sense; the message begins with `where`.
+        ValueError: a key is unknown or missing, or tiles contradict the task; the message begins with `where`.
     """
     kind = task_class(task)
     keys = kind.layout_keys()

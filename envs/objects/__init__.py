@@ -1,1 +1,1 @@
-"""Objects to push: what they are, which sets there are, and how a scene samples them."""
+"""Objects to push: shapes, sets of objects, and their sampling in a scene."""

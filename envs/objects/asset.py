@@ -1,4 +1,4 @@
-"""What the simulator needs to know of an object before its size and mass are sampled."""
+"""An object's description for the simulator, before its size and mass are sampled."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ObjectAsset:
-    """An object as its set holds it.
+    """An object of a set.
 
     Attributes:
-        name: what the set calls it. mass: kilograms, as published.
+        name: in its set. mass: kilograms, as published.
         radius: metres from the origin to the farthest vertex.
-        collision: Wavefront file, a group per convex part. visual: Wavefront file that the camera sees. Both in
+        collision: Wavefront file, a group per convex part. visual: Wavefront file for the camera. Both in
             metres, the origin at the centre of mass.
-        inertia: (x, y, z) kilograms times square metres at that mass and size, about the file's axes; None leaves
-            it to the simulator, which takes that of the bounding box.
+        inertia: (x, y, z) kilograms times square metres at that mass and size, about the file's axes; None: the
+            simulator computes that of the bounding box.
     """
 
     name: str
@@ -28,7 +28,7 @@ class ObjectAsset:
     inertia: tuple[float, float, float] | None = None
 
     def inertia_of(self, mass: float, scale: float) -> tuple[float, float, float] | None:
-        """The inertia of a copy of another mass (kilograms) and size (factor): it grows with mass and area."""
+        """The inertia at another mass (kilograms) and size (factor); it is proportional to mass times area."""
         if self.inertia is None:
             return None
         factor = mass / self.mass * scale**2
@@ -42,6 +42,6 @@ def plain_name(name: str) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names for a message of one line: all of them, or the ends of a long list."""
+    """Names for a one-line message: all of them, or both ends of a long list."""
     every = list(names)
     return ", ".join(every if len(every) <= 40 else [*every[:2], "...", every[-1]])

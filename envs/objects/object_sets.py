@@ -1,4 +1,4 @@
-"""Which objects there are to push: ten builtin shapes, real scans from a folder, both together, or random shapes."""
+"""Sets of objects: ten builtin shapes, real scans from a folder, both together, or random shapes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from envs.objects.shapes import BUILTIN_NAMES, Shape, builtin_shape, write_mesh
 
 
 class ObjectSet(Protocol):
-    """Objects by name. A name is an object's own (`mug`), with the set's before it where both exist (`ycb/mug`)."""
+    """Objects by name. A name is the object's own (`mug`), or has the set's as a prefix (`ycb/mug`)."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -32,7 +32,7 @@ class ObjectSet(Protocol):
 
 
 class BuiltinObjects:
-    """The ten shapes of `envs.objects.shapes`, written to a temporary folder when they are first asked for."""
+    """The ten shapes of `envs.objects.shapes`, written to a temporary folder at their first use."""
 
     names = BUILTIN_NAMES
 
@@ -55,7 +55,7 @@ class MixedObjects:
     """Several sets as one.
 
     Args:
-        sets: no two hold the same name.
+        sets: without common names.
     """
 
     def __init__(self, *sets: ObjectSet) -> None:
@@ -75,7 +75,7 @@ OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
     "mixed": lambda assets: MixedObjects(BuiltinObjects(), ScannedObjects(assets)),
     "random": lambda assets: RandomObjects(),
 }
-"""What makes the object set of each name, given the folder of assets (None where there is none)."""
+"""Makers of object sets by name; their argument is the folder of assets, or None."""
 
 
 def load_object_set(name: str, assets: str | Path | None = None) -> ObjectSet:
@@ -90,10 +90,10 @@ def load_object_set(name: str, assets: str | Path | None = None) -> ObjectSet:
 
 
 def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
-    """Objects of the set that are meant by names, with or without the set's name: in a mixed set `mug` means both.
+    """Objects of the set by names, with or without the set's prefix: in a mixed set `mug` means both mugs.
 
     Raises:
-        ValueError: a name means none of them; the valid ones are named.
+        ValueError: an unknown name; the message lists the valid ones.
     """
     found = []
     for name in names:

@@ -1,7 +1,7 @@
-"""A hundred objects that nobody sells: random unions of boxes, cylinders and hulls, to learn from.
+"""A hundred random objects for training: unions of boxes, cylinders and hulls.
 
-Who pushes only the same few objects learns those. Objects put together at random taught grasping to work on real
-ones (Tobin et al. 2018, "Domain Randomization and Generative Models for Robotic Grasping", whose recipe this follows).
+A model trained on a few objects only learns those. Grasping learned from random unions of shapes works on real objects
+(Tobin et al. 2018, "Domain Randomization and Generative Models for Robotic Grasping", whose recipe this follows).
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from scipy.spatial.transform import Rotation
 from envs.objects.asset import listed
 from envs.objects.shapes import SIDES, Shape, shape_of
 
-RANDOM = "random"  # what stands before the names of these objects
+RANDOM = "random"  # prefix of the names of these objects
 RANDOM_NAMES = tuple(f"{RANDOM}/shape_{number:02d}" for number in range(100))
 MAXIMUM_PARTS = 3
 SIDE = (0.02, 0.16)  # metres, of a part
 RADIUS = (0.035, 0.10)  # metres from the origin to the farthest vertex; the YCB objects used have 0.04 to 0.1
 DENSITY = (150.0, 900.0)  # kilograms per cubic metre; a mug's and a box of sugar's, as solid bodies
-CORNERS = 12  # points that a hull is put around
+CORNERS = 12  # points of a convex hull
 
 
 @cache
 def random_shape(name: str) -> Shape:
     """Build one of the hundred: one to three convex parts, each but the first with its middle on the one before.
 
-    The same name is the same object, on every machine and whatever was built before.
+    The same name gives the same object on every machine.
 
     Raises:
         ValueError: the name is not one of `RANDOM_NAMES`.
@@ -50,7 +50,7 @@ def random_shape(name: str) -> Shape:
 
 
 def _part(generator: np.random.Generator) -> trimesh.Trimesh:
-    """A convex mesh around the origin, turned at random."""
+    """A convex mesh around the origin, in a random orientation."""
     sides = _between(SIDE, generator, size=3)
     kind = int(generator.integers(3))
     if kind == 0:

@@ -1,4 +1,4 @@
-"""Which objects lie on the table, and how they get there: random shapes, sizes, masses, friction and poses.
+"""Sampling of objects: shapes, sizes, masses, friction and poses.
 
 Source: paper section 4.1 and the published implementation (what is randomised per object).
 """
@@ -16,7 +16,7 @@ from envs.objects.object_sets import BuiltinObjects, ObjectSet, chosen
 from envs.objects.shapes import BUILTIN_NAMES
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
-ATTEMPTS = 400  # whole arrangements tried before an area counts as too small
+ATTEMPTS = 400  # arrangements sampled before an area counts as too small
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class ObjectRanges:
         names: objects to choose from. scale: factor on size. mass: factor on the published mass.
         friction: Coulomb coefficient against the table.
         clearance: metres between neighbouring centres at the start.
-        kilograms: mass whatever the object, in place of the factor.
-        target: what the first object, the target, is chosen from, in place of `names`.
+        kilograms: mass of every object, instead of the factor.
+        target: names for the first object, the target, instead of `names`.
         drop_height: metres above the table from which centres fall, at least; 0 means just above the table.
     """
 
@@ -44,10 +44,10 @@ class ObjectRanges:
 
 @dataclass(frozen=True)
 class ObjectParameters:
-    """One sampled object: what it is, how it behaves, and the pose from which it is dropped.
+    """One sampled object: its shape and parameters, and the pose from which it is dropped.
 
     Attributes:
-        name: what its set calls it. scale: factor. mass: kilograms. friction: coefficient.
+        name: in its set. scale: factor. mass: kilograms. friction: coefficient.
         position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
     """
 
@@ -104,11 +104,11 @@ def sample_objects(
     """Sample one object per area, in random orientation, above the table and clear of its neighbours.
 
     Args:
-        areas: where each object may start; the first is the target. objects: the set that the names mean, the
-            builtin one by default.
+        areas: start area of each object; the first is the target. objects: the set of the names, by default the builtin
+            one.
 
     Raises:
-        ValueError: the areas are too small for so many objects, or a name means no object.
+        ValueError: the areas are too small for so many objects, or an unknown name.
     """
     objects = objects or BuiltinObjects()
     names = chosen(ranges.names, objects)
@@ -122,7 +122,7 @@ def sample_objects(
         asset = objects.asset(choices[generator.integers(len(choices))])
         scale = generator.uniform(*ranges.scale)
         radius = scale * asset.radius
-        # Long neighbours may overlap in the plan view: the later one then falls from above the earlier one.
+        # Long neighbours may overlap in the plan view: the later one is then dropped from above the earlier one.
         below = [top for center, other, top in circles if np.linalg.norm(position - center) < radius + other]
         height = max(max([0.005, *(top + 0.005 for top in below)]) + radius, ranges.drop_height)
         circles.append((position, radius, height + radius))

@@ -1,8 +1,8 @@
-"""Real objects as scans in a folder.
+"""Scans of real objects in a folder.
 
-It holds, for each object, `NAME.obj` (what the camera sees) and `NAME_vhacd.obj` (what collides: one convex part per
-group), in metres, z up, with the origin at the centre of mass, and one `meta.json` that names them, with kilograms
-and kilograms times square metres:
+The folder has for each object `NAME.obj` (visual mesh) and `NAME_vhacd.obj` (collision mesh: one convex part per
+group), in metres, z up, with the origin at the centre of mass, and one `meta.json` with names, masses (kilograms) and
+inertias (kilograms times square metres):
 
     {"mug": {"mass": 0.118, "inertia_diag": [1.07e-4, 1.11e-4, 1.47e-4]}, ...}
 
@@ -20,16 +20,16 @@ import numpy as np
 
 from envs.objects.asset import ObjectAsset, plain_name
 
-SCANS = "ycb"  # the folder's name within the assets, and what stands before the names of its objects
+SCANS = "ycb"  # the folder's name within the assets, and the prefix of its objects' names
 _GET = f"get them with: python -m cavin_pyro.assets {SCANS} --to DIR"
 
 
 class ScannedObjects:
-    """The objects of the folder `assets/ycb`, called `ycb/NAME`. Every file is looked at here, before any is needed.
+    """The objects of the folder `assets/ycb`, called `ycb/NAME`. The constructor checks every file.
 
     Raises:
-        ValueError: no folder was named, or the folder or a file in it is missing or damaged: one line with what is
-            missing, where it was looked for, and the command that makes it.
+        ValueError: no folder was named, or the folder or a file in it is missing or damaged: the message
+            says what is missing, where, and which command makes it.
     """
 
     def __init__(self, assets: str | Path | None) -> None:

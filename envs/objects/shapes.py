@@ -1,7 +1,7 @@
 """The ten builtin objects: the paper's YCB subset rebuilt from convex parts at published sizes and masses.
 
-A shape is a tuple of convex parts; the same parts serve collision and the camera, so what is pushed is what
-is seen. Round things are prisms whose corners lie on the published circle.
+A shape is a tuple of convex parts; the same parts serve for collision and for the camera. Round
+objects are prisms whose corners lie on the published circle.
 Sizes and masses: YCB Object and Model Set (Calli et al. 2015).
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from envs.objects.asset import plain_name
 
 SIDES = 16  # flat faces around a can; the largest gap to the circle is 2 % of its radius
-STAVES = 10  # flat faces around a hollow vessel, each of them a convex part that costs time in every step
+STAVES = 10  # flat faces around a hollow vessel, each of them a convex part, which costs time in every step
 WALL = 0.004  # metres; thickness of the mug's and the cup's wall and floor
 
 
@@ -29,8 +29,8 @@ class Shape:
     """A rigid object made of convex parts, its origin at the centre of volume.
 
     Attributes:
-        name: the YCB object's name, or its set's and its own.
-        parts: convex meshes in metres, z up in the pose in which the object is sold.
+        name: the YCB object's name, or prefix and name.
+        parts: convex meshes in metres, z up in the object's usual pose.
         mass: kilograms.
     """
 
@@ -61,7 +61,7 @@ def _ring(radius: float, z: float, angles: NDArray[np.floating]) -> NDArray[np.f
 
 
 def _lathed(bottom: float, top: float, height: float) -> list[trimesh.Trimesh]:
-    """A hollow vessel open at the top (diameters in metres): a floor, and a wall of one convex stave a side.
+    """A hollow vessel open at the top (diameters in metres): a floor, and a wall with one convex stave per side.
 
     The staves end on the floor instead of beside it, so that only the floor touches the table: each part
     that touches adds contacts to solve.
@@ -148,7 +148,7 @@ def shape_of(name: str, parts: Sequence[trimesh.Trimesh], mass: float) -> Shape:
 def write_mesh(shape: Shape, folder: Path) -> Path:
     """Write the shape as one Wavefront file, a group per convex part, and return its path.
 
-    Every triangle keeps corners of its own, so that a renderer shades it flat; a file already there is kept.
+    Triangles do not share corners, so that a renderer shades them flat. An existing file is kept.
     """
     path = folder / f"{plain_name(shape.name)}.obj"
     if not path.exists():

@@ -1,4 +1,4 @@
-"""The only package that calls PyBullet: bodies, steps, contacts, images and arms of one simulated world."""
+"""The only package that calls PyBullet: bodies, steps, contacts, images and arms of a simulated world."""
 
 from envs.physics.arm import Arm, ArmDescription
 from envs.physics.bullet import PYBULLET_DATA

@@ -1,7 +1,7 @@
 """An arm in a simulated world: joints driven by motors, a stick in its hand.
 
-Only the stick touches objects. The other links collide with the table alone: a wrist that brushes a tall box is a
-matter of the hand's size, which pushing with a stick is meant to leave out (`stick` has no hand at all).
+Only the stick touches objects. The other links collide with the table alone, so that a wrist cannot move a tall box:
+the result of a push must not depend on the size of the hand (`stick` has none).
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from numpy.typing import NDArray
 from envs.physics.bullet import BulletClient, pybullet
 from envs.physics.world import TOOL_FRICTION, PhysicsWorld
 
-STICK, TIP = "stick", "stick_tip"  # the URDF's links of these names: what touches objects, and its lower end
+STICK, TIP = "stick", "stick_tip"  # links of the URDF: the stick, and its lower end
 MOTOR_FORCE = 1e4  # newton metres; with the effort limits of real arms heavy objects bend the line of a push
 EVERYTHING, STATIC_ONLY = -1, 2  # Bullet's collision masks
 TOUCHING = 1e-4  # metres between arm and table that count as contact
-INVISIBLE = (1.0, 1.0, 1.0, 0.0)  # what is fully transparent is left out of every image
+INVISIBLE = (1.0, 1.0, 1.0, 0.0)  # the renderer omits fully transparent shapes
 
 
 @dataclass(frozen=True)
 class ArmDescription:
-    """Which arm stands where.
+    """An arm and its place.
 
     Attributes:
         urdf: its file, with a link `stick` that ends in `stick_tip`; the tip's z axis points out of the stick.
         base: (x, y, z) metres of the URDF's origin.
         home: radians by joint, from base to tool; out of the camera's view. The first turns about the vertical.
-        posture: radians, in the order of `home`; of all ways to reach a place, the one nearest to this is taken.
-        held: what the other movable joints are held at, radians or metres.
-        stand: links that the arm stands on; they are not drawn, so that they are not in the camera's view.
+        posture: radians, in the order of `home`; the preferred one among all solutions of the inverse kinematics.
+        held: fixed positions of the other movable joints, radians or metres.
+        stand: links that the arm stands on, which are not rendered.
     """
 
     urdf: Path
@@ -46,10 +46,10 @@ class ArmDescription:
 
 
 class LoadedArm:
-    """An arm's body in a simulation, and the numbers by which PyBullet calls its parts.
+    """An arm's body in a simulation, and PyBullet's numbers of its parts.
 
     Raises:
-        ValueError: PyBullet cannot read the file, or a joint or link that the description names is not in it.
+        ValueError: PyBullet cannot read the file, or it lacks a joint or link of the description.
     """
 
     def __init__(self, client: BulletClient, description: ArmDescription) -> None:
@@ -78,7 +78,7 @@ class LoadedArm:
         self.put(self.home)
 
     def put(self, angles: NDArray[np.float64]) -> None:
-        """Set the joints [J] (radians) at once, whatever is in the way."""
+        """Set the joints [J] (radians) at once, ignoring collisions."""
         for joint, angle in zip(self.joints, angles, strict=True):
             self.client.resetJointState(self.body, joint, angle)
 
@@ -94,7 +94,7 @@ class Arm:
         self._loaded = LoadedArm(world.client, description)
         self._client, self._table = world.client, world.table
         self.body = self._loaded.body
-        self.stand = [self._loaded.links[name] for name in description.stand]  # links that are not drawn
+        self.stand = [self._loaded.links[name] for name in description.stand]  # links that are not rendered
         for name in [*description.stand, *_without_picture(description.urdf)]:
             self._client.changeVisualShape(self.body, self._loaded.links[name], rgbaColor=INVISIBLE)
         for link in self._loaded.links.values():
@@ -109,16 +109,16 @@ class Arm:
     def command(self, angles: NDArray[np.float64], speeds: NDArray[np.float64]) -> None:
         """From now on, correct the joints to `angles` [J] radians while they turn at `speeds` [J] radians per second.
 
-        Both gains are 1: an error is gone after one step, which is what a stiff controller would do in a few.
+        Both gains are 1: an error vanishes after one step, like with a stiff controller.
         """
         self._drive(self._loaded.joints, angles.tolist(), speeds.tolist())
 
     def angles(self) -> NDArray[np.float64]:
-        """Joint angles now: [J] radians."""
+        """Current joint angles: [J] radians."""
         return np.array([one[0] for one in self._client.getJointStates(self.body, self._loaded.joints)])
 
     def tip(self) -> NDArray[np.float64]:
-        """Where the stick's tip is now: [3] metres."""
+        """Current position of the stick's tip: [3] metres."""
         state = self._client.getLinkState(self.body, self._loaded.links[TIP], computeForwardKinematics=1)
         return np.array(state[4])
 
@@ -128,14 +128,14 @@ class Arm:
         return any(contact[8] <= TOUCHING for contact in contacts)
 
     def corners(self) -> NDArray[np.float64]:
-        """Corners of axis-aligned boxes around the links, the stand's left out: [L, 8, 3] metres."""
+        """Corners of axis-aligned boxes around the links, without the stand: [L, 8, 3] metres."""
         links = [link for name, link in self._loaded.links.items() if name not in self._loaded.description.stand]
         boxes = np.array([self._client.getAABB(self.body, link) for link in links])
         choice = np.array(list(product((0, 1), repeat=3)))
         return boxes[:, choice, np.arange(3)]
 
     def lift_out(self) -> None:
-        """Set the joints to the home pose at once, whatever holds them."""
+        """Set the joints to the home pose at once, ignoring collisions."""
         self._loaded.put(self._loaded.home)
         self.command(self._loaded.home, np.zeros_like(self._loaded.home))
 
@@ -154,6 +154,6 @@ class Arm:
 
 
 def _without_picture(urdf: Path) -> list[str]:
-    """Links with a collision shape and no visual one: PyBullet would draw the collision shape."""
+    """Links with a collision shape and no visual one: PyBullet would render the collision shape."""
     links = ElementTree.parse(urdf).getroot().iter("link")
     return [link.attrib["name"] for link in links if link.find("collision") is not None and link.find("visual") is None]

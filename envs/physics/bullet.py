@@ -1,4 +1,4 @@
-"""PyBullet itself, without what it prints at import and on connecting."""
+"""PyBullet, without its messages at import and on connecting."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ with _quiet(2):
 
 
 def connect() -> BulletClient:
-    """A simulation of its own, without a window, and without Bullet's greeting."""
+    """Start a separate simulation, without a window and without Bullet's messages."""
     with _quiet(1):
         return BulletClient(pybullet.DIRECT)
 

@@ -1,4 +1,4 @@
-"""What a controller knows of its arm: where the tip is for given joint angles, and how it moves with them."""
+"""Forward kinematics of an arm: position and Jacobian of the tip for given joint angles."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Forward(NamedTuple):
 
 
 class Kinematics:
-    """An arm alone in a simulation of its own, where nothing happens: moving it there moves nothing else.
+    """An arm alone in a separate simulation.
 
     Raises:
         ValueError: as `envs.physics.arm.LoadedArm`.
@@ -48,7 +48,7 @@ class Kinematics:
         state = client.getLinkState(body, link, computeForwardKinematics=1)
         axis = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)[:, 2]
         still = [0.0] * len(self._at)
-        # The tip's frame has its centre of mass in its origin: the local position asked for is zero.
+        # The tip's frame has its centre of mass in its origin, so the local position is zero.
         linear, angular = client.calculateJacobian(body, link, [0.0] * 3, self._at.tolist(), still, still)
         jacobian = np.concatenate([np.array(linear), np.array(angular)])[:, self._columns]
         return Forward(np.array(state[4]), axis, jacobian)

@@ -1,4 +1,4 @@
-"""What bodies look like and where they are, for other renderers."""
+"""Visual shapes and poses of bodies, for other renderers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Poses:
-    """Where bodies are, in truth.
+    """True poses of bodies.
 
     Attributes:
         positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
@@ -35,7 +35,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Visual:
-    """One shape of a body as it is seen.
+    """One visual shape of a body.
 
     Attributes:
         body, link: numbers; link -1 is the body's base. kind: mesh, box, cylinder, sphere or capsule.
@@ -56,7 +56,7 @@ class Visual:
 
 
 def visuals(bullet: BulletClient) -> list[Visual]:
-    """What every body in the world looks like."""
+    """The visual shapes of every body in the world."""
     shapes = [
         shape
         for index in range(bullet.getNumBodies())
@@ -70,13 +70,13 @@ def visuals(bullet: BulletClient) -> list[Visual]:
 
 
 def link_poses(bullet: BulletClient, links: Sequence[tuple[int, int]]) -> Poses:
-    """True poses of the frames that visuals lie in, for (body, link) pairs; link -1 is a body's base."""
+    """True poses of the visuals' frames, for (body, link) pairs; link -1 is a body's base."""
     found = []
     for body, link in links:
         if link >= 0:
             found.append(bullet.getLinkState(body, link, computeForwardKinematics=1)[4:6])
             continue
-        # Bullet tells where the base's centre of mass is.
+        # Bullet returns the pose of the base's centre of mass.
         inertial = bullet.invertTransform(*bullet.getDynamicsInfo(body, -1)[3:5])
         found.append(bullet.multiplyTransforms(*bullet.getBasePositionAndOrientation(body), *inertial))
     return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))

@@ -1,7 +1,7 @@
 """Bodies, steps, contacts and images of one simulated world.
 
 Bodies are integers. Objects fall, slide and collide. The tool follows a prescribed path: its pose *and*
-velocity are set before every step, so that contacts are solved as with an arm too strong to be slowed.
+velocity are set before every step, so that contacts are solved as with an arm that no contact slows.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
 class PhysicsWorld:
     """One PyBullet world in DIRECT mode with a table in it.
 
-    Every `reset` starts from an empty simulation, because Bullet's contact caches would otherwise carry the
-    history of earlier scenes into the next one, and equal seeds would not give equal states.
+    Every `reset` starts from an empty simulation: Bullet's contact caches would otherwise keep the history of earlier
+    scenes, and equal seeds would not give equal states.
     """
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class PhysicsWorld:
         bullet = self._bullet
         bullet.resetSimulation()
         self.objects: list[int] = []  # bodies that `add_object` made
-        self._cylinders: dict[tuple[float, float], int] = {}  # shapes that `occupied` tries places with
+        self._cylinders: dict[tuple[float, float], int] = {}  # shapes for the test in `occupied`
         bullet.setGravity(0.0, 0.0, -GRAVITY)
         bullet.setTimeStep(TIME_STEP)
         bullet.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
@@ -94,7 +94,7 @@ class PhysicsWorld:
 
         Args:
             mesh: a Wavefront file, metres, origin at the centre of mass. scale: factor on its size.
-            visual: another one for the camera to see. mass: kilograms.
+            visual: another mesh for the camera. mass: kilograms.
             inertia: (x, y, z) kilograms times square metres about the mesh's axes; by default, its bounding box's.
             friction: Coulomb coefficient against the table.
             position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
@@ -150,11 +150,11 @@ class PhysicsWorld:
             self.on_step()
 
     def overlaps(self, body: int, other: int) -> bool:
-        """Whether two bodies interpenetrate where they stand now."""
+        """Whether two bodies currently interpenetrate."""
         return len(self._bullet.getClosestPoints(body, other, 0.0)) > 0
 
     def occupied(self, foot: Sequence[float] | NDArray[np.float64], *, radius: float, length: float) -> bool:
-        """Whether an upright cylinder (metres), its lower end's centre at `foot`, would cut into an object."""
+        """Whether an upright cylinder (metres), its lower end's centre at `foot`, would overlap an object."""
         size = radius, length
         if size not in self._cylinders:
             self._cylinders[size] = self._bullet.createCollisionShape(
@@ -165,7 +165,7 @@ class PhysicsWorld:
         return any(self._bullet.getClosestPoints(-1, body, 0.0, **shape) for body in self.objects)
 
     def rest(self, bodies: Sequence[int]) -> None:
-        """Put bodies to sleep: they cost no time and do not creep until something touches them."""
+        """Put bodies to sleep: they cost no time and do not drift until something touches them."""
         for body in bodies:
             for state in (pybullet.ACTIVATION_STATE_ENABLE_SLEEPING, pybullet.ACTIVATION_STATE_SLEEP):
                 self._bullet.changeDynamics(body, -1, activationState=state)
@@ -176,11 +176,11 @@ class PhysicsWorld:
         return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
 
     def visuals(self) -> list[Visual]:
-        """What every body in the world looks like."""
+        """The visual shapes of every body in the world."""
         return visuals(self._bullet)
 
     def link_poses(self, links: Sequence[tuple[int, int]]) -> Poses:
-        """True poses of the frames that visuals lie in, for (body, link) pairs; link -1 is a body's base."""
+        """True poses of the visuals' frames, for (body, link) pairs; link -1 is a body's base."""
         return link_poses(self._bullet, links)
 
     def fastest(self, bodies: Sequence[int]) -> float:
@@ -195,7 +195,7 @@ class PhysicsWorld:
         """Depth, body numbers and colour as the camera sees them.
 
         Args:
-            table: whether it is drawn. It fills most of an image and takes four fifths of the renderer's time.
+            table: whether to render it. It fills most of an image and takes four fifths of the rendering time.
         """
         if not table:
             self._show_table(0.0)
@@ -205,5 +205,5 @@ class PhysicsWorld:
         return rendering
 
     def _show_table(self, opacity: float) -> None:
-        """The renderer leaves out what has no opacity; nothing else about a body changes."""
+        """Show or hide the table: the renderer omits fully transparent bodies."""
         self._bullet.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, opacity))

@@ -1,4 +1,4 @@
-"""What pushes: a stick that moves by itself, or an arm that holds one. `Robot` is what a real arm would implement."""
+"""Robots: a stick that moves by itself, or an arm that holds one. A driver of a real arm implements `Robot`."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ __all__ = [
 ]
 
 RobotMaker = Callable[[PhysicsWorld], Robot]
-"""Puts a robot into a world that was just emptied."""
+"""Puts a robot into an empty world."""
 
-# From the folder of assets, or None, to a maker. A robot that lacks something says so here, before any world is built.
+# Functions from the folder of assets, or None, to a maker. They raise if a file is missing, before a world is built.
 ROBOTS: dict[str, Callable[[str | Path | None], RobotMaker]] = {
     "stick": lambda assets: StickRobot,
     "sawyer": lambda assets: partial(ArmRobot, description=sawyer(assets)),
@@ -43,10 +43,10 @@ ROBOTS: dict[str, Callable[[str | Path | None], RobotMaker]] = {
 
 
 def robot_maker(name: str, assets: str | Path | None = None) -> RobotMaker:
-    """What puts the robot of that name into a world.
+    """The maker of the robot of that name.
 
     Raises:
-        ValueError: unknown robot, or its files are missing; what to do stands in the message.
+        ValueError: unknown robot, or missing files; the message says how to get them.
     """
     if name not in ROBOTS:
         raise ValueError(f"unknown robot {name!r}: choose from {', '.join(ROBOTS)}")

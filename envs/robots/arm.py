@@ -18,18 +18,18 @@ from envs.workspace import TABLE_HIGH, TABLE_LOW
 WAYPOINTS = 11  # along a push, at most 14 mm apart
 WAYPOINTS_UP = 5  # between the table and `ABOVE_HEIGHT`
 MOVE_STEPS = 40  # physics steps, at least, for any motion that does not push
-LARGEST_GAP = 0.6  # radians between neighbouring waypoints; a path with a larger one is no path
-BEHIND = 0.02  # radians by which a joint may differ from where it should be; more, and the arm counts as blocked
+LARGEST_GAP = 0.6  # radians between neighbouring waypoints; a larger gap makes a path invalid
+BEHIND = 0.02  # radians of a joint's error above which the arm counts as blocked
 
-# One for each arm and process: it costs a fifth of a second, and knows nothing of any world.
+# One for each arm and process: its construction takes a fifth of a second, and it does not depend on a world.
 inverse_kinematics = lru_cache(maxsize=None)(InverseKinematics)
 
 
 class ArmRobot:
-    """An arm that stands off stage until it is told to move.
+    """An arm, which waits off stage between pushes.
 
-    A push takes as many physics steps as the stick's and has its speed profile, unless a joint would have to turn
-    faster than it can: then it takes more. All other motions are as fast as the joints allow.
+    A push has the stick's number of physics steps and speed profile, or more steps if a joint would exceed its
+    velocity limit. All other motions are as fast as the joints allow.
 
     Raises:
         ValueError: the arm's file cannot be used.
@@ -38,8 +38,8 @@ class ArmRobot:
     def __init__(self, world: PhysicsWorld, description: ArmDescription) -> None:
         self.inverse = inverse_kinematics(description)
         self._world, self.arm = world, Arm(world, description)
-        self._home = self._at = self.arm.angles()  # where the joints should be now
-        self._place = self.arm.tip()  # where the tip should be now
+        self._home = self._at = self.arm.angles()  # commanded joint angles
+        self._place = self.arm.tip()  # commanded position of the tip
 
     def fits(self, place: Point) -> bool:
         return not self._world.occupied(place, radius=STICK_RADIUS, length=STICK_LENGTH)
@@ -65,14 +65,14 @@ class ArmRobot:
             return ""
         stopped = self._follow(np.stack([self._at, self._home]), self.arm.tip(), MOVE_STEPS, guarded=False)
         if np.abs(self.arm.angles() - self._home).max() > BEHIND:
-            self.arm.lift_out()  # pinned under something immovable; on a real arm somebody has to help
+            self.arm.lift_out()  # stuck; a real arm needs help here
         self._at, self._place = self._home, self.arm.tip()
         return stopped
 
     def clear_of_view(self, camera: Camera) -> bool:
         x, y, z = camera.position
         corners = self.arm.corners()
-        # The shadow that the arm would throw if the camera were a lamp; what is above it throws none.
+        # Project the arm from the camera onto the table; parts above the camera do not count.
         depth = z - corners[..., 2:]
         below = (depth > 0.0).any(axis=(1, 2))
         shadow = (corners[below, :, :2] - (x, y)) * z / np.maximum(depth[below], 1e-3) + (x, y)
@@ -98,7 +98,7 @@ class ArmRobot:
         return np.stack(path)
 
     def _follow(self, path: NDArray[np.float64] | None, place: Point, steps: int, *, guarded: bool = True) -> Stopped:
-        """Drive the joints along waypoints [K, J], evenly spaced in the way to go, in at least `steps` steps."""
+        """Drive the joints along waypoints [K, J], evenly spaced along the path, in at least `steps` steps."""
         if path is None:
             return "unreachable"
         spline = CubicSpline(np.linspace(0.0, 1.0, len(path)), path)  # of two waypoints, a straight line

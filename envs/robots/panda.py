@@ -1,4 +1,4 @@
-"""Franka Emika's Panda from PyBullet's own data, with a stick on its flange: an arm for which nothing is downloaded."""
+"""Franka Emika's Panda from PyBullet's own data, with a stick on its flange: an arm without downloads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _JOINT = """<joint name="{child}_fixed" type="fixed"><origin xyz="0 0 {height}"/
 
 
 def panda(assets: str | Path | None = None) -> ArmDescription:
-    """Where the Panda stands. It needs no assets; a folder given for other parts of the world is not looked at."""
+    """The Panda and its place. It ignores `assets`."""
     return ArmDescription(
         urdf=_urdf(),
         base=BASE,
@@ -43,7 +43,7 @@ def panda(assets: str | Path | None = None) -> ArmDescription:
 def _urdf() -> Path:
     """PyBullet's Panda without its hand, a stick on the flange instead, in a temporary folder of this process.
 
-    A part of the arm rather than a body tied to it: a constraint between bodies gives way under load.
+    The stick is a link of the arm, not a constrained body: a constraint between bodies yields under load.
     """
     source = PYBULLET_DATA / "franka_panda"
     tree = ElementTree.parse(source / "panda.urdf")

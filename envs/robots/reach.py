@@ -1,9 +1,9 @@
-"""Inverse kinematics: joint angles that put the tip of an upright stick at a place.
+"""Inverse kinematics: joint angles that put the tip of an upright stick at a position.
 
-The stick is round, so how it is turned about its own axis does not matter: five conditions, and an arm of seven
-joints has two to spare. They go into staying near a posture. The first joint turns the whole arm about the vertical,
-hence a table over distance and height alone gives a first guess for every place, and damped least squares finishes it.
-The answer depends on the place only, not on where the arm was: equal pushes are carried out equally.
+The stick is round, so its rotation about its own axis is free: there are five conditions, and an arm of seven joints
+has two redundant degrees of freedom, which keep it near a posture. The first joint turns the whole arm about the
+vertical, so a table over distance and height gives an initial guess for every position, which damped least squares
+refines. The solution depends on the position only, not on the arm's state: equal pushes are executed equally.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from envs.robots.robot import ABOVE_HEIGHT, TIP_HEIGHT, Point
 
 DISTANCES = np.arange(0.20, 1.001, 0.05)  # metres from the first joint's axis
 HEIGHTS = np.linspace(TIP_HEIGHT, ABOVE_HEIGHT, 4)  # metres
-CLOSE = 1e-4  # metres from the place, and radians from upright, that count as there
+CLOSE = 1e-4  # tolerance: metres from the position, and radians from upright
 ITERATIONS = 60
 DAMPING = 1e-5
-TO_POSTURE = 0.1  # share of the way back to the posture, per iteration, as far as the tip does not notice
+TO_POSTURE = 0.1  # fraction of the way back to the posture per iteration, in the null space of the tip
 LARGEST_STEP = 0.3  # radians per iteration
 
 
 class InverseKinematics:
-    """Joint angles for places of the tip.
+    """Joint angles for positions of the tip.
 
     Raises:
         ValueError: the arm's file cannot be used.
@@ -37,7 +37,7 @@ class InverseKinematics:
         self.forward = Kinematics(description)
         self._base, self._posture = np.array(description.base), np.array(description.posture)
         self.solve = lru_cache(maxsize=4096)(self._solve)
-        # From the middle outwards and inwards, each from its neighbour: the elbow never flips between them.
+        # Outwards and inwards from the middle, each from its neighbour, so that the elbow does not flip.
         middle = len(DISTANCES) // 2
         table = np.zeros((len(DISTANCES), len(HEIGHTS), len(self._posture)))
         for column, height in enumerate(HEIGHTS):
@@ -50,7 +50,7 @@ class InverseKinematics:
         self._guess = RegularGridInterpolator((DISTANCES, HEIGHTS), table, bounds_error=False, fill_value=None)
 
     def angles(self, place: Point) -> NDArray[np.float64] | None:
-        """Joint angles [J] radians that put the tip at `place` [3] metres, upright; None where there are none."""
+        """Joint angles [J] radians that put the tip at `place` [3] metres, upright; None if there is no solution."""
         return self.solve(*(float(value) for value in place))
 
     def _solve(self, x: float, y: float, z: float) -> NDArray[np.float64] | None:
@@ -65,10 +65,10 @@ class InverseKinematics:
         return angles if there else None
 
     def _descend(self, place: Point, angles: NDArray[np.float64], drift: float) -> tuple[NDArray[np.float64], bool]:
-        """Damped least squares from a first guess, within the joints' limits: angles [J], and whether they serve."""
+        """Damped least squares from a guess, within the joints' limits: angles [J], and whether they converged."""
         for _ in range(ITERATIONS):
             position, axis, jacobian = self.forward(angles)
-            # The turn that would make the axis point down: its part about the vertical is free.
+            # The rotation that makes the axis point down; its component about the vertical is free.
             error = np.concatenate([place - position, np.cross(axis, (0.0, 0.0, -1.0))[:2]])
             if np.abs(error).max() < CLOSE and axis[2] < 0.0:
                 return angles, True

@@ -1,8 +1,8 @@
-"""The seam between the world and what pushes in it: what the driver of a real arm has to offer, and nothing more.
+"""The interface of robots, which the driver of a real arm implements.
 
-A driver implements `Robot` and enters its name in `envs.robots.ROBOTS`; `envs.robots.phases.push` then makes it push.
+Add a driver that implements `Robot` to `envs.robots.ROBOTS`; `envs.robots.phases.push` then makes it push.
 All places are those of the tool's tip, (x, y, z) metres in the robot's base frame with the table's top at z = 0, and
-the tool stands upright. No method raises for what happens on the table: it reports, and leaves the robot stopped.
+the tool stands upright. No method raises for an event on the table: it reports the event and stops the robot.
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ Point = NDArray[np.float64]
 Stopped = Literal["", "unreachable", "blocked", "table"]
 """Why a motion ended early.
 
-"": it did not. "unreachable": some place along it is out of reach; nothing moved. "blocked": the tip fell behind where
-it should be by more than the robot tolerates, so that something is in the way. "table": the robot touched the table.
+"": it did not. "unreachable": some position along it has no solution; nothing moved. "blocked": the tip's
+error exceeds the robot's tolerance, so an obstacle is in the way. "table": the robot touched the table.
 """
 
 
 class Robot(Protocol):
-    """Something that holds a stick upright and pushes with it. Between pushes it is off stage."""
+    """Holds a stick upright and pushes with it. Between pushes it is off stage."""
 
     def fits(self, place: Point) -> bool:
-        """Whether the stick, upright with its tip at `place` [3], would cut into no object.
+        """Whether the stick, upright with its tip at `place` [3], would overlap no object.
 
-        A robot that cannot know says yes, and finds out on its way down.
+        A robot without this knowledge returns True; its way down may then be blocked.
         """
 
     def reaches(self, start: Point, end: Point) -> bool:
         """Whether the whole push is possible: from above `start` [3], along the line, to above `end` [3]."""
 
     def move(self, place: Point) -> Stopped:
-        """Take the tip to `place` [3] at any pace: straight up or down if it lies over or under the tip."""
+        """Move the tip to `place` [3] at any speed: straight up or down if it is above or below the tip."""
 
     def slide(self, end: Point) -> Stopped:
-        """Push: take the tip to `end` [3] along a straight line, with a speed that rises from zero and ends there."""
+        """Push: move the tip to `end` [3] along a straight line, with zero speed at both ends."""
 
     def leave(self) -> Stopped:
-        """Take everything out of the camera's view, well above the objects."""
+        """Leave the camera's view, well above the objects."""
 
     def clear_of_view(self, camera: Camera) -> bool:
         """Whether no part of the robot stands between the camera and the table."""
 
     def stop(self) -> None:
-        """Stand still from now on, wherever the robot is."""
+        """Stop at the current position."""
 
     def wait(self) -> None:
-        """Let one time step of the world pass, standing still."""
+        """Wait for one time step of the world."""
 
     def tip(self) -> Point:
-        """Where the tip is now: [3] metres."""
+        """Current position of the tip: [3] metres."""

@@ -10,7 +10,15 @@ from envs.physics import ArmDescription
 URDF = Path("sawyer", "sawyer_stick.urdf")  # inside the folder of assets
 HOW_TO_GET = "get it with `python -m cavin_pyro.assets sawyer --to DIR`, then give assets=DIR"
 POSTURE = (0.0, -0.6, 0.0, 1.2, 0.0, 1.0, 1.5)  # radians; the elbow up, the hand above the table's middle
-HOME = (0.46, -1.64, -0.16, 1.28, 0.08, 0.81, 1.95)  # radians; the hand up and to the left, between no camera and table
+HOME = (
+    0.46,
+    -1.64,
+    -0.16,
+    1.28,
+    0.08,
+    0.81,
+    1.95,
+)  # radians; the hand up and left, out of view
 STAND = (
     *("pedestal", "pedestal_feet", "controller_box", "right_arm_base_link"),
     *("torso", "right_l0", "head", "screen", "head_camera"),
@@ -18,7 +26,7 @@ STAND = (
 
 
 def sawyer(assets: str | Path | None = None) -> ArmDescription:
-    """Where the Sawyer stands: its base is the origin of all coordinates.
+    """The Sawyer and its place: its base is the origin of all coordinates.
 
     Raises:
         ValueError: no folder, or it lacks the URDF or one of the meshes that the URDF names.

@@ -10,15 +10,15 @@ from envs.physics import TIME_STEP, PhysicsWorld
 from envs.robots.robot import PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
 from envs.sensors.camera import Camera
 
-OFF_STAGE = (0.60, 0.0, 2.0)  # metres, the tool's middle; above the camera, so that no image shows the tool
+OFF_STAGE = (0.60, 0.0, 2.0)  # metres, the tool's middle; above the camera, outside of every image
 _MIDDLE = STICK_LENGTH / 2  # metres above the tip
 
 
 class StickRobot:
-    """A stick that is put where it should be; only while it slides does time pass.
+    """A stick with a prescribed pose; time passes only while it slides.
 
-    Its speed follows half a period of a sine, so that objects, whose friction can brake harder than the tool
-    does, stop when the tool stops. It reaches everything, and nothing stops it.
+    Its speed follows half a period of a sine, so that objects, whose friction decelerates them faster than the tool
+    does, stop when the tool stops. It reaches every position, and nothing stops it.
     """
 
     def __init__(self, world: PhysicsWorld) -> None:
@@ -34,7 +34,7 @@ class StickRobot:
         return True
 
     def move(self, place: Point) -> Stopped:
-        self._tip = place  # through the air: no time passes, and what is not there touches nothing
+        self._tip = place  # without passing time or touching anything
         return ""
 
     def slide(self, end: Point) -> Stopped:

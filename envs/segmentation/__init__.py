@@ -1,4 +1,4 @@
-"""Segmentations to choose from, by name."""
+"""Segmentations by name."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from envs.segmentation.segmenter import Pixels, Segmenter
 
 SEGMENTERS: dict[str, Callable[[TrueMasks], Segmenter]] = {
     "mask": MaskSegmenter,
-    "clusters": lambda true_masks: ClusterSegmenter(),  # which has no use for the simulator's word
+    "clusters": lambda true_masks: ClusterSegmenter(),  # which does not use the simulator's masks
 }
 
 
 def segmenter_of(segmentation: str, true_masks: TrueMasks) -> Segmenter:
-    """The segmenter of a name.
+    """The segmenter of that name.
 
     Raises:
         ValueError: unknown name.

@@ -1,4 +1,4 @@
-"""Shapes laid over a map, and how well they explain it together. All costs are in cells."""
+"""Placement of shapes on a height map, and its cost. All costs are in cells."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ LEVEL = 0.004  # metres; heights are compared in steps of this
 TOLERANCE, CAP = 0.004, 0.02  # metres of height by which a cell may differ at no cost, and where the cost is highest
 MISFIT = 0.7  # highest cost of a cell on which a shape lies; a cell on which none lies costs 1
 EMPTY, OVERLAP = 0.7, 0.7  # cost of a shape's cell where nothing stands, and of one where another shape lies already
-PRESENT = 0.2  # of its cells that a shape must save, or it is not there
-# Of its cells, the cost of moving a shape 0.1 m and of turning it by a radian. The cost grows faster than the distance,
-# so that of alike objects that are pushed in a row none is taken to have passed the others.
+PRESENT = 0.2  # fraction of its cells by which a shape must lower the cost, or it counts as hidden
+# Fractions of its cells: the cost of moving a shape by 0.1 m and of rotating it by a radian. The cost grows faster than
+# the distance, so that similar objects that are pushed in a row do not exchange identities.
 MOVING, TURNING, POWER = 0.1, 0.05, 1.5
 TURNS = np.radians(np.arange(-96, 97, 12))  # radians, searched
 STRIDE = 2  # cells between the places that are searched
-NEAR = 8  # cells around a place that are searched when it is known about
-SAMPLE = 80  # cells, about, by which a shape is judged in a search
-REFINED = 3  # best finds of a search that are refined
+NEAR = 8  # cells around an approximately known place to search
+SAMPLE = 80  # cells of a shape, about, that a search evaluates
+REFINED = 3  # best results of a search to refine
 COARSE, FINE = (1.0, 0.1), (0.5, 0.05)  # steps of refining: cells and radians
 
 Table = NDArray[np.float32]
-"""What laying a shape saves on a cell, by the level of its height there: [1 + occupied cells, levels], first: empty."""
+"""Savings per cell from a shape, by the level of its height there: [1 + occupied cells, levels], the first is empty."""
 
 
 class Arrangement:
-    """Where shapes lie on a map.
+    """Poses of shapes on a map.
 
     Args:
         heights: [I, J] the map, metres; 0 where nothing is to be explained.
-        shapes: what may be laid over it; none is to begin with.
+        shapes: those to place; initially none is placed.
     """
 
     def __init__(self, heights: NDArray[np.float32], shapes: Sequence[Shape]) -> None:
@@ -54,23 +54,23 @@ class Arrangement:
         self._misfit = (MISFIT * np.clip(excess, 0.0, 1.0)).astype(np.float32)
 
     def lay(self, number: int, pose: Pose | None) -> None:
-        """Lay a shape at a pose, or take it away."""
+        """Place a shape at a pose, or remove it."""
         self.poses.pop(number, None)
         self._layers.pop(number, None)
         if pose is not None:
             self.poses[number], self._layers[number] = pose, self._layer(number, pose)
 
     def set_out(self, poses: Mapping[int, Pose]) -> None:
-        """Lay these shapes and no others."""
+        """Place these shapes and no others."""
         for number in range(len(self.shapes)):
             self.lay(number, poses.get(number))
 
     def laid(self, number: int) -> Shape:
-        """A shape where it lies."""
+        """A placed shape."""
         return replace(self.shapes[number], pose=self.poses[number])
 
     def savings(self, number: int) -> Table:
-        """What laying this shape would save, as the others lie."""
+        """Savings from this shape, given the others."""
         cost, covered = np.ones(len(self._misfit), np.float32), np.zeros(len(self._misfit), np.bool_)
         for other, (rows, levels) in self._layers.items():
             if other != number:
@@ -81,18 +81,18 @@ class Arrangement:
         return table.astype(np.float32)
 
     def saved(self, number: int) -> float:
-        """What a shape saves where it lies; if it does not, what it would have to save to be there."""
+        """Savings from a placed shape; for another one, the savings that it needs to be placed."""
         if number not in self.poses:
             return PRESENT * self.areas[number]
         return self.gain(number, self.poses[number], self.savings(number))
 
     def gain(self, number: int, pose: Pose, table: Table) -> float:
-        """What laying a shape at a pose saves, less what it costs to move there."""
+        """Savings from a shape at a pose, less the cost of moving there."""
         moving = self._moving(number, np.array([pose.row, pose.column]), pose.turn)
         return float(table[self._layer(number, pose)].sum() - moving)
 
     def search(self, number: int, table: Table, near: Pose | None = None) -> tuple[float, Pose]:
-        """What a shape saves at most, and the pose at which it does, of all or of those `near` another."""
+        """The largest savings from a shape and its pose, among all poses or those `near` another."""
         width, shape, former = self._rows.shape[1], self.shapes[number], near or self.shapes[number].pose
         places = self._occupied[(self._occupied % STRIDE == 0).all(axis=1) & (table[1:].max(axis=1) > 0.0)]
         if near is not None:
@@ -111,7 +111,7 @@ class Arrangement:
         return max((self.refine(number, pose, table) for pose in (former, *chosen)), key=lambda one: one[0])
 
     def refine(self, number: int, pose: Pose, table: Table, steps: tuple[float, float] = COARSE) -> tuple[float, Pose]:
-        """Move and turn a shape by steps (cells, radians) as long as that saves more."""
+        """Move and rotate a shape by steps (cells, radians) while the savings grow."""
         step, turn = steps
         gain = self.gain(number, pose, table)
         while True:
@@ -124,7 +124,7 @@ class Arrangement:
             gain, pose = better, other
 
     def total(self) -> float:
-        """What the map costs as the shapes lie."""
+        """The cost of the map with the placed shapes."""
         cost, count, total = np.ones(len(self._misfit)), np.zeros(len(self._misfit)), 0.0
         for number, (rows, levels) in self._layers.items():
             pose = self.poses[number]
@@ -135,7 +135,7 @@ class Arrangement:
         return float(total + cost[1:].sum() + OVERLAP * np.maximum(count[1:] - 1, 0).sum())
 
     def owners(self) -> NDArray[np.intp]:
-        """For each cell [I, J] the shape that lies on it and differs least from it; -1 where none lies."""
+        """For each cell [I, J] the shape that covers it with the smallest difference; -1 for none."""
         owner, least = np.full(len(self._misfit), -1), np.full(len(self._misfit), np.inf)
         for number, (rows, levels) in self._layers.items():
             better = self._misfit[rows, levels] < least[rows]
@@ -158,7 +158,7 @@ class Arrangement:
         return self._turned[number, pose]
 
     def _moving(self, number: int, places: NDArray[np.floating | np.intp], turn: float) -> NDArray[np.float64]:
-        """What it costs a shape to have moved to places [..., 2] and turned."""
+        """The cost of moving a shape to places [..., 2] and rotating it."""
         last = self.shapes[number].pose
         distance = np.hypot(places[..., 0] - last.row, places[..., 1] - last.column) * CELL
         return self.areas[number] * (MOVING * (distance / 0.1) ** POWER + TURNING * abs(turn - last.turn))

@@ -1,8 +1,8 @@
 """Objects found in the depth image alone, as on a real robot.
 
-The table's plane is fitted and taken away, what is left is mapped from above and falls into connected regions, regions
-that touch are split, and from image to image objects are known again by where they were and what they looked like.
-The objects are those of the first image: later arrivals are taken for noise or for parts of these.
+It fits and removes the table's plane, projects the rest onto a height map, finds its connected regions, splits objects
+in contact, and tracks objects from image to image by position and shape. The set of objects is that of the first image:
+later regions count as noise or as parts of these.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from envs.segmentation.tracking import Track, begin_track, follow_tracks
 from envs.sensors.sensor import DepthImage
 from envs.workspace import MAXIMUM_OBJECTS
 
-CLICK = 8  # cells by which a person may miss the target
+CLICK = 8  # cells, tolerance of the person who points at the target
 NO_PIXELS: Pixels = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
 class ClusterSegmenter:
-    """Finds objects by clustering what rises above the table."""
+    """Finds objects by clustering the points above the table."""
 
     def __init__(self) -> None:
         self._tracks: list[Track | None] = []
@@ -69,7 +69,7 @@ def _confirmed(regions: list[Mask], image: DepthImage, target: tuple[int, int] |
 
 
 def pixels_of(regions: list[Mask | None], heights: HeightMap) -> list[Pixels]:
-    """Pixels of each region; the floors of vessels, which hardly rise above the table, are part of them."""
+    """Pixels of each region; including the floors of vessels, which are hardly above the table."""
     rows, columns = heights.pixels
     found = []
     for region in regions:
@@ -87,7 +87,7 @@ def pixels_of(regions: list[Mask | None], heights: HeightMap) -> list[Pixels]:
 
 
 def _inside(region: Mask) -> Mask:
-    """A region [I, J] with all that it encloses."""
+    """A region [I, J] with its holes filled."""
     filled = np.zeros_like(region)
     if region.any():
         box = box_around(region, 0)

@@ -1,7 +1,6 @@
-"""From a depth image to a map of the table from above: how high something stands on each little cell of it.
+"""From a depth image to a height map: the height above the table, for each cell of the table.
 
-In the image, a tall object leans outwards and hides what is behind it; on the map objects stand apart as they do
-on the table.
+In the image, a tall object leans outwards and occludes others; on the map objects are as separate as on the table.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 CELL = 0.004  # metres; a little more than what a pixel of the Kinect2 shows from one metre
 MARGIN = 0.06  # metres around the table
-LOWEST, HIGHEST = 0.008, 0.35  # metres above the table between which something counts as an object
-STRIDE = 6  # every sixth pixel on each axis says where the table is
+LOWEST, HIGHEST = 0.008, 0.35  # metres above the table; range of heights that count as an object
+STRIDE = 6  # the fit of the table uses every sixth pixel on each axis
 TRIMMING = (0.04, 0.02, 0.01, 0.006)  # metres from the table beyond which a pixel is left out of the next fit
 ORIGIN = np.array(TABLE_LOW) - MARGIN  # metres
 SHAPE = tuple(int(side) for side in np.ceil((np.array(TABLE_HIGH) + MARGIN - ORIGIN) / CELL))
@@ -31,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class HeightMap:
-    """What stands on the table.
+    """Heights of the objects on the table.
 
     Attributes:
         heights: [I, J] metres above the table of the highest point on each cell; 0 where nothing stands.
@@ -47,17 +46,17 @@ class HeightMap:
 
     @property
     def occupied(self) -> Mask:
-        """Cells on which something stands, [I, J]."""
+        """Cells with an object, [I, J]."""
         return self.heights > 0.0
 
     @cached_property
     def filled(self) -> NDArray[np.float32]:
-        """The same heights, and on cells without any, in gaps up to two cells wide, about what is around them."""
+        """The same heights, with gaps up to two cells wide filled from their surroundings."""
         return np.where(self.occupied, self.heights, ndimage.grey_closing(self.heights, (3, 3))).astype(np.float32)
 
 
 def map_heights(image: DepthImage) -> HeightMap:
-    """Fit the table's plane and map what stands on it.
+    """Fit the table's plane and map the heights above it.
 
     Raises:
         ValueError: the image shows no table.
@@ -100,8 +99,8 @@ def cells_of(image: DepthImage, pixels: Pixels) -> tuple[NDArray[np.intp], Mask]
 def fit_table(image: DepthImage) -> NDArray[np.float64]:
     """The plane that most of the image lies in: [3] n such that n . p = 1 for its points p in the image's axes.
 
-    Least squares, again and again without what was far from the last plane; the first is level and at the median
-    height. Objects must cover less than half of what is observed.
+    Repeated least squares without the points far from the last plane; the first plane is level, at the median height.
+    Objects must cover less than half of what is observed.
 
     Raises:
         ValueError: the image shows no table.

@@ -1,4 +1,4 @@
-"""Ground-truth segmentation: the simulator says which pixel is whose."""
+"""Ground-truth segmentation, from the simulator's masks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class MaskSegmenter:
     """The true mask of each object, restricted to pixels with a measurement.
 
     Args:
-        true_masks: asked once per image.
+        true_masks: called once per image.
     """
 
     def __init__(self, true_masks: TrueMasks) -> None:

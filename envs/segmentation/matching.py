@@ -1,4 +1,4 @@
-"""Which moved object is which piece of the map, and which part of a piece where several objects are one."""
+"""Matching of moved objects with pieces of the map, and with parts of a piece of several objects."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from envs.segmentation.registration import explain
 from envs.segmentation.shapes import Shape, shape_of
 
 FARTHEST = 0.5  # metres; no object goes farther between two images
-REMNANT = 0.1  # of an object's former area; less is not the object but what another one left over
-FRAGMENT, PENALTY = 0.4, 0.15  # a piece of less than this share is worth these metres less: a handle, say
-ALIKE = 0.65  # ratio of the areas of an object and of its piece, at least, where several objects have moved
-LEFT_OVER = 0.3  # of an object's area, at least, if it is what no shape explains
-RECOGNISED = 0.4  # of a shape's cells; where it explains less, the object shows another side and is learnt anew
+REMNANT = 0.1  # of an object's former area; smaller pieces are remnants of another object
+FRAGMENT, PENALTY = 0.4, 0.15  # a smaller piece costs these extra metres: a handle, for example
+SIMILAR = 0.65  # ratio of the areas of an object and of its piece, at least, where several objects have moved
+LEFT_OVER = 0.3  # of an object's area, at least, for an object that no shape explains
+RECOGNISED = 0.4  # of a shape's cells; below it, the object shows another side and gets a new shape
 
 
 @dataclass(frozen=True)
 class Match:
-    """Where an object is: its cells [I, J], and its former shape at its new pose, None if that does not fit."""
+    """An object's cells [I, J], and its former shape at its new pose, None if it does not fit."""
 
     region: Mask
     shape: Shape | None
 
 
 def match_apart(moved: Mapping[int, Shape], pieces: Sequence[Mask], heights: HeightMap) -> dict[int, Match] | None:
-    """The piece of each moved object by its number; None if pieces are not one object each."""
+    """The piece of each moved object by its number; None unless every piece is one object."""
     if len(pieces) != len(moved):
         return None
     observed = [shape_of(piece, heights.filled) for piece in pieces]
     chosen = _assign(list(moved.values()), observed)
     for shape, column in zip(moved.values(), chosen, strict=True):
         ratio = observed[column].area / shape.area
-        if ratio < REMNANT or (len(moved) > 1 and not ALIKE < ratio < 1.0 / ALIKE):
+        if ratio < REMNANT or (len(moved) > 1 and not SIMILAR < ratio < 1.0 / SIMILAR):
             return None
     return {number: Match(pieces[column], None) for number, column in zip(moved, chosen, strict=True)}
 
@@ -96,7 +96,7 @@ def _left_over(
 
 
 def _assign(shapes: Sequence[Shape], observed: Sequence[Shape]) -> list[int]:
-    """For each shape the number of what is observed and most probably is that object, -1 for none."""
+    """For each shape the number of the most probable observed object, -1 for none."""
     chosen = [-1] * len(shapes)
     if observed:
         cost = np.array([[_cost(shape, piece) for piece in observed] for shape in shapes])
@@ -106,12 +106,12 @@ def _assign(shapes: Sequence[Shape], observed: Sequence[Shape]) -> list[int]:
 
 
 def _cost(shape: Shape, piece: Shape) -> float:
-    """Metres by which an object would have moved and changed."""
+    """Metres of an object's move and change."""
     distance = float(np.hypot(shape.pose.row - piece.pose.row, shape.pose.column - piece.pose.column)) * CELL
     fragment = PENALTY if piece.area < FRAGMENT * shape.area else 0.0
     return min(distance, FARTHEST) + fragment + float(np.abs(_features(shape) - _features(piece)).sum())
 
 
 def _features(shape: Shape) -> NDArray[np.float64]:
-    """What stays alike as an object moves [2]: the root of its area, and its height; metres."""
+    """Invariants of a moving object [2]: the root of its area, and its height; metres."""
     return np.array([np.sqrt(shape.area) * CELL, np.percentile(shape.patch[shape.patch > 0.0], 90)])

@@ -1,4 +1,4 @@
-"""Regions of the height map that may be one object each."""
+"""Regions of the height map, candidates for one object each."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ AROUND = np.ones((3, 3), np.bool_)  # eight neighbours
 MINIMUM_AREA = 3e-4  # square metres; smaller things are noise (the smallest object covers 10e-4)
 MINIMUM_PIXELS = 30  # of such a region
 SLIVER_GAP = 2  # cells, at most, between a part and the object it belongs to
-NECK = 3  # cells, at most, that are taken off all around to see whether a region falls into parts
-PART_AREA = 15e-4  # square metres; what is smaller and beside something larger is its handle or its rim
+NECK = 3  # cells, largest erosion in the test whether a region separates
+PART_AREA = 15e-4  # square metres; a smaller region beside a larger one is its handle or its rim
 NARROW = 0.5  # of a part's own half width: a wider neck belongs to the object
 GAP_AREA = 1e-4  # square metres; smaller holes are lost measurements
-CORE_AREA = 2.5e-4  # square metres of it that must be left
+CORE_AREA = 2.5e-4  # square metres of a part that must remain
 HOLLOW_AREA = 7e-4  # square metres; the hollow of a vessel is larger, the eye of a handle smaller
 
 
@@ -28,9 +28,10 @@ def box_around(region: Mask, margin: int) -> tuple[slice, slice]:
 
 
 def find_regions(heights: HeightMap) -> list[Mask]:
-    """Connected regions [I, J] large enough to be objects; single empty cells do not part them.
+    """Connected regions [I, J] large enough to be objects; single empty cells do not separate them.
 
-    Slivers beside a larger region are the part of it that lost measurements at an edge have cut off, as a handle's.
+    A sliver beside a larger region belongs to it: missing measurements at an edge, of a handle for example, separate
+    them.
     """
     closed = ndimage.binary_closing(heights.occupied, AROUND) | heights.occupied
     labels, count = ndimage.label(closed, AROUND)
@@ -50,10 +51,10 @@ def find_regions(heights: HeightMap) -> list[Mask]:
 
 
 def split_at_necks(region: Mask) -> list[Mask]:
-    """The parts into which a region falls when a little is taken off all around; itself, if it does not.
+    """The parts into which a small erosion separates a region, or the region itself.
 
-    Objects that touch with a corner or an edge come apart. Hollow vessels are filled first, so that their rims do not;
-    the eye of a handle is not, so that the handle vanishes instead of counting as a part.
+    This separates objects in contact at a corner or an edge. Hollow vessels are filled first, so that their rims stay
+    whole; the eye of a handle is not filled, so that the handle vanishes and does not count as a part.
     """
     (box,) = ndimage.find_objects(region.astype(np.int8))
     own = region[box]
@@ -77,13 +78,13 @@ def split_at_necks(region: Mask) -> list[Mask]:
 
 
 def _large(mask: Mask, area: float) -> Mask:
-    """What is left of a mask without its regions smaller than `area` square metres."""
+    """A mask without its regions smaller than `area` square metres."""
     labels, count = ndimage.label(mask, AROUND)
     return (np.bincount(labels.ravel(), minlength=count + 1) * CELL**2 >= area)[labels] & mask
 
 
 def nearest_owner(parts: list[Mask]) -> NDArray[np.intp]:
-    """For every cell [I, J] the number of the part that is nearest to it."""
+    """For every cell [I, J] the number of the nearest part."""
     numbers = np.full(parts[0].shape, -1)
     for number, part in enumerate(parts):
         numbers[part] = number

@@ -1,9 +1,9 @@
-"""Telling apart objects that touch, by the shapes that they had when they stood alone.
+"""Registration of objects in contact, by their shapes from when they stood alone.
 
-Analysis by synthesis: the shapes are laid over the map of heights so that together they explain as much of it as they
-can, and nothing that is not there, without overlapping. One after the other is laid where it explains most of what
-the others leave over, in several orders; then each is taken up and laid anew until nothing improves (block coordinate
-descent, each step a search of all places and turns), and two that may have been taken for each other are exchanged.
+Analysis by synthesis: place the shapes on the height map so that together they explain it at the lowest cost, without
+overlaps. The search places one shape after the other where it lowers the cost most, in several orders; then it removes
+and places each one again until the cost stops falling (block coordinate descent, each step a search over all poses),
+and exchanges pairs of similar shapes.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from envs.segmentation.shapes import Shape
 
 ORDERS, SWEEPS = 6, 3  # at most
 IMPROVEMENT = 0.5  # cells, at least, that another arrangement must save
-GOOD = 0.75  # of a shape's cells; one that saves so much is not looked for elsewhere
-POOR = 0.6  # of a shape's cells; where one saves less, objects taken to stand still may not do so
-EXCHANGED = 0.4  # ratio of the areas, at least, of two shapes that may have been taken for each other
+GOOD = 0.75  # of a shape's cells; with such savings a shape is not searched elsewhere
+POOR = 0.6  # of a shape's cells; with smaller savings, objects assumed to be at rest may have moved
+EXCHANGED = 0.4  # ratio of the areas, at least, of two shapes that may be confused
 
 
 def explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequence[int]) -> Arrangement:
-    """Lay shapes over a map [I, J]; those in `still` have hardly moved, unless that leaves another unexplained."""
+    """Place shapes on a map [I, J]; those in `still` hardly move, unless another shape stays unexplained."""
     arrangement = Arrangement(heights, shapes)
     _arrange(arrangement, still)
     if still and any(arrangement.saved(number) < POOR * shape.area for number, shape in enumerate(shapes)):
@@ -37,7 +37,7 @@ def explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequen
 
 
 def _arrange(arrangement: Arrangement, still: Sequence[int]) -> None:
-    """Lay all shapes as well as possible; those in `still` are moved a little at most."""
+    """Place all shapes at the lowest cost; those in `still` move a little at most."""
     shapes = arrangement.shapes
     movable = [number for number in range(len(shapes)) if number not in still]
     movable.sort(key=lambda number: -shapes[number].area)
@@ -62,7 +62,7 @@ def _arrange(arrangement: Arrangement, still: Sequence[int]) -> None:
 
 
 def _starts(arrangement: Arrangement, movable: Sequence[int]) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
-    """Which shapes to leave where they were last, and in which order to lay the others; the best guess comes first."""
+    """Shapes to leave at their last poses, and orders to place the others; the best guess comes first."""
     arrangement.set_out({number: shape.pose for number, shape in enumerate(arrangement.shapes)})
     areas = arrangement.areas
     stay = [number for number in movable if arrangement.saved(number) >= POOR * areas[number]]
@@ -74,7 +74,7 @@ def _starts(arrangement: Arrangement, movable: Sequence[int]) -> Iterator[tuple[
 
 
 def _lay_anew(arrangement: Arrangement, number: int, still: bool) -> bool:
-    """Lay a shape where it saves the most as the others lie; whether that is elsewhere."""
+    """Place a shape where it saves the most, given the others; returns whether it moved."""
     table, former = arrangement.savings(number), arrangement.saved(number)
     least = PRESENT * arrangement.areas[number]
     if still or former > GOOD * arrangement.areas[number]:
@@ -88,7 +88,7 @@ def _lay_anew(arrangement: Arrangement, number: int, still: bool) -> bool:
 
 
 def _exchange(arrangement: Arrangement, one: int, other: int) -> bool:
-    """Lay two shapes each where the other lies, if that is better; whether it is."""
+    """Exchange the places of two shapes if this saves more; returns whether it does."""
     poses, total = dict(arrangement.poses), arrangement.total()
     small, large = sorted(arrangement.areas[number] for number in (one, other))
     if one not in poses or other not in poses or small < EXCHANGED * large:

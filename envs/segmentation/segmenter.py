@@ -1,4 +1,4 @@
-"""What a segmentation is to the scene: from depth images to the pixels of each object."""
+"""The interface of segmentations: from depth images to the pixels of each object."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 class Segmenter(Protocol):
-    """Finds the objects in an episode's images, and knows them again in each further image.
+    """Finds the objects in an episode's first image, and tracks them in later ones.
 
-    The list that comes back holds the pixels of one object per entry, at most `MAXIMUM_OBJECTS` of them. An object
+    The result has the pixels of one object per entry, at most `MAXIMUM_OBJECTS` of them. An object
     keeps its place in the list throughout the episode; the first is the target. An object out of sight has no pixels.
     """
 
@@ -24,8 +24,8 @@ class Segmenter(Protocol):
         """Begin an episode.
 
         Args:
-            target: row and column of a pixel on the target, as a person confirms it once; None if it cannot be
-                observed, which leaves the first place empty.
+            target: row and column of a pixel on the target, which a person confirms once; None if the target is
+                hidden, which leaves the first entry empty.
         """
         ...
 

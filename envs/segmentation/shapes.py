@@ -1,4 +1,4 @@
-"""What an object looked like from above when it stood alone, to be laid over later maps."""
+"""Shapes of objects from above, taken when they stood alone, to place on later maps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from envs.segmentation.regions import AROUND
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a shape's middle lies on a map (row, column), in cells, and how far the shape is turned, radians."""
+    """The position of a shape's middle on a map (row, column), in cells, and its rotation, radians."""
 
     row: float
     column: float
@@ -23,11 +23,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class Shape:
-    """Heights of an object's cells, and where it was last.
+    """Heights of an object's cells, and its last pose.
 
     Attributes:
-        patch: [h, w] metres above the table; 0 where the object is not. middle: (row, column) in the patch of the
-            cell that `pose` speaks of. pose: when the object was observed last.
+        patch: [h, w] metres above the table; 0 outside of the object. middle: (row, column) in the patch of the
+            cell at `pose`. pose: the last observed one.
     """
 
     patch: NDArray[np.float32]
@@ -40,7 +40,7 @@ class Shape:
         return int((self.patch > 0.0).sum())
 
     def shifted(self, rows: int, columns: int) -> Shape:
-        """The same shape at the same place of a map that begins elsewhere."""
+        """The same shape on a map with another origin."""
         return replace(self, pose=replace(self.pose, row=self.pose.row + rows, column=self.pose.column + columns))
 
     def laid(self, pose: Pose) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
@@ -65,7 +65,7 @@ def shape_of(region: Mask, heights: NDArray[np.float32]) -> Shape:
     rows, columns = np.nonzero(region)
     first = int(rows.min()), int(columns.min())
     box = slice(first[0], int(rows.max()) + 1), slice(first[1], int(columns.max()) + 1)
-    # The cell nearest to the mean lies on the object, however bent that is.
+    # The cell nearest to the mean lies on the object, even if that is bent.
     middle = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
     row, column = int(rows[middle]), int(columns[middle])
     closed = ndimage.binary_closing(np.pad(region[box], 1), AROUND)[1:-1, 1:-1]

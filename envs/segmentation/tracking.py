@@ -1,7 +1,7 @@
-"""Knowing objects again from one height map to the next.
+"""Tracking of objects from one height map to the next.
 
-Whatever still stands where it stood is the same object. What is left over on the map is matched with the objects that
-no longer stand where they did. What touches nothing else is learnt anew, so that its shape is known when it does.
+An unchanged region is the same object. The remaining regions are matched with the objects that moved. An object that
+touches nothing gets a new shape, for later images in which it is in contact.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from envs.segmentation.regions import AROUND, MINIMUM_AREA, box_around, nearest_
 from envs.segmentation.shapes import Shape, shape_of
 
 STILL = 0.85  # of an object's cells must show its former height if it has not moved
-CORE = 0.25  # of an object's cells must be left without its edge, if its edge is not to be looked at
+CORE = 0.25  # of an object's cells, least interior for a comparison without its edge
 INVADED = 0.3  # at most, of the free cells around an object may be taken by others if it has not moved
-INVADED_CELLS = 3  # how wide around it
+INVADED_CELLS = 3  # cells around an object, width of that test
 SAME_HEIGHT = 0.008  # metres
-TOUCHING = 3  # cells, at most, between objects that are explained together
-ALONE = 2  # cells, at least, around an object whose shape is learnt
+TOUCHING = 3  # cells, at most, between objects to register jointly
+ALONE = 2  # free cells, at least, around an object whose shape is stored
 
 
 @dataclass(frozen=True)
 class Track:
-    """What an object looked like when it was last observed.
+    """The last observation of an object.
 
     Attributes:
         region: [I, J] its cells. heights: [I, J] the map of that time.
-        shape: as it stood alone for the last time, where it was last.
+        shape: from when it last stood alone, at its last pose.
     """
 
     region: Mask
@@ -47,7 +47,7 @@ def begin_track(region: Mask, heights: HeightMap) -> Track:
 
 
 def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Track | None]:
-    """Each track as the new map shows it; None for what is not observed, or has never been."""
+    """Update each track with the new map; None for objects that are hidden, or were never observed."""
     known = {number: track for number, track in enumerate(tracks) if track is not None}
     standing = {
         number: Match(track.region & heights.occupied, track.shape)
@@ -70,8 +70,8 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Tr
 
 
 def _pieces(taken: Mask, heights: HeightMap) -> list[Mask]:
-    """What stands on the map, large enough to be an object, beside the cells `taken` by what stands still."""
-    # Noise makes outlines flicker: a thin seam around what stands still belongs to it.
+    """Regions of the map large enough for an object, outside of the cells `taken` by unmoved objects."""
+    # Noise makes outlines flicker: a thin seam around an unmoved object belongs to it.
     seams = ndimage.binary_dilation(taken, AROUND)
     free = ndimage.binary_closing(heights.occupied & ~seams, AROUND) & ~seams
     labels, count = ndimage.label(free, AROUND)
@@ -80,7 +80,7 @@ def _pieces(taken: Mask, heights: HeightMap) -> list[Mask]:
 
 
 def _with_seams(regions: dict[int, Mask], heights: HeightMap) -> dict[int, Mask]:
-    """The same regions with the seams and specks that touch them, without those that are empty."""
+    """The same regions with the seams and specks that touch them, without empty ones."""
     if not regions:
         return {}
     masks = list(regions.values())
@@ -110,7 +110,7 @@ def _stands_still(track: Track, heights: NDArray[np.float32]) -> bool:
     measured = former > 0.0
     core = core if (core & measured).sum() >= CORE * (region & measured).sum() else region
     before, now = former[core], latest[core]
-    # A cell without a measurement now and then says nothing.
+    # Single cells without a measurement do not count.
     same = (np.abs(before - now) < SAME_HEIGHT).sum() >= STILL * (before > 0.0).sum()
     around = ndimage.binary_dilation(region, AROUND, iterations=INVADED_CELLS) & (former == 0.0)
     around &= ~ndimage.binary_dilation(region, AROUND)

@@ -1,4 +1,4 @@
-"""Depth cameras to choose from, by name."""
+"""Depth cameras by name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ CAMERAS: dict[str, SensorMaker] = {"ideal": IdealSensor, "kinect2": Kinect2}
 
 
 def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:
-    """The sensor of a name; a camera's geometry alone makes one without errors; a sensor is taken as it is.
+    """The sensor of that name, an ideal one for a camera's geometry, or the given sensor.
 
     Raises:
         ValueError: unknown name.

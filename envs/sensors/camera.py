@@ -1,7 +1,7 @@
 """A depth camera's geometry: from pixels to points in the robot's base frame, and back, for any pose.
 
 Pinhole model without lens distortion. Source: the published implementation (Kinect2, 512 by 424 pixels); here half of
-each side by default, which shows a 57 mm cube with about a hundred pixels.
+each side by default, with about a hundred pixels for a 57 mm cube.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class Camera:
 
     Attributes:
         width, height: pixels. position: (x, y, z) metres.
-        rotation: how the camera is turned away from looking straight down, a rotation vector in the base frame,
-            radians. Not turned, the image's up is +x of the table and its left +y.
-        intrinsics_offset: what is added to the Kinect2's (focal length along a row, along a column, principal
+        rotation: from looking straight down, a rotation vector in the base frame, radians. Without rotation, the
+            image's up is +x of the table and its left +y.
+        intrinsics_offset: added to the Kinect2's (focal length along a row, along a column, principal
             column, principal row), in pixels at a width of 512.
     """
 
@@ -42,7 +42,7 @@ class Camera:
 
     @property
     def focal_length(self) -> float:
-        """Pixels, without the offsets; the field of view is the Kinect2's whatever the resolution."""
+        """Pixels, without the offsets; the field of view is the Kinect2's at every resolution."""
         return KINECT2_FOCAL_LENGTH * self.width / KINECT2_WIDTH
 
     @property
@@ -64,7 +64,7 @@ class Camera:
         return replace(self, width=width, height=height)
 
     def rays(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Where pixels look, in the image's axes: [P, 3] (right, down, 1), metres at a distance of one metre.
+        """Rays of pixels, in the image's axes: [P, 3] (right, down, 1), metres at a distance of one metre.
 
         Args:
             rows, columns: [P] pixel indices.
@@ -77,7 +77,7 @@ class Camera:
     def points(
         self, depth: NDArray[np.floating], rows: NDArray[np.intp], columns: NDArray[np.intp]
     ) -> NDArray[np.float64]:
-        """Points in the robot's base frame behind chosen pixels.
+        """Points in the robot's base frame at chosen pixels.
 
         Args:
             depth: [height, width] metres along the optical axis. rows, columns: [P] pixel indices.
@@ -101,7 +101,7 @@ class Camera:
 
 
 def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Sample `count` of the points [P, 3], without replacement where there are enough.
+    """Sample `count` of the points [P, 3], without replacement if there are enough.
 
     Raises:
         ValueError: there is no point to sample from.

@@ -1,4 +1,4 @@
-"""A Kinect v2 above the table: never quite where it was meant to be, noisy, and blind at edges.
+"""A Kinect v2 above the table, with noise, missing pixels and errors of its pose.
 
 Noise along and across the rays: Fankhauser, Bloesch, Rodriguez, Kaestner, Hutter and Siegwart, "Kinect v2 for mobile
 robot navigation: evaluation and modeling", ICAR 2015. That a time-of-flight camera mixes foreground and background at
@@ -26,7 +26,7 @@ RESOLUTION = 0.001  # metres; depth comes as whole millimetres
 EDGE_JUMP = 0.015  # metres between neighbouring pixels that count as an edge
 EDGE_LOSS, EDGE_MIXING = 0.5, 0.25  # shares of an edge's pixels without a measurement, and with a mixed one
 GRAZING = np.radians(78.0)  # angle between ray and surface's normal from which nothing comes back
-NOTHING = 10.0  # metres; beyond the range: stands for where the view meets neither table nor object
+NOTHING = 10.0  # metres; beyond the range: depth of rays that meet neither table nor object
 LOSS = 0.001  # share of all pixels without a measurement
 
 Image = NDArray[np.float32]
@@ -34,7 +34,7 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Perturbation:
-    """How far a camera may be from a given one: bounds of uniform distributions, either way.
+    """Uniform perturbation of a camera: largest deviations, either way.
 
     intrinsics: pixels, on both focal lengths and the principal point. translation: metres, on each axis.
     rotation: radians, about each axis.
@@ -68,11 +68,10 @@ class Kinect2:
     """The Kinect v2's depth camera.
 
     Attributes:
-        nominal: where it was meant to be mounted.
-        viewpoint: how far it stands from there in an episode. The program knows of it, as in the published
-            implementation: calibration finds it.
-        calibration: what calibration leaves undiscovered: how far the camera stands from where the program
-            believes it to stand.
+        nominal: the nominal pose.
+        viewpoint: its perturbation in an episode. The program knows it, as in the published implementation:
+            calibration finds it.
+        calibration: the remaining error of the calibration: the difference of the true pose from the assumed one.
     """
 
     nominal: Camera = NOMINAL
@@ -84,7 +83,7 @@ class Kinect2:
         self._generator = generator
         self.actual = self.viewpoint.sample(self.nominal, generator)
         self.believed = self.calibration.sample(self.actual, generator)
-        # The table neither moves nor hides behind anything that is not rendered, so that one image serves an episode.
+        # The table does not move, so one image of it serves an episode.
         self._table = _table_depth(self.actual)
         self._table_noise = axial_noise(self._table, _table_incidence(self.actual))
 
@@ -96,7 +95,7 @@ class Kinect2:
         return DepthImage(self._measure(depth, drawn), self.believed), np.where(drawn, rendering.bodies, -1)
 
     def _measure(self, depth: Image, objects: NDArray[np.bool_]) -> Image:
-        """What the sensor returns for a true depth image; `objects` tells where more than the table is seen."""
+        """What the sensor returns for a true depth image; `objects` masks the pixels of objects."""
         generator, camera = self._generator, self.actual
         noise = generator.standard_normal(depth.shape, dtype=np.float32)
         measured = depth + noise * self._table_noise
@@ -113,9 +112,9 @@ class Kinect2:
             fate = generator.random(len(rows), dtype=np.float32)
             share = generator.random(len(rows), dtype=np.float32)
             mixed = edge & (fate >= EDGE_LOSS) & (fate < EDGE_LOSS + EDGE_MIXING)
-            # What has an edge for its surroundings has no angle of its own: the smaller one is that of its surface.
+            # Beside an edge, the smaller of both angles is that of the surface.
             value = distance + noise[rows, columns] * axial_noise(distance, np.where(edge, 0.0, incidence))
-            # Where there is nothing behind, no light comes back from there and the front is all that is measured.
+            # Without a background, only the front is measured.
             behind = np.where(highest > RANGE[1], lowest, highest)
             value = np.where(mixed, lowest + share * (behind - lowest), value)
             value[(edge & (fate < EDGE_LOSS)) | (~edge & (incidence > GRAZING))] = 0.0

@@ -1,4 +1,4 @@
-"""What a depth sensor is to the scene, and the sensor that makes no error."""
+"""The interface of depth sensors, and a sensor without errors."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from envs.sensors.camera import Camera
 
 @dataclass(frozen=True)
 class DepthImage:
-    """All that a program gets from a depth camera, in the simulator as on a real robot.
+    """The image of a depth camera, simulated or real.
 
     Attributes:
         depth: [height, width] metres along the optical axis; 0 where there is no measurement.
-        camera: where the program believes the camera to be.
+        camera: the assumed camera.
     """
 
     depth: NDArray[np.floating]
@@ -27,7 +27,7 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a camera without any error would see.
+    """The image of a camera without errors.
 
     Attributes:
         depth: [height, width] metres along the optical axis.
@@ -44,16 +44,16 @@ class Renderer(Protocol):
     """A renderer: `envs.physics.PhysicsWorld.render`."""
 
     def __call__(self, camera: Camera, *, table: bool = True) -> Rendering:
-        """What `camera` sees, with or without the table."""
+        """Render the view of `camera`, with or without the table."""
         ...
 
 
 class DepthSensor(Protocol):
-    """A depth camera as mounted: it may stand a little elsewhere in every episode, and it may err."""
+    """A mounted depth camera; its pose may vary between episodes, and it may have noise."""
 
     @property
     def nominal(self) -> Camera:
-        """Where the camera was meant to be mounted; pictures for people are taken from there."""
+        """The nominal camera, which takes the pictures for people."""
         ...
 
     def reset(self, generator: np.random.Generator) -> None:
@@ -61,12 +61,12 @@ class DepthSensor(Protocol):
         ...
 
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
-        """Take an image; beside it the simulator's body numbers [height, width], which no sensor has."""
+        """Take an image; also returns the simulator's body numbers [height, width], which no real sensor has."""
         ...
 
 
 class IdealSensor:
-    """A camera that stands where it should and measures without any error.
+    """A camera at its nominal pose, without errors.
 
     Args:
         camera: its pose and resolution.

@@ -28,7 +28,7 @@ class Clearing(Task):
     region: TileSet
 
     def check(self) -> None:
-        """The target starts in the region, or an episode might have ended before it began."""
+        """The target starts in the region, or an episode could end before it begins."""
         check_inside(self.target_start, self.region, "target_start tile {tile} is outside the region to clear")
 
     def success(self, step: Step) -> Tensor:
@@ -36,6 +36,6 @@ class Clearing(Task):
         return step.all_within(self.region.signed_distance)
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
-        """Virtual goals lie at the table's edges: minus the sum, over objects in the region, of the way to one."""
+        """Virtual goals lie at the table's edges: minus the sum, over objects in the region, of the distance to one."""
         remaining = self.region.contains(positions) & mask
         return -torch.where(remaining, table_distance(positions), 0.0).sum(dim=-1)

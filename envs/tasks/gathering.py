@@ -1,4 +1,4 @@
-"""Gathering: all objects have to come together in a region. Not in the paper."""
+"""Gathering: all objects have to be in a region. Not in the paper."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from envs.tasks.tiles import TileSet
 
 @dataclass(frozen=True, kw_only=True)
 class Gathering(Task):
-    """Push every object into the region. Nothing but the table's edge is forbidden.
+    """Push every object into the region. Only falls off the table are forbidden.
 
     A margin makes the region smaller for planners.
 

@@ -51,8 +51,8 @@ class Insertion(Task):
 
         "A slot is placed randomly along one of the sides of the table, surrounded by restricted area" (paper, appendix
         "Task Details"). The wall is two tiles deep and as long as its side, the slot leads through its inner half, and
-        objects start as in the fixed layouts of that side. The side at the robot is left out: no push could start
-        behind an object two tiles away from it, which lies at the end of the reach.
+        objects start as in the fixed layouts of that side. The side at the robot is excluded: no push could start
+        behind an object two tiles away from it, at the end of the workspace.
         """
         short = [_slot_in_short_side(place, mirrored) for mirrored in (False, True) for place in range(1, _ROWS - 1)]
         return (*short, *(_slot_in_far_side(place) for place in range(1, _COLUMNS - 2)))

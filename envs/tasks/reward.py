@@ -21,7 +21,7 @@ REWARD_NAMES = ("dense", "sparse")
 
 
 class Outcome(NamedTuple):
-    """What one step of a task came to; every tensor is [...].
+    """The outcome of one step of a task; every tensor is [...].
 
     Attributes:
         reward: the sum of the terms. terms: by name, see `Task.terms`.
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
         return self.violation | self.fall
 
     def step(self, index: int) -> Outcome:
-        """Of outcomes of several steps, `[..., T]`, one: `[...]`."""
+        """One of several outcomes: `[..., T]` -> `[...]`."""
         reward, success, violation, fall = (
             field[..., index] for field in (self.reward, self.success, self.violation, self.fall)
         )
@@ -52,9 +52,9 @@ class TaskReward:
 
     Args:
         task: in its layout. reward: dense or sparse.
-        margin: metres by which to be stricter than the task itself, for planners, whose predictions err: forbidden
-            places, and what must be left, grow; what must be kept within shrinks. An object that starts within the
-            margin may stay there, but come no closer to what is forbidden.
+        margin: safety margin in metres for planners, whose predictions err: forbidden regions, and regions to clear,
+            grow; regions to stay within shrink. An object that starts within the margin may stay there, but must not
+            come closer.
 
     Raises:
         ValueError: unknown kind of reward, or a negative margin.
@@ -68,18 +68,18 @@ class TaskReward:
         self.task, self.dense, self.margin = task, reward == "dense", margin
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
-        """Judge one step: [...].
+        """Evaluate one step: [...].
 
         Args:
             previous, centers: [..., M, 3] metres before and after the step; object 0 is the target.
             mask: [..., M] bool, True for real objects.
-            fallen: whether an object is known to have left the table, wherever it was seen last.
+            fallen: whether an object has left the table according to the simulator.
         """
         states = torch.stack(torch.broadcast_tensors(previous, centers), -3)
         return self._judge(states, mask, fallen).step(0)
 
     def along(self, states: Tensor, mask: Tensor) -> Outcome:
-        """Judge all T steps of paths as calls for one after another would, faster: [..., T].
+        """Evaluate all T steps of paths, equal to one call per step, but faster: [..., T].
 
         Args:
             states: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target.

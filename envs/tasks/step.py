@@ -1,4 +1,4 @@
-"""Steps of an episode, real or predicted, as a task sees them: where objects were and where they are.
+"""Steps of an episode, real or predicted: positions of objects before and after.
 
 Tensors may have any leading dimensions `[...]`.
 """
@@ -19,12 +19,12 @@ Depth = Callable[[Tensor], Tensor]
 class Step(NamedTuple):
     """Planar centres of objects in T + 1 successive states, with a push from each to the next; object 0 is the target.
 
-    What a task says of a step it says of all T: [..., T]. The environment judges T = 1 step at a time, planners whole
-    segments, so that no state is looked at twice.
+    A task evaluates all T steps at once: [..., T]. The environment evaluates T = 1 step at a time, planners whole
+    segments, so that no state is evaluated twice.
 
     Attributes:
         states: [..., T + 1, M, 2] metres. mask: [..., 1, M] bool, True for real objects.
-        margin: metres by which to be stricter than the task itself, for planners; else 0.
+        margin: safety margin in metres, for planners; else 0.
     """
 
     states: Tensor
@@ -33,17 +33,17 @@ class Step(NamedTuple):
 
     @property
     def before(self) -> Tensor:
-        """Where objects are before the push: [..., T, M, 2] metres."""
+        """Positions before the push: [..., T, M, 2] metres."""
         return self.states[..., :-1, :, :]
 
     @property
     def after(self) -> Tensor:
-        """Where objects are after the push: [..., T, M, 2] metres."""
+        """Positions after the push: [..., T, M, 2] metres."""
         return self.states[..., 1:, :, :]
 
     @property
     def target(self) -> Tensor:
-        """Where the target is after the push: [..., T, 2] metres."""
+        """Position of the target after the push: [..., T, 2] metres."""
         return self.after[..., 0, :]
 
     def target_enters(self, depth: Depth) -> Tensor:

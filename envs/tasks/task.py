@@ -1,7 +1,7 @@
-"""What a task is: the tiles it is played on, when it succeeds and fails, and the terms of its reward.
+"""Base class of tasks: their tiles, success, violations, and the terms of their reward.
 
-A task is one class in one file of this folder; `envs/layouts/` holds the layouts that it is played in. The same
-functions judge the steps of the environment and the predicted steps of planners.
+A task is one class in one file of this folder; `envs/layouts/` has its layouts. The same functions evaluate the steps
+of the environment and the predicted steps of planners.
 
 Source: paper, section 4.1 and appendix "Task Details".
 """
@@ -27,7 +27,7 @@ TIME_REWARD = -1.0
 
 
 class Marking(NamedTuple):
-    """How pictures show the tiles of a task's `field`: name in legends, colour, and how opaque the fill is."""
+    """How pictures show the tiles of a task's `field`: name in legends, colour, and opacity of the fill."""
 
     field: str
     name: str
@@ -46,9 +46,9 @@ class Task(ABC):
     any tiles `(i, j)` in Python; a field without a default needs at least one tile. Other fields are options.
 
     Attributes:
-        name: by default the name of the class in small letters.
+        name: by default the name of the class in lower case.
         markings: how pictures show the layout; later ones lie on top of earlier ones.
-        about: whose subgoals pictures show: the `target` (object 0), or `all` objects where the goal is about all.
+        about: the objects whose subgoals pictures show: the `target` (object 0), or `all`.
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
         target_start, obstacle_start: tiles on which objects start.
 
@@ -80,25 +80,25 @@ class Task(ABC):
             object.__setattr__(self, name, TileSet(tiles))
         self.check()
 
-    # What a task says.
+    # Methods that a task defines.
 
     def check(self) -> None:  # noqa: B027 (a task may have nothing to check)
-        """Raise ValueError where tiles contradict one another; the message need not name the layout's file."""
+        """Raise ValueError if tiles contradict one another; the message need not name the layout's file."""
 
     @abstractmethod
     def success(self, step: Step) -> Tensor:
         """Whether the goal is reached: [...] bool."""
 
     def violation(self, step: Step) -> Tensor:
-        """Whether a rule is broken, which ends the episode: [...] bool; never, unless a task says so.
+        """Whether a rule is broken, which ends the episode: [...] bool; by default never.
 
-        That no object may fall off the table is a rule of every task, checked elsewhere (`TaskReward`).
+        `TaskReward` checks falls off the table for every task.
         """
         return torch.zeros_like(step.mask[..., 0])
 
     @abstractmethod
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
-        """Minus the metres still to go: [...]; its increase over a step is the dense reward's `progress`.
+        """Minus the remaining distance in metres: [...]; its increase over a step is the dense reward's `progress`.
 
         Args:
             positions: [..., M, 2] metres. mask: [..., M] bool, True for real objects.
@@ -122,31 +122,31 @@ class Task(ABC):
 
     @classmethod
     def random_layouts(cls) -> tuple[Task, ...]:
-        """What `layout=random` samples from; if empty, from the layouts in files."""
+        """The tasks that `layout=random` samples; if empty, those of the layouts in files."""
         return ()
 
-    # What follows from that.
+    # Derived from them.
 
     @classmethod
     def layout_keys(cls) -> dict[str, bool]:
-        """The fields, the task's own before where objects start, and whether a layout must have them."""
+        """The fields of a layout, the task's own first, and whether each is required."""
         starts = [field.name for field in fields(Task)]
         ordered = sorted(fields(cls), key=lambda field: field.name in starts)
         return {field.name: field.default is MISSING and field.default_factory is MISSING for field in ordered}
 
     def tile_groups(self) -> list[TileGroup]:
-        """The layout as pictures show it."""
+        """The layout for pictures."""
         groups = [TileGroup(one.name, one.color, one.opacity, getattr(self, one.field).tiles) for one in self.markings]
         return [group for group in groups if group.tiles]
 
 
 def check_apart(one: Iterable[Tile], other: Iterable[Tile], problem: str) -> None:
-    """Raise ValueError if two groups share a tile, which takes the place of `{tile}` in `problem`."""
+    """Raise ValueError if two groups share a tile, which replaces `{tile}` in `problem`."""
     if shared := set(one) & set(other):
         raise ValueError(problem.format(tile=list(min(shared))))
 
 
 def check_inside(inner: Iterable[Tile], outer: Iterable[Tile], problem: str) -> None:
-    """Raise ValueError if a tile of `inner` is not in `outer`; it takes the place of `{tile}` in `problem`."""
+    """Raise ValueError if a tile of `inner` is not in `outer`; it replaces `{tile}` in `problem`."""
     if outside := set(inner) - set(outer):
         raise ValueError(problem.format(tile=list(min(outside))))

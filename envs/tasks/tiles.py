@@ -12,10 +12,10 @@ from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_COUNT, TILE_SIDE, Tile, t
 
 
 class TileSet:
-    """A union of tiles, to which points have an exact signed distance. Equal if the tiles are, in their order.
+    """A union of tiles with an exact signed distance. Equal if the tiles and their order are.
 
     Args:
-        tiles: neighbours melt into one shape. None are allowed, but nothing has a distance to none.
+        tiles: may be empty, but then no distance is defined.
     """
 
     def __init__(self, tiles: Iterable[Tile]) -> None:
@@ -141,7 +141,7 @@ def table_distance(points: Tensor) -> Tensor:
 
 
 def parse_tiles(value: Any, name: str) -> tuple[Tile, ...]:
-    """Check a list of tiles as Python or YAML has it.
+    """Check a list of tiles from Python or YAML.
 
     Raises:
         ValueError: it is no list, or a tile is malformed, listed twice or off the table; `name` says which list it is.

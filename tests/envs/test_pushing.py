@@ -318,7 +318,7 @@ def test_a_layout_may_be_a_number_or_a_file_or_belong_to_a_task_that_has_been_bu
         ({"layout": "nowhere.yaml"}, r"^layout nowhere.yaml cannot be read"),
         ({"tiles": {"goal": [[9, 9]]}}, r"goal: tile \[9, 9\] is off the table"),
         ({"tiles": {"bridge": [[1, 1]]}}, r"unknown key 'bridge'"),
-        ({"task": BRIDGE, "tiles": {"goal": [[2, 3]]}}, r"^a task that has been built has its layout"),
+        ({"task": BRIDGE, "tiles": {"goal": [[2, 3]]}}, r"^a task object has its own layout"),
     ],
 )
 def test_a_bad_argument_gets_its_one_line(options: dict, message: str) -> None:
