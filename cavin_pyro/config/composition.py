@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import itertools
 import re
 from collections.abc import Iterator, Sequence
@@ -104,8 +105,7 @@ def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
 def preset_defaults(name: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
     """The configuration with the presets that the overrides choose and nothing else, and the usual presets by group."""
     with _hydra():
-        usual = hydra.compose(name, return_hydra_config=True).hydra.runtime.choices
-        return _defaults(name, overrides), {str(group): str(choice) for group, choice in usual.items()}
+        return _defaults(name, overrides), _usual_presets(name)
 
 
 @contextmanager
@@ -121,9 +121,16 @@ def _hydra() -> Iterator[None]:
 
 def _defaults(name: str, overrides: Sequence[str]) -> DictConfig:
     """The configuration with the presets that the user chose and no other overrides."""
-    groups = hydra.compose(name, return_hydra_config=True).hydra.runtime.choices
+    groups = _usual_presets(name)
     chosen = [word for word in overrides if word.partition("=")[0] in groups or word.startswith("hydra.searchpath")]
     return hydra.compose(name, overrides=chosen)
+
+
+@functools.cache  # a composition takes a tenth of a second
+def _usual_presets(name: str) -> dict[str, str]:
+    """The preset of each group that a command takes when the user names none."""
+    choices = hydra.compose(name, return_hydra_config=True).hydra.runtime.choices
+    return {str(group): str(choice) for group, choice in choices.items()}
 
 
 def _check_additions(name: str, overrides: list[str]) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,29 +33,6 @@ from models.networks.pointnet import PointNet
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 PUSHES = CollectionConfig(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
-
-# Each case in turn, in one process: a start costs seconds, the case itself milliseconds.
-RUN_IN_TURN = """
-import contextlib, gc, importlib, io, json, os, sys, traceback
-
-gc.disable()  # a third of the time, for a process that ends soon
-answers = []
-for case in json.load(sys.stdin):
-    output, errors, status = io.StringIO(), io.StringIO(), 0
-    os.makedirs(case["folder"], exist_ok=True)
-    os.chdir(case["folder"])
-    sys.argv = [case["command"], *case["overrides"]]
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
-        try:
-            importlib.import_module("cavin_pyro." + case["command"]).main()
-        except SystemExit as stop:
-            status = stop.code
-        except BaseException:
-            status = 1
-            traceback.print_exc()
-    answers.append({"status": status, "output": output.getvalue(), "errors": errors.getvalue()})
-print(json.dumps(answers))
-"""
 
 
 @dataclass(frozen=True)
@@ -85,11 +65,17 @@ def start_command(command: str, *overrides: str, folder: Path, quiet: bool = Fal
     return subprocess.Popen(line, cwd=folder, env=ENVIRONMENT, stdout=pipe, stderr=pipe, text=True)
 
 
-def run_command(command: str, *overrides: str, folder: Path) -> Answer:
-    """Run a command as a user does, from the folder."""
+def run_as_users(command: str, *overrides: str, folder: Path) -> Answer:
+    """Run a command with an interpreter of its own, from the folder, and with the limits of this process."""
     with start_command(command, *overrides, folder=folder) as process:
         output, errors = process.communicate(timeout=300)
     return Answer(process.returncode, output, errors)
+
+
+def run_command(command: str, *overrides: str, folder: Path) -> Answer:
+    """Run a command in a process of its own, from the folder, without waiting for its imports (command_server.py)."""
+    status, output, errors = _forked({"command": command, "overrides": overrides}, folder)
+    return Answer(status, output, errors)
 
 
 def run_in_turn(cases: Mapping[str, Case], folder: Path) -> dict[str, Answer]:
@@ -98,11 +84,34 @@ def run_in_turn(cases: Mapping[str, Case], folder: Path) -> dict[str, Answer]:
         {"command": case.command, "overrides": list(case.overrides), "folder": str(folder / name)}
         for name, case in cases.items()
     ]
-    line = [sys.executable, "-c", RUN_IN_TURN]
-    done = subprocess.run(line, env=ENVIRONMENT, input=json.dumps(jobs), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    answers: list[dict[str, Any]] = json.loads(done.stdout.splitlines()[-1])
+    status, output, errors = _forked({"cases": jobs}, folder)
+    assert status == 0, errors
+    answers: list[dict[str, Any]] = json.loads(output.splitlines()[-1])
     return {name: Answer(**answer) for name, answer in zip(cases, answers, strict=True)}
+
+
+def _forked(job: Mapping[str, Any], folder: Path) -> tuple[int, str, str]:
+    """Exit status, output and errors of a job of the command server."""
+    server = _command_server()
+    assert server.stdin is not None and server.stdout is not None
+    with tempfile.TemporaryDirectory() as kept:
+        output, errors = Path(kept) / "output", Path(kept) / "errors"
+        print(
+            json.dumps({**job, "folder": str(folder), "output": str(output), "errors": str(errors)}), file=server.stdin
+        )
+        server.stdin.flush()
+        status = int(server.stdout.readline())
+        return status, output.read_text(), errors.read_text()
+
+
+@functools.cache
+def _command_server() -> subprocess.Popen[str]:
+    """One for each process of the tests; it ends when that closes its input."""
+    line = [sys.executable, "-m", "tests.cavin_pyro.command_server"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    server = subprocess.Popen(line, cwd=ROOT, env=ENVIRONMENT, text=True, **pipes)
+    atexit.register(server.communicate)
+    return server
 
 
 def small_parts(seed: int = 0) -> dict[str, torch.nn.Module]:
@@ -152,7 +161,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="session")
 def shell() -> SimpleNamespace:
     """Ways to run the commands."""
-    names: list[Callable] = [Case, contents, run_command, run_in_turn, start_command]
+    names: list[Callable] = [Case, contents, run_as_users, run_command, run_in_turn, start_command]
     return SimpleNamespace(**{name.__name__: name for name in names})
 
 

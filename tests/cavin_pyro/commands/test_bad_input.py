@@ -88,7 +88,7 @@ def test_bad_input_leaves_what_it_names_as_it_was(answers: SimpleNamespace) -> N
 @pytest.mark.parametrize("line", ["plan task=juggling", "collect transitions", "evaluate workers=0"])
 def test_bad_input_of_a_user_at_a_terminal(line: str, shell: SimpleNamespace, tmp_path: Path) -> None:
     """The cases above share a process; these are on their own, as users are."""
-    answer = shell.run_command(*line.split(), folder=tmp_path)
+    answer = shell.run_as_users(*line.split(), folder=tmp_path)
     assert answer.status == 2
     assert answer.errors.startswith("error: ")
     assert answer.errors.count("\n") == 1

@@ -115,7 +115,7 @@ def test_a_foreign_package_in_the_folder_from_which_a_command_is_run(
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("raise SystemExit('was run')\n")
-    answer = shell.run_command("collect", "output=out", folder=tmp_path)
+    answer = shell.run_as_users("collect", "output=out", folder=tmp_path)
     assert answer.status == 2
     (line,) = answer.errors.splitlines()
     assert line.startswith("error: the package ")
@@ -162,7 +162,7 @@ def test_a_disk_that_takes_no_more_ends_a_command_in_one_line(
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, limit)  # which the command inherits
     try:
-        answer = shell.run_command(command, *line, "output=out", folder=tmp_path)
+        answer = shell.run_as_users(command, *line, "output=out", folder=tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert answer.status == 2, answer.errors

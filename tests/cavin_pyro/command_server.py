@@ -1,0 +1,88 @@
+"""A process that has imported what commands need and forks one process per command: a start costs seconds otherwise.
+
+Reads jobs, a line of JSON each, and prints the exit status of each. A job has `folder`, `output` and `errors` (files),
+and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder, or
+`cases`, which run in turn in one process, each from its own `folder`, with their answers as JSON in `output`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import io
+import json
+import os
+import runpy
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
+    "cavin_pyro.config.help",
+    "cavin_pyro.criticism.loading",
+    "cavin_pyro.criticism.report",
+    "cavin_pyro.criticism.sections",
+    "cavin_pyro.data.collection",
+    "cavin_pyro.evaluation.comparison",
+    "cavin_pyro.evaluation.evaluation",
+    "cavin_pyro.training.pretraining",
+    "cavin_pyro.training.run",
+    "cavin_pyro.visualization.rendering",
+)
+LIMIT = 300  # seconds per job
+
+
+def main() -> None:
+    for name in IMPORTED:
+        importlib.import_module(name)
+    gc.freeze()  # so that children's collections neither look at all of this nor copy it
+    for line in sys.stdin:
+        child = os.fork()
+        if not child:
+            run(json.loads(line))
+            return
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+def run(job: dict[str, Any]) -> None:
+    signal.alarm(LIMIT)
+    writing = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+    for number, (path, flags) in enumerate(
+        [(os.devnull, os.O_RDONLY), (job["output"], writing), (job["errors"], writing)]
+    ):
+        os.dup2(os.open(path, flags), number)
+    os.chdir(job["folder"])
+    if "cases" in job:
+        sys.path[0] = ""  # the folder of each case
+        print(json.dumps([run_case(**case) for case in job["cases"]]))
+        return
+    sys.path[0] = job["folder"]  # as `python -m` has it
+    sys.argv = [job["command"], *job["overrides"]]
+    runpy.run_module(f"cavin_pyro.{job['command']}", run_name="__main__", alter_sys=True)
+
+
+def run_case(command: str, overrides: Sequence[str], folder: str) -> dict[str, Any]:
+    """Run a command in this process."""
+    gc.disable()  # a third of the time, for a process that ends soon
+    output, errors, status = io.StringIO(), io.StringIO(), 0
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    os.chdir(folder)
+    sys.argv = [command, *overrides]
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        try:
+            importlib.import_module(f"cavin_pyro.{command}").main()
+        except SystemExit as stop:
+            status = stop.code
+        except BaseException:
+            status = 1
+            traceback.print_exc()
+    return {"status": status, "output": output.getvalue(), "errors": errors.getvalue()}
+
+
+if __name__ == "__main__":
+    main()
