@@ -17,7 +17,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main() -> None:
-    """Download, decimate, decompose and verify one kind of assets; goes on where an earlier run stopped."""
+    """Download, decimate, decompose and verify one kind of assets; resumes an interrupted run."""
     guarded(_run)
 
 
@@ -31,11 +31,9 @@ def _run() -> None:
     parser = _Parser(prog="python -m cavin_pyro.assets", description=main.__doc__)
     parser.add_argument("kind", choices=kinds, help="the ten YCB objects of the paper, or the Sawyer arm")
     parser.add_argument(
-        "--to", type=Path, required=True, metavar="DIR", help="folder; the kind gets one of its own in it"
+        "--to", type=Path, required=True, metavar="DIR", help="folder, in which the kind gets its own subfolder"
     )
-    parser.add_argument(
-        "--source", metavar="URL", help="a mirror in place of the publisher's site, same paths below it"
-    )
+    parser.add_argument("--source", metavar="URL", help="a mirror of the publisher's site, with the same paths")
     arguments = parser.parse_args()
     kind = kinds[arguments.kind]
     print(install(kind, arguments.to, site(arguments.source or kind.site)))

@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("check")
 def main(config: DictConfig) -> None:
-    """Check a trained model and its guide on held-out windows, and write a report; resumes what was interrupted."""
+    """Check a trained model and its guide on held-out windows, and write a report; resumes an interrupted run."""
     import pyro
 
     from cavin_pyro.criticism.checks.consistency import check_objects
@@ -28,7 +28,7 @@ def main(config: DictConfig) -> None:
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("output", "sections"))
     write_config(folder, config)
-    # A section of an earlier run counts if it would come out the same today.
+    # A section of an earlier run is reused if a new run would give the same result.
     data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
     fingerprint = " ".join([program_fingerprint(), about["weights"], *data])
     parts = run_sections(names, context, config.sizes, folder, fingerprint)

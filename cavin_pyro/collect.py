@@ -11,9 +11,9 @@ from cavin_pyro.config.application import command
 
 @command("collect")
 def main(config: DictConfig) -> None:
-    """Collect random pushes by the heuristic policy into a dataset folder, and draw what they came to.
+    """Collect random pushes by the heuristic policy into a dataset folder, with a picture of their statistics.
 
-    Resumes what was interrupted.
+    Resumes an interrupted run.
     """
     from cavin_pyro.config.commands.collection import CollectionOptions
     from cavin_pyro.config.errors import UserError

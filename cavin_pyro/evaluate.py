@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("evaluate")
 def main(config: DictConfig) -> None:
-    """Run seeded episodes and report rates with their intervals; resumes what was interrupted."""
+    """Run seeded episodes and report rates with their intervals; resumes an interrupted run."""
     import copy
     from pathlib import Path
 

@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("pretrain")
 def main(config: DictConfig) -> None:
-    """Train PointNet to draw a dataset's clouds again, and write it as a checkpoint."""
+    """Train PointNet to reconstruct a dataset's clouds, and write it as a checkpoint."""
     import numpy as np
     import torch
 

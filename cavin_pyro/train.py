@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("train")
 def main(config: DictConfig) -> None:
-    """Train a model and its guide by stochastic variational inference; resumes what was interrupted."""
+    """Train a model and its guide by stochastic variational inference; resumes an interrupted run."""
     from cavin_pyro.training.run import train
     from cavin_pyro.visualization.training import draw_training
 

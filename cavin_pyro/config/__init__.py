@@ -1,1 +1,1 @@
-"""How a command is told what to do: composition of options, one-line errors, and the parts that they name."""
+"""Options of the commands: declaration, composition, one-line errors, and construction of the parts."""

@@ -1,4 +1,4 @@
-"""What all commands share: Hydra for the options, one line for bad input, exit status 2.
+"""The common frame of all commands: options by Hydra; one line and exit status 2 for bad input.
 
 @command("plan")
 def main(config: DictConfig) -> None: ...
@@ -36,7 +36,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
 
     def decorate(body: Body) -> Callable[[], None]:
         def main() -> None:
-            # Third parties' deprecations are for developers, whose tests turn them into errors.
+            # Hide deprecations of third parties from users; in tests they are errors.
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             if "--version" in sys.argv[1:]:
                 print(f"cavin_pyro {__version__}")
@@ -69,7 +69,7 @@ def guarded(action: Callable[[], T]) -> T:
             2,
         )
     except KeyboardInterrupt:
-        _stop("interrupted; where the command can resume, the same command goes on", 130)
+        _stop("interrupted; rerun the same command to resume, if it can", 130)
 
 
 def _stop(line: str, status: int) -> NoReturn:
@@ -78,7 +78,7 @@ def _stop(line: str, status: int) -> NoReturn:
 
 
 def _help_or_check(name: str, purpose: str) -> bool:
-    """Check the overrides of the command line before Hydra's own application reads them; whether help was all."""
+    """Check the overrides before Hydra's application reads them. Return whether the run ends here."""
     from cavin_pyro.config.composition import check_overrides, presets_by_name, sweeps
 
     sys.argv[1:] = presets_by_name(sys.argv[1:])
@@ -136,7 +136,7 @@ def _run(name: str, body: Body, config: DictConfig) -> None:
 
 
 def check_packages() -> None:
-    """Make sure that the packages with common names are ours.
+    """Check that the packages with common names are ours.
 
     Raises:
         UserError: a foreign package of the same name comes first on the path.

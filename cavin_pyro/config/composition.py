@@ -1,4 +1,4 @@
-"""From a command's name and overrides to its configuration, or to one line that says which override is wrong."""
+"""From a command's name and overrides to its configuration, or to one line about the wrong override."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ register()
 
 
 def compose(name: str, *overrides: str) -> DictConfig:
-    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for those who call the library from Python.
+    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for callers in Python.
 
     Raises:
-        UserError: an override that the command line would refuse.
+        UserError: an invalid override.
     """
     from cavin_pyro.config.output import with_output
 
@@ -57,7 +57,7 @@ def resolved(config: DictConfig) -> DictConfig:
 
 
 def check_overrides(name: str, overrides: list[str], config_dir: str | None = None) -> DictConfig:
-    """Compose, and explain in one line what is wrong.
+    """Compose, and explain a wrong override in one line.
 
     Args:
         config_dir: a folder of further presets.
@@ -134,7 +134,7 @@ def _usual_presets(name: str) -> dict[str, str]:
 
 
 def _check_additions(name: str, overrides: list[str]) -> None:
-    """Refuse `~option`, and `+option` unless it goes to a part, whose class will say whether it knows it."""
+    """Refuse `~option`, and `+option` unless it belongs to a part, whose class checks it later."""
     changes = [one for one in _parsed(overrides) if one.type is not OverrideType.CHANGE]
     if not changes:
         return
@@ -144,7 +144,7 @@ def _check_additions(name: str, overrides: list[str]) -> None:
         if key.startswith("hydra"):
             continue
         if one.type is OverrideType.DEL:
-            raise UserError(f"{key} cannot be taken away: give it a value as {key}=value")
+            raise UserError(f"{key} cannot be removed: give it a value as {key}=value")
         parent: Any = OmegaConf.select(known, key.rpartition(".")[0]) if "." in key else None
         if not (OmegaConf.is_dict(parent) and "_target_" in parent) and OmegaConf.select(known, key) is None:
             raise UserError(_unknown(key, known))

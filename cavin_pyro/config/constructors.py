@@ -1,4 +1,4 @@
-"""What a class says of its own options: names, types and defaults from its signature, meanings from its docstring."""
+"""Options of a class: names, types and defaults from its signature, meanings from its docstring."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONTAINERS = (Sequence, Mapping, list, tuple, dict)
 
 
 def with_defaults(value: Any, group: str = "") -> Any:
-    """A preset in which every part of ours has all its options: those it names, else its constructor's defaults."""
+    """A preset with all options of our parts: those of the preset, else the constructors' defaults."""
     if isinstance(value, list):
         return [with_defaults(entry) for entry in value]
     if not isinstance(value, dict):
@@ -37,7 +37,7 @@ def with_defaults(value: Any, group: str = "") -> Any:
 def constructor_options(target: str) -> dict[str, inspect.Parameter]:
     """The named arguments of a class of ours or the user's by its dotted path, with types for annotations.
 
-    Empty where there is no such class. Arguments that a constructor hands on to its parent's are among them.
+    Empty where there is no such class. They include arguments that a constructor passes on to its parent's.
     """
     try:
         found = get_object(target)
@@ -81,7 +81,7 @@ def part_of(default: Any) -> Any:
         module, name = type(default).__module__, type(default).__name__
         package = module.partition(".")[0]
         if getattr(importlib.import_module(package), name, None) is type(default):
-            module = package  # the shorter path, which users are told
+            module = package  # the shorter path, for users
         return {
             "_target_": f"{module}.{name}",
             **{one.name: part_of(getattr(default, one.name)) for one in fields(default)},
@@ -97,7 +97,7 @@ def check_parts(config: Mapping[str, Any], prefix: str = "") -> None:
     """
     for name, value, one in _declared(config):
         inner = [part for part in get_args(one.annotation) if part is not type(None)] or [one.annotation]
-        # A class says better what its lists and mappings must be.
+        # The class has better messages for its lists and mappings.
         checked = len(inner) == 1 and (inner[0] in PLAIN or is_dataclass(inner[0]))
         optional = value is None and (one.default is None or type(None) in get_args(one.annotation))
         if not checked or optional or (isinstance(value, str) and value.startswith("${")):

@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 
 class UserError(Exception):
-    """What was wrong with the input, where, and what would be right: one line, shown without a traceback."""
+    """Bad input, with its place and the valid choices: one line, shown without a traceback."""
 
 
 @contextmanager
 def user_input() -> Iterator[None]:
-    """Turn a ValueError raised while the user's choices are read into a `UserError`.
+    """Turn a ValueError from reading the user's choices into a `UserError`.
 
     Wrap only the building of parts from configuration, so that a ValueError anywhere else stays a bug with a traceback.
     """

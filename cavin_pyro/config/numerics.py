@@ -1,4 +1,4 @@
-"""How this process computes: what matrix products round to, and where memory goes that is free again."""
+"""Numerics of this process: the precision of matrix products, and the allocator."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def set_matmul_precision(name: str) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Tell the allocator not to give memory back to the system between one tensor and the next.
+    """Make the allocator keep freed memory between tensors, instead of returning it to the system.
 
-    A plan makes and drops thousands of tensors of some hundred kilobytes. Fresh pages for each of them take a third
+    A plan allocates and frees thousands of tensors of some hundred kilobytes. Fresh pages for each of them take a third
     of the time at 8,192 samples. Does nothing where the C library has no such option.
     """
     if sys.platform != "linux":
@@ -33,4 +33,4 @@ def keep_freed_memory() -> None:
         mallopt(MMAP_THRESHOLD, LARGEST_ON_HEAP)
         mallopt(TRIM_THRESHOLD, KEPT)
         mallopt(TOP_PAD, KEPT // 16)
-        mallopt(LARGEST_FAST, 0)  # else every large tensor goes through all small ones that were freed before it
+        mallopt(LARGEST_FAST, 0)  # otherwise every large allocation scans all freed small blocks

@@ -30,17 +30,17 @@ KINDS = {
     dict: "a section",
 }
 T = TypeVar("T")
-MAXIMUM_SEED = 2**32 - 1  # the largest that every generator of random numbers in use takes
+MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
 
 
 @dataclass(frozen=True)
 class About:
-    """What is declared of an option, apart from its type and its default.
+    """The declaration of an option, apart from its type and its default.
 
     Attributes:
         help: one line. unit: of a number. group: the heading under which `--help` lists it.
-        choices: names, or the dotted path of a collection of them, which is imported when they are asked for.
-        minimum, maximum: both allowed. above: a bound that is not allowed itself.
+        choices: names, or the dotted path of a collection of them, which is imported on demand.
+        minimum, maximum: both allowed. above: an exclusive lower bound.
     """
 
     help: str
@@ -71,13 +71,13 @@ def seed_option(help: str = "seed of all random numbers", **about: Any) -> Any:
 
 
 def named(choices: Collection[str] | str) -> Collection[str]:
-    """Choices, or what lies at the dotted path of them."""
+    """Choices, or the collection at their dotted path."""
     return get_object(choices) if isinstance(choices, str) else choices
 
 
 @dataclass(frozen=True)
 class Option:
-    """An option as the command line knows it: `name` is dotted, `type` its annotation."""
+    """An option of the command line: `name` is dotted, `type` its annotation."""
 
     name: str
     type: Any
@@ -86,7 +86,7 @@ class Option:
 
 
 def options(schema: type, prefix: str = "") -> Iterator[Option]:
-    """The options of a configuration, those of its sections among them, in the order of their declaration."""
+    """The options of a configuration, those of its sections among them, in order of declaration."""
     hints = get_type_hints(schema)
     for one in fields(schema):
         about = one.metadata.get("about")
@@ -102,13 +102,13 @@ def options(schema: type, prefix: str = "") -> Iterator[Option]:
 
 
 def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> None:
-    """Check the ranges and choices of a composed configuration, whose types are right.
+    """Check the ranges and choices of a composed configuration with valid types.
 
     Args:
-        prefix: what error lines put before an option's name.
+        prefix: of option names in error lines.
 
     Raises:
-        UserError: an option out of its range; what would be right is said.
+        UserError: an option out of its range, which the message states.
     """
     for one in options(schema):
         value: Any = config
@@ -118,7 +118,7 @@ def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> 
 
 
 def check_value(name: str, value: Any, about: About, *, whole: bool = False) -> None:
-    """Check one value; None, `???` and interpolations are left to those who read them.
+    """Check one value; None, `???` and interpolations are not checked.
 
     Raises:
         UserError: it is out of its range, or none of the choices.
@@ -137,7 +137,7 @@ def check_value(name: str, value: Any, about: About, *, whole: bool = False) -> 
 
 
 def shown(value: Any) -> Any:
-    """A value as a user writes it."""
+    """A value in the user's notation."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     return f"{value:g}" if isinstance(value, float) else value
@@ -155,7 +155,7 @@ def _range(about: About, whole: bool) -> str:
 
 
 def kind(annotation: Any) -> str | None:
-    """What a type is called in an error line: "a whole number"; None if there is no word for it."""
+    """The name of a type in an error line: "a whole number"; None if it has none."""
     inner = [one for one in get_args(annotation) if one is not type(None)]
     if get_origin(annotation) is Union or type(annotation).__name__ == "UnionType":
         kinds = [kind(one) for one in inner]
@@ -182,7 +182,7 @@ def types(schema: type, prefix: str = "") -> dict[str, Any]:
 
 
 def configured(schema: type[T], values: Mapping[str, Any], section: str) -> T:
-    """A configuration from a section of a command's or of a stored one, in which options may lack or be unknown.
+    """A configuration from a section of a command's or of a stored one, in which options may be missing or unknown.
 
     Raises:
         UserError: a value of another type, or out of its range.

@@ -1,4 +1,4 @@
-"""The folder for a run's results where the user names none: another for every other configuration."""
+"""The default folder for a run's results: different configurations have different folders."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import preset_defaults
 
-# The folder of a run without overrides, and the options that never decide which folder it is: runs that differ in
-# these only are one run, shown or continued otherwise.
+# The folder of a run without overrides, and the options that never decide which folder it is: runs that differ only in
+# these are the same run.
 FOLDERS = {
     "collect": ("data/pushes", ("transitions", "workers", "repair")),
     "pretrain": ("runs/pretrain", ()),
@@ -42,7 +42,7 @@ def with_output(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
 
 
 def run_name(name: str, config: DictConfig, hydra_config: Any) -> str:
-    """What tells a run from others of its command: presets by name, other differences by a hash of them."""
+    """A name that identifies a run of a command: presets by name, other differences by their hash."""
     pattern, irrelevant = FOLDERS[name]
     defaults, usual = preset_defaults(name, list(hydra_config.overrides.task))
     choices = {str(group): choice for group, choice in hydra_config.runtime.choices.items()}

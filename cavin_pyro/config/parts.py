@@ -40,7 +40,7 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
 
 
 def check_sizes(section: str, config: Config) -> None:
-    """Make sure that every whole number of a section, apart from weights, is at least 1.
+    """Check that every whole number of a section, apart from weights, is at least 1.
 
     Raises:
         UserError: one is not.
@@ -57,7 +57,7 @@ def build_model(config: Config) -> Model:
     that its section has: `model.prior` where that names a class, else the section `prior`.
 
     Raises:
-        UserError: a part that cannot be built, or a section that lacks a number.
+        UserError: a part that cannot be built, or a section without a required number.
     """
     sizes = dict(config["model"])
     own_prior = sizes.pop("prior", None) or {}
@@ -87,10 +87,10 @@ def build_model(config: Config) -> Model:
 
 
 def build_guide(config: Config, model: Model) -> Guide:
-    """The guide program that goes with a model, from the section `guide`.
+    """The guide program of a model, from the section `guide`.
 
     Raises:
-        UserError: a guide that cannot be built, or does not fit the model; the guides that do are named.
+        UserError: a guide that cannot be built, or is incompatible; the message lists the compatible ones.
     """
     check_sizes("guide", config["guide"])
     target, kind = config["guide"].get("_target_"), class_of(config["guide"])
@@ -106,11 +106,11 @@ def build_guide(config: Config, model: Model) -> Guide:
 
 
 def class_of(config: Config) -> Any:
-    """The class that a part names, None if there is no such class."""
+    """The class of a part, None if there is no such class."""
     try:
         return hydra.utils.get_class(config["_target_"])
     except (KeyError, HydraException, ImportError, ValueError):
-        return None  # `construct` says it better
+        return None  # `construct` has a better message
 
 
 def _guides_for(model_name: str) -> list[str]:

@@ -1,8 +1,7 @@
-"""Where Hydra finds the commands' options, and presets with the defaults of the constructors that they name.
+"""Registration of the commands' options with Hydra, and of presets with the defaults of their classes.
 
-A preset says `_target_`, the class, and what differs from the class's own defaults. Hydra gets both, so that every
-option of a part can be changed from the command line and stands in a run's `config.yaml`, and no default is written
-twice.
+A preset has `_target_`, the class, and its differences from the class's defaults. Hydra receives both, so every option
+of a part can be overridden on the command line and is in a run's `config.yaml`, and no default is written twice.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class PresetPath(SearchPathPlugin):
 
 
 def register() -> None:
-    """Tell Hydra of the commands' options and of our presets."""
+    """Register the commands' options and our presets with Hydra."""
     Plugins.instance().register(PresetSource)
     Plugins.instance().register(PresetPath)
     for name, schema in COMMANDS.items():

@@ -20,7 +20,7 @@ from planning import PushBox
 
 
 def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
-    """The class that the option `task` names, and what replaces fields of its layout: `task.*` and `tiles.*`.
+    """The class that the option `task` names, and replacements of fields of its layout: `task.*` and `tiles.*`.
 
     Raises:
         UserError: there is no such class, or it is no task.
@@ -41,10 +41,10 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
 
 
 def check_world(env: DictConfig) -> None:
-    """Check the parts that have names.
+    """Check the names of the parts.
 
     Raises:
-        UserError: unknown part, the valid ones are named; or a part lacks files, and what to do is said.
+        UserError: an unknown part, with the valid ones, or missing files, with the command that gets them.
     """
     with user_input():
         robot_maker(env.robot, env.assets)
@@ -84,5 +84,5 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
 
 
 def push_box() -> PushBox:
-    """What normalised pushes mean on the table, for planners that propose pushes near objects."""
+    """The scale of normalised pushes, for planners that propose pushes near objects."""
     return PushBox(REACH_LOW, REACH_HIGH, MAXIMUM_MOTION)

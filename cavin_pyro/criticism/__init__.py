@@ -1,1 +1,1 @@
-"""Criticism of a trained model and its guide: whether the inference can be trusted, and what the model gets wrong."""
+"""Criticism of a trained model and its guide: accuracy of the inference, and errors of the model."""

@@ -1,4 +1,4 @@
-"""What every check gets: a trained model, its guide, and windows to check them on."""
+"""The input of every check: a trained model, its guide, and windows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from models.state import Window
 
 @dataclass(frozen=True)
 class CheckContext:
-    """What a check gets.
+    """The input of a check.
 
     Attributes:
         model, guide: trained, in evaluation mode, without gradients. pointnet: makes the features of new clouds.

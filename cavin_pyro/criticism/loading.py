@@ -1,4 +1,4 @@
-"""Load what a check needs, from a checkpoint and datasets, and what the report says about their origin."""
+"""Load the input of checks from a checkpoint and datasets, with their provenance for the report."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def sample_windows(table: WindowTable, numbers: torch.Tensor, count: int, *, see
 
 
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
-    """Whether a dataset is what a checkpoint says that it was trained on.
+    """Whether a checkpoint was trained on a dataset, by its provenance.
 
     Returns:
         `folder`, `transitions`, `seed`, `fingerprint`; `same`: true or false, None where it cannot be told; `verdict`.

@@ -15,7 +15,7 @@ from cavin_pyro.data.features import cloud_features
 from models.networks.pointnet import PointNet
 from models.state import State
 
-SEED = 2**31  # added to a context's seed: datasets are collected with small ones, so these episodes are in none
+SEED = 2**31  # added to a context's seed: datasets are collected with small ones, so no dataset has these episodes
 
 
 class Recording(NamedTuple):

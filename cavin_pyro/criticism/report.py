@@ -7,7 +7,7 @@ Keys of report.json:
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check)
     sections    by name: `title`, `findings` (sentences) and `values`, which the section's function documents
 
-Floats have six significant digits; what is not a finite number is null.
+Floats have six significant digits; non-finite numbers are null.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6
 DOTS_PER_INCH = 150  # of photographs
-LARGEST_DRAWING = 400_000  # bytes of SVG; what is larger becomes pixels
+LARGEST_DRAWING = 400_000  # bytes of SVG; larger drawings become pixels
 MISSING = "–"
 
 Part = dict[str, Any]
@@ -40,7 +40,7 @@ Part = dict[str, Any]
 
 
 def render(section: Section) -> Part:
-    """Turn figures into images and numbers into plain ones, so that a section can be kept on disk."""
+    """Turn figures into images and numbers into plain ones, so that a section can be stored on disk."""
     return {
         "name": section.name,
         "title": section.title,
@@ -56,7 +56,7 @@ def render(section: Section) -> Part:
 
 
 def write_report(folder: Path, about: Mapping[str, Any], parts: Sequence[Part]) -> None:
-    """Write both files, each whole or not at all."""
+    """Write both files, each atomically."""
     about = plain(about)
     sections = {part["name"]: {key: part[key] for key in ("title", "findings", "values")} for part in parts}
     write_json(folder / "report.json", {"about": about, "sections": sections})

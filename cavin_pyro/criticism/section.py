@@ -1,4 +1,4 @@
-"""What a check returns for the report: a section with findings, values, tables and pictures."""
+"""A section of the report, the result of a check: findings, values, tables and pictures."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Section:
     """One section of the report.
 
     Attributes:
-        name: key in report.json. title: heading. explanation: what was measured, on what, and how to read it.
-        findings: a sentence each, of what this run has shown, made from the values.
+        name: key in report.json. title: heading. explanation: the measurement, its data, and how to read it.
+        findings: of this run, a sentence each, derived from the values.
         values: for report.json: numbers, strings, lists and dictionaries of them.
     """
 

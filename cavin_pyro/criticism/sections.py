@@ -24,8 +24,8 @@ from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.storage.files import read_json, write_json
 
-# In the order of the report. Each takes the context, and what `sizes.<name>` holds; long ones show
-# their progress themselves.
+# In the order of the report. Each takes the context and the options `sizes.<name>`; long ones show
+# their progress.
 SECTIONS: dict[str, Callable[..., Section]] = {
     "elbo": assess_elbo,
     "guide_error": assess_guide_error,
@@ -60,7 +60,7 @@ def run_sections(
 ) -> list[Part]:
     """Run sections, or read those that an earlier run with the same fingerprint has finished.
 
-    Every finished one is a file in `folder / "sections"`, so a killed check resumes when it is run again.
+    Every finished one is a file in `folder / "sections"`, so you can rerun a killed check to resume it.
     Random numbers of a section depend on the context's seed alone, not on the sections before it.
     """
     kept = folder / "sections"

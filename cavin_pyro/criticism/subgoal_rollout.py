@@ -72,7 +72,7 @@ def code_selections(codes: tuple[str, ...]) -> list[tuple[str, str]]:
 
 
 def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, objects: int) -> Observation:
-    """Sample scene `number` with so many objects, in clutter as in collection; equal numbers give equal scenes."""
+    """Sample scene `number` with so many objects, as cluttered as in collection; equal numbers give equal scenes."""
     generator = np.random.default_rng([seed, number])
     return scene.sample([clutter_area(generator)] * objects, ranges, generator)
 

@@ -31,11 +31,11 @@ CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose s
 
 @dataclass
 class CollectionConfig(CollectionOptions):
-    """What decides the data, and nothing else: equal configurations give equal data.
+    """Everything that determines the data: equal configurations give equal data.
 
     Attributes:
-        ranges: object parameters. object_set: where the objects come from. assets: folder of meshes, for a set that
-            needs one; where it lies decides nothing.
+        ranges: object parameters. object_set: by name. assets: folder of meshes, for a set that needs one; its path
+            does not affect the data.
         camera, segmentation: by name, see `envs.scene.Scene`.
     """
 
@@ -108,7 +108,7 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
 
 
 def clutter_area(generator: np.random.Generator) -> Area:
-    """A rectangle somewhere on the table: objects near each other are what planning has to deal with."""
+    """A random rectangle on the table, so that objects start close to each other, as in planning."""
     ((low, high),) = WHOLE_TABLE
     size = np.minimum(generator.uniform(*CLUTTER_SIDES, size=2), np.subtract(high, low))
     corner = np.add(low, generator.random(2) * (np.subtract(high, low) - size))
@@ -157,7 +157,7 @@ def open_scene(config: CollectionConfig) -> Scene:
     """The world in which episodes of this configuration are collected.
 
     Raises:
-        UserError: it has no such part, or a part lacks its files.
+        UserError: it has no such part, or files of a part are missing.
     """
     with user_input():
         return Scene(
@@ -193,7 +193,7 @@ def _shards(config: CollectionConfig, *, first: int, workers: int) -> Iterator[t
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
         waiting = [pool.apply_async(_collect_shard, ((config, next(numbers)),)) for _ in range(2 * workers)]
         while True:
-            # A bounded queue: `imap` would run ahead of the disk without limit.
+            # A bounded queue: `imap` would buffer results without limit.
             yield waiting.pop(0).get()
             waiting.append(pool.apply_async(_collect_shard, ((config, next(numbers)),)))
 
@@ -235,7 +235,7 @@ def _write(folder: Path, metadata: dict[str, Any]) -> None:
 
 
 def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:
-    """Where the time of each shard went; apart from the data, which must not depend on the machine's speed."""
+    """Log the CPU time of each shard, outside of the data, which must not depend on the machine's speed."""
     path = folder / "timing.csv"
     header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
     row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "segmentation", "points"))

@@ -34,7 +34,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def shard_path(folder: Path, number: int) -> Path:
-    """Where a shard lies."""
+    """The path of a shard."""
     return folder / f"episodes-{number:05d}.h5"
 
 
@@ -45,7 +45,7 @@ def write_shard(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _shard_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    # Made in memory, because HDF5 on a full disk ends in errors of its own that cannot be caught in one place.
+    # Built in memory, because HDF5 raises errors of its own on a full disk.
     with h5py.File("shard", "w", libver="v110", driver="core", backing_store=False) as file:
         for name in sorted(arrays):
             file.create_dataset(
@@ -134,7 +134,7 @@ def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool =
     """Yield (number, arrays) of a dataset's shards in order.
 
     Args:
-        names: arrays to read. skip_corrupt: leave corrupt shards out, naming each, instead of stopping at them.
+        names: arrays to read. skip_corrupt: skip corrupt shards with a message, instead of raising.
 
     Raises:
         UserError: no dataset, a corrupt shard, or none that is whole.

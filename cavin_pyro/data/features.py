@@ -65,7 +65,7 @@ def sample_clouds(
     """Sample clouds [count, 256, 3] metres from datasets, from as many shards as it takes, real objects only.
 
     Args:
-        held_out_objects: names of objects that are not to be among them.
+        held_out_objects: names of objects whose clouds are omitted.
 
     Raises:
         UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.

@@ -1,4 +1,4 @@
-"""Windows for training from episodes on disk: which count, the split, and batches."""
+"""Windows for training from episodes on disk: selection, split, and batches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SEGMENT_LENGTH = 3  # T
 class WindowTable:
     """All states and pushes of a dataset, and where its windows start.
 
-    A window is looked up when a batch needs it, so overlapping windows share their memory.
+    Batches gather windows on demand, so overlapping windows share their memory.
 
     Attributes:
         training, validation: numbers of windows, for `batch`.
@@ -84,13 +84,13 @@ def load_windows(
     seed: int = 0,
     skip_corrupt: bool = False,
 ) -> WindowTable:
-    """Read one or more datasets, compute the features that are not there yet, and find the windows.
+    """Read one or more datasets, compute missing features, and find the windows.
 
     Args:
         segment_length: T. seed: of the split into training and validation.
 
     Raises:
-        UserError: no dataset, a corrupt shard, datasets that do not go together, or no window to learn from.
+        UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
     """
     config = config or WindowConfig()
     fingerprint, shards = pointnet_fingerprint(pointnet), []

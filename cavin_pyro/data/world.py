@@ -1,4 +1,4 @@
-"""The world that random pushes are collected in."""
+"""The world for the collection of random pushes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from cavin_pyro.data.collection import CollectionConfig
 
 
 def collecting_world(env: DictConfig) -> CollectionConfig:
-    """How episodes are collected in the world of `env.*`, with the usual numbers.
+    """The configuration of a collection in the world of `env.*`, with default options.
 
     Raises:
         UserError: as `check_world` and `object_ranges`, or another robot than the stick.
     """
     check_world(env)
     if env.robot != "stick":
-        raise UserError(f"random pushes are made with env.robot=stick, not {env.robot}: it pushes alike in less time")
+        raise UserError(
+            f"random pushes are made with env.robot=stick, not {env.robot}: its pushes are equivalent and faster"
+        )
     return CollectionConfig(
         ranges=object_ranges(env),
         object_set=env.objects,

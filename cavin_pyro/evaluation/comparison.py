@@ -58,7 +58,7 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
     """The episodes of another evaluation, whose scenes and rules must be those of `config`.
 
     Raises:
-        UserError: there is no finished evaluation, it is damaged, or its scenes or rules are others.
+        UserError: there is no finished evaluation, it is damaged, or its scenes or rules differ.
     """
     try:
         rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["per_episode"]
@@ -72,9 +72,7 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
     mine = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(mine) | set(theirs)):
         if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):
-            raise UserError(
-                f"compare={folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes are others"
-            )
+            raise UserError(f"compare={folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes differ")
     return list(rows)
 
 

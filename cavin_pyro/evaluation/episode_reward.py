@@ -1,4 +1,4 @@
-"""The planner's reward, also where episodes have different layouts."""
+"""The planner's reward, also for episodes with different layouts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from envs.tasks import Outcome, Task, TaskReward
 
 
 class TaskSource(Protocol):
-    """All that a planner gets to know of an environment: `envs.pushing.PushingEnv` without its world."""
+    """The part of `envs.pushing.PushingEnv` that a planner may use: its tasks, without the world."""
 
     @property
     def tasks(self) -> Sequence[Task]:
@@ -50,5 +50,5 @@ class EpisodeReward:
         return self._rewards[self._env.tasks.index(self.task)]
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
-        """Judge the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool."""
+        """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool."""
         return self.current(previous, centers, mask)

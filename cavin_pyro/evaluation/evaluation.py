@@ -100,5 +100,5 @@ def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:
         min(config.workers, len(seeds)), initializer=_begin, initargs=(config,)
     ) as pool:
         yield from pool.imap_unordered(_episode, seeds)
-        pool.close()  # workers exit by themselves and release what they hold, such as the compiler's locks
+        pool.close()  # lets workers exit normally and release resources, such as the compiler's locks
         pool.join()

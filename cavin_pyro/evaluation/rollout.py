@@ -22,7 +22,7 @@ OUTCOMES = ("success", "violation", "fall", "timeout")
 
 @dataclass(frozen=True)
 class PlanRecord:
-    """One plan, and the observation that it was made from. `rollout` makes T of its pushes, or fewer.
+    """One plan, with the observation behind it. `rollout` executes T of its pushes, or fewer.
 
     Attributes:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
@@ -101,7 +101,7 @@ def observed_state(observation: ObservationDict, pointnet: PointNet) -> State:
 
 
 class EpisodeCallback:
-    """What `rollout` calls while an episode goes on. A subclass overrides the methods that it needs."""
+    """Callbacks of `rollout` during an episode. A subclass overrides the methods that it needs."""
 
     def on_observation(self, observation: ObservationDict) -> None:
         """Called with the first observation and with the one after every push."""
@@ -133,7 +133,7 @@ def rollout(
 
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
-        pushes_per_plan: pushes to make before the next plan; None makes all T (paper, Algorithm 1, line 11).
+        pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11).
         photograph: keep a picture with every plan.
         callbacks: called in this order; without any, no frame is computed.
     """

@@ -1,1 +1,1 @@
-"""What is kept on disk: atomic writes, run directories, provenance, checkpoints."""
+"""Storage on disk: atomic writes, run directories, provenance, checkpoints."""

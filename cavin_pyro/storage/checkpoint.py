@@ -26,7 +26,7 @@ from cavin_pyro.storage.renamed import renamed
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
 OWN_MODULES = ("models", "guides")
-BUILT_SECTIONS = ("model", "prior", "scales", "guide")  # of the configuration; the others are read by people only
+BUILT_SECTIONS = ("model", "prior", "scales", "guide")  # of the configuration, from which parts are built
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Checkpoint:
     """Weights, configuration and provenance.
 
     Attributes:
-        config: how to build the parts. provenance: where the weights come from. tensors: by `part.parameter`.
+        config: of the parts. provenance: of the weights. tensors: by `part.parameter`.
     """
 
     config: dict[str, Any]
@@ -73,7 +73,7 @@ def save_checkpoint(
     header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
     header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
     with atomic_write(path) as temporary:
-        temporary.write_bytes(save(tensors, metadata=header))  # `save_file` would hide what a full disk says
+        temporary.write_bytes(save(tensors, metadata=header))  # `save_file` would hide the error of a full disk
 
 
 def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
@@ -108,7 +108,7 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
     if old := renamed(config):
         raise UserError(
-            f"checkpoint {path} has names from before: {', '.join(old)}: "
+            f"checkpoint {path} has old names: {', '.join(old)}: "
             f"rewrite it with python -m cavin_pyro.storage.renamed {path}"
         )
     _check_targets([config.get(section) for section in BUILT_SECTIONS], path, trust)
@@ -139,7 +139,7 @@ def shipped_folder() -> Path:
 
 
 def default_checkpoint() -> Path:
-    """The checkpoint that commands load unless told otherwise."""
+    """The checkpoint that commands load by default."""
     return find_checkpoint(DEFAULT_CHECKPOINT)
 
 
@@ -158,7 +158,7 @@ def _check_targets(config: Any, path: Path, trust: Sequence[str]) -> None:
 
 
 def _is_own_class(target: str) -> bool:
-    """Whether a dotted name is a class of this program; what its modules merely import does not count."""
+    """Whether a dotted name is a class of this program; imports of its modules do not count."""
     module, _, name = target.rpartition(".")
     if module.split(".")[0] not in OWN_MODULES:
         return False

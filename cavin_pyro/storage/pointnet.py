@@ -1,4 +1,4 @@
-"""The frozen PointNet of a checkpoint (paper, section 4.1), and whether a model takes its features."""
+"""The frozen PointNet of a checkpoint (paper, section 4.1), and its compatibility with a model."""
 
 from __future__ import annotations
 

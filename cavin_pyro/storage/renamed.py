@@ -1,4 +1,4 @@
-"""Names that stored configurations had before, what they are now, and the command that rewrites a checkpoint:
+"""Renamed options and classes of stored configurations, and the command that rewrites a checkpoint:
 
 python -m cavin_pyro.storage.renamed runs/train/checkpoint.safetensors
 """
@@ -30,16 +30,16 @@ OPTIONS = {  # an option keeps its section
 }
 VALUES = {"trainer.batches": {"alike": "bucketed"}}
 
-_Place = tuple[dict[str, Any], str]  # where a name stands: the section, and its key
+_Place = tuple[dict[str, Any], str]  # section and key of a name
 
 
 def renamed(config: dict[str, Any]) -> list[str]:
-    """What has another name now in a stored configuration, as `old -> new`; nothing if all names are of today."""
+    """Renamed entries of a stored configuration, as `old -> new`; empty if all names are current."""
     return [f"{old} -> {new}" for old, new, _, _ in _find(config, "")]
 
 
 def rename(config: dict[str, Any]) -> None:
-    """Put today's names into a stored configuration."""
+    """Replace old names in a stored configuration."""
     for _, _, (section, key), (new_key, new_value) in list(_find(config, "")):
         entries = [(new_key, new_value) if name == key else (name, value) for name, value in section.items()]
         section.clear()
@@ -47,7 +47,7 @@ def rename(config: dict[str, Any]) -> None:
 
 
 def _find(section: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, _Place, tuple[str, Any]]]:
-    """Old name, new name, where it stands, and the entry that takes its place."""
+    """Old name, new name, place, and the new entry."""
     for key, value in section.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict):
@@ -62,10 +62,10 @@ def _find(section: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, _Pla
 
 
 def rewrite(path: Path) -> list[str]:
-    """Put today's names into the header of a checkpoint; the weights stay as they are, byte for byte.
+    """Replace old names in the header of a checkpoint; the weights stay as they are, byte for byte.
 
     Returns:
-        What was renamed, as `old -> new`.
+        Renamed entries, as `old -> new`.
 
     Raises:
         UserError: the file cannot be read or is no checkpoint.

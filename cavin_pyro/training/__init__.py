@@ -1,1 +1,1 @@
-"""Learning: the trainer, its objectives, and the pretraining of the PointNet."""
+"""Training: the trainer, its objectives, and the pretraining of the PointNet."""

@@ -1,4 +1,4 @@
-"""Whether a model and a guide are compatible, judged by their sites."""
+"""Model-guide compatibility, checked by their sites."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Sites = dict[str, Site]
 
 @torch.no_grad()
 def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> None:
-    """Run both programs once and make sure that the guide has the sites of the model's codes, and no others.
+    """Run both programs once and check that the guide has the sites of the model's codes, and no others.
 
     Pyro itself samples a code that the guide lacks from the prior, and counts sites that only the guide has.
     `window: [B]`, with B of at least 2, so that one of them can be masked. The random generator's state is

@@ -1,6 +1,6 @@
 """The published code's counterfactual term, for an ablation (the published implementation).
 
-The paper's objective has no such term: it asserts that the actions of (s, c, z) lead where h(s, c) says.
+The paper's objective has no such term: it asserts that the actions of (s, c, z) lead to h(s, c).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from models.state import Window
 
 
 def counterfactual_loss(model: Model, window: Window, codes: Mapping[str, Any]) -> Tensor:
-    """Negative log density of s' where f says that the generated actions lead, summed over the windows `[B]`.
+    """Negative log density of s' around f's prediction for the generated actions, summed over the windows `[B]`.
 
     a = mean of g(. | s, c, z), s_t+1 = mean of f(. | s_t, a_t) for t = 0, ..., T - 1, and s_T is compared with
     s' under the likelihood scales. Objects count that are real in both, windows where `sequence_mask` is set.

@@ -1,4 +1,4 @@
-"""From configuration to what training minimizes."""
+"""The objective of training, from the configuration."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def data_folders(data: str | Sequence[str]) -> list[Path]:
 
 
 def build_objective(config: Config, model: Model) -> Objective:
-    """What training minimizes, from the section `objective`.
+    """The objective, from the section `objective`.
 
     Raises:
-        UserError: an objective that cannot be built, or that the model lacks something for.
+        UserError: an objective that cannot be built, or that is incompatible with the model.
     """
     section = config["objective"]
     check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})

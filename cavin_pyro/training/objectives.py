@@ -1,4 +1,4 @@
-"""What training minimizes: a bound of Pyro's, with the changes that ablations make to it."""
+"""Training objectives: a bound of Pyro, with optional changes for ablations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Objective:
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: per code, positive. warm_up_steps: over which the weights of the
-            codes' log densities (prior and guide alike) grow from nearly nothing.
+            codes' log densities (of prior and guide) grow from nearly zero.
         counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`.
 
     Raises:
@@ -63,7 +63,7 @@ class Objective:
             )
 
     def check(self, model: Model) -> None:
-        """Make sure that a model has what this objective needs.
+        """Check that a model is compatible with this objective.
 
         Raises:
             ValueError: it generates no actions, but there is a counterfactual term.
@@ -92,7 +92,7 @@ class Objective:
 
 
 class BoundObjective(nn.Module):
-    """An objective together with the model and the guide whose parameters it is about."""
+    """An objective together with the model and the guide whose parameters it trains."""
 
     def __init__(self, objective: Objective, model: Model, guide: Guide) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Pretraining PointNet by drawing clouds again (paper, section 4.1: "a pretrained PointNet")."""
+"""Pretraining PointNet by reconstructing clouds (paper, section 4.1: "a pretrained PointNet")."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def pretrain(
 ) -> dict[str, float]:
     """Minimise the Chamfer distance between clouds and their reconstructions.
 
-    Training clouds are turned about the vertical and scaled a little, so that features describe shapes and
-    directions that are rare in the data; validation clouds (one in ten) are not changed.
+    Training clouds are augmented by rotations about the vertical and small scalings, for shapes and directions that are
+    rare in the data; validation clouds (one in ten) are not.
 
     Args:
         clouds: [N, 256, 3] metres from their centres. log: where the losses go, as CSV.
 
     Returns:
-        Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, what drawing one and the same
-        average cloud every time would cost.
+        Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, the loss of one
+        average cloud for all.
 
     Raises:
         UserError: the loss is not finite.

@@ -1,4 +1,4 @@
-"""Where a trained model comes from: the record of the run, its data and its PointNet."""
+"""Provenance of a trained model: the run, its data and its PointNet."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from envs.workspace import MAXIMUM_OBJECTS
 
 
 def train(config: DictConfig) -> Trainer:
-    """The whole of a training run, from its configuration to a folder with checkpoint and metrics.
+    """Run a whole training, from its configuration to a folder with checkpoint and metrics.
 
     Returns:
         The run when it has ended.

@@ -1,7 +1,7 @@
 """Stochastic variational inference: the loop, its validation, its checkpoints, and exact resuming.
 
-One `torch.optim.Adam` over the ELBO as a module, because Pyro's own optimisers keep one per parameter and cost more
-time than these small networks do.
+One `torch.optim.Adam` over the ELBO as a module, because Pyro's own optimizers keep one per parameter and take more
+time than these small networks.
 """
 
 from __future__ import annotations
@@ -69,11 +69,11 @@ class Trainer:
 
     @property
     def resume_path(self) -> Path:
-        """Everything that the next step depends on, as of the last validation."""
+        """The file with the complete state of training at the last validation."""
         return self.folder / "resume.safetensors"
 
     def run(self) -> None:
-        """Train until the steps are done or patience is lost; goes on from the resume file if there is one.
+        """Train until the steps are done or patience is lost; resumes from the resume file if it exists.
 
         Raises:
             UserError: a loss or gradient that is not finite (the term is named), or a damaged resume file.
@@ -88,7 +88,7 @@ class Trainer:
             progress_bar("training", total=config.steps, initial=self.step) as bar,
             SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step + 1) as board,
         ):
-            # Pyro's own warnings, many for one NaN; this loop looks itself and stops.
+            # Pyro warns many times about one NaN; this loop checks and stops.
             warnings.filterwarnings("ignore", "Encountered", UserWarning)
             while self.step < config.steps and self.stale < config.patience:
                 running += self._update()
@@ -210,7 +210,7 @@ class Trainer:
 
 @contextmanager
 def unchecked_programs() -> Iterator[None]:
-    """Without Pyro's looks at the sites' shapes and names, which cost a small model a twentieth of every step."""
+    """Disable Pyro's checks of sites, which take a twentieth of every step of a small model."""
     with pyro.settings.context(validate_infer=False, validate_poutine=False):
         yield
 

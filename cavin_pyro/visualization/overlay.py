@@ -25,7 +25,7 @@ PUSH_COLOR = "#1A1A1A"
 TABLE_COLOR = "#C2B9AD"  # where there is no photograph
 
 TARGET_RADIUS = 0.07  # metres; of the circle that marks the target
-MOVING = 0.01  # metres; objects that are to move less are left out
+MOVING = 0.01  # metres; objects with smaller planned moves are omitted
 
 
 class View(Protocol):
@@ -97,7 +97,7 @@ def candidate_subgoals(record: PlanRecord, task: Task, view: View, *, count: int
     every = np.broadcast_to(returns[:, None, None], points.shape[:-1]).ravel()
     points = points.reshape(-1, 3)
     finite = np.flatnonzero(np.isfinite(every) & np.isfinite(points).all(axis=-1))
-    # Drawn, not every so many-th: those would be the same segment of every plan.
+    # A random choice: regular steps would select the same segment of every plan.
     chosen = np.random.default_rng(0).permutation(finite)[:count]
     chosen = chosen[np.argsort(every[chosen], kind="stable")]
     return view.project(points[chosen]), every[chosen]

@@ -64,10 +64,10 @@ def draw_overlay(
     scale: Normalize | None,
     reached: NDArray[np.float32] | None = None,
 ) -> None:
-    """Draw observed objects, candidates, subgoals, predictions and pushes over what the panel shows.
+    """Draw observed objects, candidates, subgoals, predictions and pushes over the panel's background.
 
     Args:
-        scale: of the candidates' returns; None leaves the candidates out.
+        scale: of the candidates' returns; None omits the candidates.
         reached: [n, M, 3] metres, centres observed after each push; None before that.
     """
     if scale is not None:
@@ -109,7 +109,7 @@ def draw_objects(panel: Axes, centers: NDArray[np.float32], mask: NDArray[np.boo
 
 
 def legend(task: Task, plan_records: Sequence[PlanRecord], *, candidates: bool) -> list[Line2D | Patch]:
-    """An entry for everything that `draw_overlay` draws of an episode, and for nothing else."""
+    """Legend entries for exactly what `draw_overlay` draws of an episode."""
     entries: list[Line2D | Patch] = [
         Patch(facecolor=to_rgba(group.color, group.opacity), edgecolor=group.color, label=group.name)
         for group in task.tile_groups()

@@ -30,7 +30,7 @@ SUCCESS_COLOR, FAILURE_COLOR = "#1B6E1B", "#C2272D"
 def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -> None:
     """Draw at most five plans, evenly spread and in temporal order, and the end.
 
-    Parts that a planner lacks are left out.
+    Parts that a planner lacks are omitted.
 
     Args:
         episode: its plans hold photographs and clouds, or an empty table is drawn.
@@ -79,7 +79,7 @@ def draw_plan_record(
 
     Args:
         camera: that took the photograph, in any resolution; None draws a map.
-        scale: of the candidates' returns; None leaves the candidates out.
+        scale: of the candidates' returns; None omits the candidates.
         reached: [n, M, 3] metres, centres observed after each push; None before that.
     """
     view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)

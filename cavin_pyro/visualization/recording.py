@@ -1,6 +1,6 @@
 """An episode in 3D on a timeline, for the rerun viewer: the world, the observations, and the plans.
 
-Everything spatial is in metres in the robot's base frame. `docs/how-to/see-a-plan.md` lists what is where.
+Everything spatial is in metres in the robot's base frame. `docs/how-to/see-a-plan.md` lists the entities.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class EpisodeRecording(EpisodeCallback):
         if body in self._scene.bodies:
             return f"world/objects/{object_name(self._scene.bodies.index(body))}"
         if body < min(self._scene.bodies):
-            return "world/table"  # the world begins with it
+            return "world/table"  # the first body of the world
         return f"world/robot/body_{body}/{'base' if link < 0 else f'link_{link}'}"
 
     def _log_poses(self) -> None:

@@ -27,7 +27,7 @@ from envs.sensors.camera import Camera
 from envs.tasks import Task
 
 FRAMES_PER_SECOND = 10
-PAUSE = 0.5  # seconds for which a new plan is shown before it is carried out
+PAUSE = 0.5  # seconds for which a new plan is shown before its execution
 CAPTION_HEIGHT = 22  # pixels
 
 
@@ -86,7 +86,7 @@ class EpisodeVideo(EpisodeCallback):
         """Append a frame [H, W, 3], drawn over.
 
         Args:
-            phase: what is going on, for the caption. repeat: for how many frames it is shown.
+            phase: for the caption. repeat: for how many frames it is shown.
 
         Raises:
             ValueError: the frame is not an image, or of another size than the first one.

@@ -12,7 +12,7 @@ from envs.workspace import MAXIMUM_OBJECTS
 
 @dataclass
 class CollectionOptions:
-    """What decides the episodes that are collected, apart from their world."""
+    """Options that determine the collected episodes, apart from their world."""
 
     seed: int = seed_option("root of all randomness", group="run")
     steps: int = option(10, "pushes per episode", minimum=1, group="data")
@@ -20,7 +20,7 @@ class CollectionOptions:
         5, "pushes in a row that share a target object and a direction", minimum=1, group="data"
     )
     perturbation_rate: float = option(
-        0.3, "fraction of pushes whose start is moved at random", minimum=0, maximum=1, group="data"
+        0.3, "fraction of pushes with a perturbed start", minimum=0, maximum=1, group="data"
     )
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
     maximum_objects: int = option(MAXIMUM_OBJECTS, "objects on the table, at most", group="data")
@@ -37,7 +37,7 @@ class CollectConfig(CollectionOptions):
     )
     output: str | None = option(
         None,
-        "folder for the dataset, where an unfinished one is resumed; by default data/pushes, or beside it",
+        "folder for the dataset, in which an unfinished one resumes; by default data/pushes, or beside it",
         group="run",
     )
     workers: int = option(2, "processes; the data do not depend on it", minimum=1, group="run")

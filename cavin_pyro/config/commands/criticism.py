@@ -20,18 +20,18 @@ class CheckConfig:
     )
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
-        "a shipped one (cavin, kinect, held_out), or the path of what train has written",
+        "a shipped one (cavin, kinect, held_out), or the path of a checkpoint from train",
         group="model",
     )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
-    data: Any = option("data/pushes", f"{DATA}; best what the model was trained on", group="data")
+    data: Any = option("data/pushes", f"{DATA}; preferably the model's training data", group="data")
     output: str | None = option(
         None,
-        "folder for the report, where an unfinished check is resumed; by default runs/check, or beside it",
+        "folder for the report, in which an unfinished check resumes; by default runs/check, or beside it",
         group="run",
     )
     seed: int = seed_option(group="run")
-    windows: int = option(1000, "held-out windows, and as many of those that training saw", minimum=1, group="data")
+    windows: int = option(1000, "held-out windows, and as many training windows", minimum=1, group="data")
     sections: Any = option(None, "sections of the report, [elbo,consistency]; by default all", group="run")
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)

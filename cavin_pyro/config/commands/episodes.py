@@ -25,7 +25,7 @@ class TilesConfig:
 
 @dataclass
 class EpisodeConfig:
-    """What commands share that run episodes."""
+    """Common options of commands that run episodes."""
 
     defaults: list[Any] = field(default_factory=lambda: [*DEFAULTS])
     task: Any = None
@@ -42,24 +42,24 @@ class EpisodeConfig:
     maximum_steps: int = option(ENVIRONMENT["maximum_steps"], "pushes per episode, at most", minimum=1, group="task")
     planner: Any = None
     pushes_per_plan: int | None = option(
-        1, "pushes made before the next plan; null makes all T (paper, Algorithm 1, line 11)", group="planning"
+        1, "executed pushes per plan; null executes all T (paper, Algorithm 1, line 11)", group="planning"
     )
     margin: float = option(
         0.02,
-        "by how much the planner's reward is stricter than the task's; predictions err by about that much",
+        "safety margin of the planner's reward; predictions err by about this much",
         unit="metres",
         minimum=0,
         group="planning",
     )
     matmul_precision: str = option(
         "bfloat16",
-        "precision to which a plan's matrix products round their factors",
+        "precision of the factors of matrix products in plans",
         choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
         group="planning",
     )
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
-        "a shipped one (cavin, kinect, held_out), or the path of what train has written",
+        "a shipped one (cavin, kinect, held_out), or the path of a checkpoint from train",
         group="model",
     )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
@@ -71,10 +71,10 @@ class EpisodeConfig:
 class PlanConfig(EpisodeConfig):
     """Options of `python -m cavin_pyro.plan`."""
 
-    output: str | None = option(None, "folder for the results; by default one of its own in runs/plan", group="run")
+    output: str | None = option(None, "folder for the results; by default a separate one in runs/plan", group="run")
     video: bool = option(True, "write a video of the episode", group="run")
     viewer: str | None = option(
-        None, "rerun: a recording in 3D as well, episode.rrd; needs the extra of that name, .[viewer]", group="run"
+        None, "rerun also writes a recording in 3D, episode.rrd; needs the extra .[viewer]", group="run"
     )
 
 
@@ -84,7 +84,7 @@ class EvaluateConfig(EpisodeConfig):
 
     output: str | None = option(
         None,
-        "folder for the results, where an unfinished evaluation is resumed; by default one of its own in runs/evaluate",
+        "folder for the results, in which an unfinished evaluation resumes; by default a separate one in runs/evaluate",
         group="run",
     )
     episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1, group="run")
@@ -101,7 +101,7 @@ class DemoConfig(EpisodeConfig):
     """Options of `python -m cavin_pyro.demo`."""
 
     output: str | None = option(
-        None, "folder for the results, with one in it per task; by default runs/demo", group="run"
+        None, "folder for the results, with a subfolder per task; by default runs/demo", group="run"
     )
     tasks: list[str] = option(
         ["clearing", "insertion", "crossing"], "tasks to run", choices="envs.tasks.TASKS", group="task"

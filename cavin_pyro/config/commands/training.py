@@ -11,7 +11,7 @@ from cavin_pyro.config.options import option, seed_option
 
 SCHEDULES = ("constant", "cosine")
 BATCHES = ("mixed", "bucketed")
-DATA = "folder that collect has written, or several: data=[data/one,data/two]"
+DATA = "dataset folder from collect, or several: data=[data/one,data/two]"
 
 
 @dataclass
@@ -26,13 +26,13 @@ class TrainerConfig:
     )
     batches: str = option(
         "mixed",
-        "bucketed: every batch has windows with one number of objects, which saves the work on padding",
+        "bucketed by object count: every batch has windows with one number of objects, without padding",
         choices=BATCHES,
         group="trainer",
     )
     matmul_precision: str = option(
         "float32",
-        "precision to which matrix products round their factors",
+        "precision of the factors of matrix products",
         choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
         group="trainer",
     )
@@ -43,7 +43,7 @@ class TrainerConfig:
         group="trainer",
     )
     validate_every: int = option(
-        1000, "steps between validations, where a run that was killed resumes", minimum=1, group="trainer"
+        1000, "steps between validations, at which a killed run can resume", minimum=1, group="trainer"
     )
     validation_windows: int = option(4096, "windows per validation, at most", minimum=1, group="trainer")
     patience: int = option(20, "validations without a new best before training stops", minimum=1, group="trainer")
@@ -57,7 +57,7 @@ class TrainerConfig:
 
 @dataclass
 class WindowConfig:
-    """Which windows and transitions teach what (section `windows`; the published implementation)."""
+    """Selection of windows and transitions for training (section `windows`; the published implementation)."""
 
     validation_fraction: float = option(
         0.1, "share of the episodes that is held out for validation", minimum=0, maximum=1, group="windows"
@@ -73,13 +73,13 @@ class WindowConfig:
     )
     negative_fraction: float = option(
         0.25,
-        "share of the other windows that is kept, for f to learn what pushes do not do",
+        "fraction of the other windows to keep, so that f learns pushes without effect",
         minimum=0,
         maximum=1,
         group="windows",
     )
     held_out_objects: list[str] = option(
-        [], "names of objects, [mug,banana]; episodes with one of them do not count", group="windows"
+        [], "names of objects, [mug,banana]; training omits episodes with one of them", group="windows"
     )
 
 
@@ -101,17 +101,15 @@ class TrainConfig:
     data: Any = option("data/pushes", DATA, group="data")
     output: str | None = option(
         None,
-        "folder for the results, where an unfinished run is resumed; by default runs/train, or beside it",
+        "folder for the results, in which an unfinished run resumes; by default runs/train, or beside it",
         group="run",
     )
     pointnet: str = option(
         DEFAULT_CHECKPOINT,
-        "whose PointNet gives the features: a shipped checkpoint, or the path of what pretrain has written",
+        "checkpoint of the PointNet for features: a shipped one, or the path of one from pretrain",
         group="data",
     )
-    skip_corrupt: bool = option(
-        False, "leave corrupt files of the dataset out instead of stopping at them", group="data"
-    )
+    skip_corrupt: bool = option(False, "skip corrupt files of the dataset instead of stopping", group="data")
     model: Any = None
     guide: Any = None
     prior: Any = None
@@ -135,7 +133,9 @@ class PretrainConfig:
     )
     seed: int = seed_option(group="run")
     clouds: int = option(60_000, "point clouds of the dataset, one in ten for validation", minimum=2, group="data")
-    held_out_objects: list[str] = option([], "names of objects, [mug,banana]; no cloud is of one of them", group="data")
+    held_out_objects: list[str] = option(
+        [], "names of objects, [mug,banana]; training omits their clouds", group="data"
+    )
     steps: int = option(6000, "gradient steps", minimum=1, group="training")
     batch_size: int = option(128, "clouds per step", minimum=1, group="training")
     learning_rate: float = option(1e-3, "Adam's", above=0, group="training")

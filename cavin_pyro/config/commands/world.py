@@ -1,4 +1,4 @@
-"""The world that an episode takes place in: robot, objects, camera and segmentation."""
+"""The world of an episode: robot, objects, camera and segmentation."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from envs.objects.sampling import ObjectRanges
 from envs.pushing import PushingEnv
 
 ENVIRONMENT = {name: one.default for name, one in inspect.signature(PushingEnv).parameters.items()}
-COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are packed closer than those of an episode
+COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of an episode
 
 
 @dataclass
 class RangesConfig:
-    """From where objects and their parameters are sampled (section `env.ranges`; presets `env/ranges=`)."""
+    """Distributions of objects and their parameters (section `env.ranges`; presets `env/ranges=`)."""
 
     names: list[str] | None = option(None, "objects to sample from; by default all of env.objects", group="objects")
     target: list[str] | None = option(None, "objects to sample the target from; by default names", group="objects")
@@ -31,7 +31,7 @@ class RangesConfig:
     )
     drop_height: float = option(
         ObjectRanges.drop_height,
-        "above the table, from which centres fall; 0: just above the table",
+        "above the table, from which objects are dropped; 0: just above the table",
         unit="metres",
         minimum=0,
         group="objects",
@@ -59,7 +59,7 @@ class WorldConfig:
     )
     segmentation: str = option(
         ENVIRONMENT["segmentation"],
-        "how objects are told apart in a depth image",
+        "segmentation of objects in a depth image",
         choices="envs.segmentation.SEGMENTERS",
         group="world",
     )
@@ -68,5 +68,5 @@ class WorldConfig:
 
 
 def collection_world() -> WorldConfig:
-    """The world that random pushes are collected in."""
+    """The world for the collection of random pushes."""
     return WorldConfig(ranges=RangesConfig(clearance=COLLECTION_CLEARANCE))

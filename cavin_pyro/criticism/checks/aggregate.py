@@ -1,4 +1,4 @@
-"""Whether inferred codes are distributed like the prior, as planning from the prior assumes."""
+"""Comparison of inferred codes with the prior, from which planners sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of predictions that go on over many segments."""
+"""Errors of predictions over many segments."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _window(recording: Recording, begin: int, end: int) -> Window:
 
 
 def _inferred_effect(guide: Guide, window: Window) -> Tensor:
-    """The guide's effect code for each window: its mean, or a draw where the distribution has none."""
+    """The guide's effect code for each window: its mean, or a sample where the distribution has none."""
     site: Any = poutine.trace(guide).get_trace(window).nodes["effect_code"]
     try:
         return site["fn"].mean

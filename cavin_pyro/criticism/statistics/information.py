@@ -68,8 +68,8 @@ def mutual_information(guide: Program, window: Window, codes: Codes, site: str) 
     q(code_i | window_j) over the N windows: with j = i among them this is a lower bound, without it an upper bound
     (Poole et al., 2019). A later code is inferred from each window's own earlier code.
 
-    This is I(c; s, s') and I(z; s, a, c). I(c; s'|s) is smaller by I(c; s), which cannot be had from data with one
-    window for each state; E KL(q | p) is a second upper bound on it.
+    This is I(c; s, s') and I(z; s, a, c). I(c; s'|s) is smaller by I(c; s), which cannot be estimated from data with
+    one window for each state; E KL(q | p) is a second upper bound on it.
 
     Args:
         codes: one sample `[B, D]` of every code. site: which one.

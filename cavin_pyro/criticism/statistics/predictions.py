@@ -21,7 +21,7 @@ from models.state import Window
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)  # of central intervals
 AXES = ("x", "y", "z")
-FEATURES = 8  # of a feature's components are looked at, sampled once: they are many and alike
+FEATURES = 8  # components of a feature to evaluate, a fixed random choice
 
 
 class Prediction(NamedTuple):

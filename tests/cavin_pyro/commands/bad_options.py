@@ -78,7 +78,7 @@ BAD_OPTIONS = [
     ("plan", "seed=1,2", "seed=1,2"),
     ("plan", "reward=???", "Missing mandatory value: reward"),
     ("plan", "reward=${nowhere}", "'nowhere' not found"),
-    ("plan", "~task", "task cannot be taken away: give it a value as task=value"),
+    ("plan", "~task", "task cannot be removed: give it a value as task=value"),
     ("plan", "planner=null", "write overrides as name=value"),
     ("plan", "env.ranges=3", "env.ranges must be a section, not 3"),
     ("plan", "+unknown=1", "unknown override 'unknown': valid are checkpoint, env, layout"),

@@ -69,7 +69,7 @@ def test_an_interruption_is_one_line_and_its_own_status(capsys: pytest.CaptureFi
     with pytest.raises(SystemExit) as stop:
         guarded(act)
     assert stop.value.code == 130
-    assert capsys.readouterr().err.startswith("error: interrupted; where the command can resume")
+    assert capsys.readouterr().err.startswith("error: interrupted; rerun the same command to resume")
 
 
 def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None:
