@@ -40,13 +40,16 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     `info` of a reset: `steps`, which is 0, and the episode's `task` in its layout. `info` of a step: `steps` so far,
     `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable", not begun;
     "blocked" by an obstacle; contact with the "table"; "" if it did not), `success`, `violation`, `fall`,
-    and `terms`, the named terms of the reward. An episode terminates at success, violation or fall, and is truncated
+    `terms`, the named terms of the reward, and `strict`, the same step by `criterion="strict"`: `success`, `violation`,
+    `fall` and `reward`. An episode terminates at success, violation or fall, and is truncated
     after `maximum_steps`.
 
     Args:
         task, layout, tiles: see `envs.layouts.possible_tasks`; `tiles` replaces fields of the layout.
             `layout="random"` is sampled at every reset. A `Task` object has its own layout.
-        reward: dense or sparse. objects: how many, 1 to 5. ranges: object parameters.
+        reward: dense or sparse. criterion: what ends an episode as a violation, see `envs.tasks.TaskReward`. Scenes and
+            observations do not depend on it.
+        objects: how many, 1 to 5. ranges: object parameters.
         robot: one of `envs.robots.ROBOTS`.
         object_set: a key of `envs.objects.object_sets.OBJECT_SETS`.
         camera, segmentation: see `envs.scene.Scene`.
@@ -67,6 +70,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         layout: int | str | Path = 0,
         tiles: Mapping[str, Any] | None = None,
         reward: str = "sparse",
+        criterion: str = "strict",
         objects: int = 3,
         ranges: ObjectRanges | None = None,
         object_set: str = "builtin",
@@ -87,8 +91,9 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if isinstance(task, Task) and (layout != 0 or tiles):
             raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
         self.tasks = (task,) if isinstance(task, Task) else possible_tasks(task, layout, tiles)
-        self._rewards = [TaskReward(one, reward=reward) for one in self.tasks]
-        self.task, self.reward = self.tasks[0], self._rewards[0]  # of the episode
+        self._rewards = [TaskReward(one, reward=reward, criterion=criterion) for one in self.tasks]
+        self._strict_rewards = [TaskReward(one, reward=reward) for one in self.tasks]
+        self.task, self.reward, self._strict_reward = self.tasks[0], self._rewards[0], self._strict_rewards[0]
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
@@ -126,6 +131,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if number not in range(len(self.tasks)):
             raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
         self.task, self.reward = self.tasks[number], self._rewards[number]
+        self._strict_reward = self._strict_rewards[number]
         self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
         target = _areas(self.task.target_start, TARGET_JITTER)
         obstacle = _areas(self.task.obstacle_start, OBSTACLE_JITTER)
@@ -145,7 +151,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             raise RuntimeError("call reset() before step()")
         report = self.scene.push(np.asarray(action))
         observation = self.scene.observe()
-        outcome = self._judge(self._observation, observation, fallen=report.fallen)
+        outcome = _judged(self.reward, self._observation, observation, fallen=report.fallen)
+        strict = _judged(self._strict_reward, self._observation, observation, fallen=report.fallen)
         terms = {name: float(term) for name, term in outcome.terms.items()}
         self._observation = observation
         self._steps += 1
@@ -154,10 +161,9 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             "unsafe": report.unsafe,
             "ineffective": report.ineffective,
             "stopped": report.stopped,
-            "success": bool(outcome.success),
-            "violation": bool(outcome.violation),
-            "fall": bool(outcome.fall),
+            **_ends(outcome),
             "terms": terms,
+            "strict": {**_ends(strict), "reward": sum(float(term) for term in strict.terms.values())},
         }
         terminated = bool(outcome.success | outcome.failure)
         truncated = not terminated and self._steps >= self.maximum_steps
@@ -173,13 +179,18 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         """Free the simulator."""
         self.scene.close()
 
-    def _judge(self, before: Observation, after: Observation, *, fallen: bool = False) -> Outcome:
-        previous, centers = (torch.from_numpy(one.centers) for one in (before, after))
-        return self.reward(previous, centers, torch.from_numpy(after.mask), fallen=fallen)
-
     def _can_start(self, observation: Observation) -> bool:
-        outcome = self._judge(observation, observation)
+        outcome = _judged(self._strict_reward, observation, observation)
         return not bool(outcome.success | outcome.failure)
+
+
+def _judged(reward: TaskReward, before: Observation, after: Observation, *, fallen: bool = False) -> Outcome:
+    previous, centers = (torch.from_numpy(one.centers) for one in (before, after))
+    return reward(previous, centers, torch.from_numpy(after.mask), fallen=fallen)
+
+
+def _ends(outcome: Outcome) -> dict[str, bool]:
+    return {name: bool(getattr(outcome, name)) for name in ("success", "violation", "fall")}
 
 
 def _areas(tiles: TileSet, jitter: float) -> Area:

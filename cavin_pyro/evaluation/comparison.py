@@ -16,7 +16,15 @@ from yaml import YAMLError
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.run_directory import flat_options, stored_options
 
-SAME_SCENES = ("task", "layout", "tiles", "objects", "maximum_steps", "env")  # options, or sections of them
+SAME_SCENES = (
+    "task",
+    "layout",
+    "tiles",
+    "criterion",
+    "objects",
+    "maximum_steps",
+    "env",
+)  # options, or sections of them
 
 
 @dataclass(frozen=True)

@@ -50,11 +50,15 @@ def episode_row(episode: Episode) -> Row:
     """One episode as a line of results."""
     distances = [transition.subgoal_distance for transition in episode.transitions]
     reached = [distance for distance in distances if math.isfinite(distance)]
+    strict_outcome, strict_steps, strict_return = episode.strict()
     return {
         "seed": episode.seed,
         "outcome": episode.outcome,
         "steps": len(episode.transitions),
         "return": episode.total_reward,
+        "strict_outcome": strict_outcome,
+        "strict_steps": strict_steps,
+        "strict_return": strict_return,
         "unsafe": sum(transition.unsafe for transition in episode.transitions),
         "ineffective": sum(transition.ineffective for transition in episode.transitions),
         "subgoal_distance": float(np.mean(reached)) if reached else None,

@@ -93,6 +93,7 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
             layout=config.layout,
             tiles=tiles,
             reward=config.reward,
+            criterion=config.criterion,
             objects=config.objects,
             ranges=object_ranges(config.env),
             object_set=config.env.objects,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,6 +49,7 @@ class Transition:
         centers: [M, 3] metres, as observed after the push.
         subgoal_distance: metres, the mean over objects from their centres to the plan's first subgoal; NaN before a
             segment's last push and for planners without subgoals.
+        strict_reward: by `criterion=strict`. strict_end: one of `OUTCOMES` if an episode ends here by it, else "".
     """
 
     step: int
@@ -60,6 +62,8 @@ class Transition:
     ineffective: bool
     centers: NDArray[np.float32]
     subgoal_distance: float
+    strict_reward: float = 0.0
+    strict_end: str = ""
 
 
 @dataclass
@@ -77,6 +81,15 @@ class Episode:
     def total_reward(self) -> float:
         """The episode's return."""
         return sum(transition.reward for transition in self.transitions)
+
+    def strict(self) -> tuple[str, int, float]:
+        """Outcome, pushes and return by `criterion=strict`, if the episode was run by rules that end it no sooner."""
+        total = 0.0
+        for transition in self.transitions:
+            total += transition.strict_reward
+            if transition.strict_end:
+                return transition.strict_end, transition.step, total
+        return "timeout", len(self.transitions), total
 
     def reached(self, record: PlanRecord) -> NDArray[np.float32]:
         """Centres observed after each push of a plan: [n, M, 3] metres, n <= T."""
@@ -171,6 +184,8 @@ def rollout(
                 reward=float(reward),
                 centers=observation["centers"],
                 subgoal_distance=_subgoal_distance(record, observation["centers"]) if last else float("nan"),
+                strict_reward=info["strict"]["reward"],
+                strict_end=_end(info["strict"]),
                 **{name: info[name] for name in ("success", "violation", "fall", "unsafe", "ineffective")},
             )
             episode.transitions.append(transition)
@@ -179,7 +194,7 @@ def rollout(
                 callback.on_transition(transition)
             ended = terminated or truncated
             if ended:
-                episode.outcome = next((name for name in OUTCOMES[:3] if info[name]), "timeout")
+                episode.outcome = _end(info) or "timeout"
                 break
     if photograph:
         episode.photograph, episode.clouds = env.render(), observation["clouds"]
@@ -191,6 +206,11 @@ def rollout(
 def _call_on_frame(callbacks: Sequence[EpisodeCallback]) -> None:
     for callback in callbacks:
         callback.on_frame()
+
+
+def _end(flags: Mapping[str, Any]) -> str:
+    """Which of the outcomes a step came to, "" if the episode goes on."""
+    return next((name for name in OUTCOMES[:3] if flags[name]), "")
 
 
 def _subgoal_distance(record: PlanRecord, centers: NDArray[np.float32]) -> float:

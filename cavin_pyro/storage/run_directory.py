@@ -52,11 +52,13 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
 
 
 def stored_options(path: Path) -> dict[str, Any]:
-    """The options in a `config.yaml` by their dotted names; older versions wrote the task's name alone."""
+    """The options in a `config.yaml` by their dotted names, with what older versions left out."""
     options = flat_options(OmegaConf.to_container(OmegaConf.load(path)))
     if options.get("task") in TASKS:
         task = TASKS[options.pop("task")]
         options["task._target_"] = f"{task.__module__}.{task.__qualname__}"
+    if "reward" in options:
+        options.setdefault("criterion", "strict")  # older versions knew no other
     return options
 
 

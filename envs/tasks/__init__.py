@@ -7,7 +7,7 @@ import pkgutil
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from envs.tasks.reward import REWARD_NAMES, Outcome, TaskReward
+from envs.tasks.reward import CRITERIA, REWARD_NAMES, Outcome, TaskReward
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task
 from envs.tasks.tiles import TileSet
@@ -22,6 +22,7 @@ def _tasks_in_this_folder() -> Mapping[str, type[Task]]:
 TASKS = _tasks_in_this_folder()
 
 __all__ = [
+    "CRITERIA",
     "GOAL_MARKING",
     "REWARD_NAMES",
     "TASKS",

@@ -9,6 +9,9 @@ from torch import Tensor
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart, check_inside
 from envs.tasks.tiles import TileSet
+from envs.workspace import TILE_SIDE
+
+PUBLISHED_TOLERANCE = 1.5 * TILE_SIDE  # metres around the bridge, in real episodes of the published implementation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,10 @@ class Crossing(Task):
     def violation(self, step: Step) -> Tensor:
         """The target is off the bridge: [...] bool."""
         return step.target_enters(self.region.signed_distance)
+
+    def published_violation(self, step: Step) -> Tensor:
+        """The target is more than `PUBLISHED_TOLERANCE` off the bridge: [...] bool."""
+        return step.target_enters(lambda points: self.region.signed_distance(points) - PUBLISHED_TOLERANCE)
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the target's distance to the nearest centre of a goal tile."""

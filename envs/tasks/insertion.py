@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from envs.tasks.step import Step
@@ -40,6 +41,10 @@ class Insertion(Task):
     def violation(self, step: Step) -> Tensor:
         """An object is in the restricted region: [...] bool."""
         return step.any_enters(self.region.depth)
+
+    def published_violation(self, step: Step) -> Tensor:
+        """Never: the published implementation ends no real episode of insertion for a violation."""
+        return torch.zeros_like(step.mask[..., 0])
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the target's distance to the nearest centre of a tile of the slot."""

@@ -18,6 +18,7 @@ from envs.tasks.step import Step, off_table
 from envs.tasks.task import Task
 
 REWARD_NAMES = ("dense", "sparse")
+CRITERIA = ("strict", "published")
 
 
 class Outcome(NamedTuple):
@@ -55,17 +56,22 @@ class TaskReward:
         margin: safety margin in metres for planners, whose predictions err: forbidden regions, and regions to clear,
             grow; regions to stay within shrink. An object that starts within the margin may stay there, but must not
             come closer.
+        criterion: which rules make a step a violation: `strict`, those of the paper (`Task.violation`), or `published`,
+            those of the published implementation for real episodes (`Task.published_violation`).
 
     Raises:
-        ValueError: unknown kind of reward, or a negative margin.
+        ValueError: unknown kind of reward, unknown criterion, or a negative margin.
     """
 
-    def __init__(self, task: Task, *, reward: str = "sparse", margin: float = 0.0) -> None:
+    def __init__(self, task: Task, *, reward: str = "sparse", margin: float = 0.0, criterion: str = "strict") -> None:
         if reward not in REWARD_NAMES:
             raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARD_NAMES)}")
+        if criterion not in CRITERIA:
+            raise ValueError(f"unknown criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
         if not margin >= 0.0:
             raise ValueError(f"margin must be at least 0 metres, not {margin}")
         self.task, self.dense, self.margin = task, reward == "dense", margin
+        self.criterion = criterion
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
         """Evaluate one step: [...].
@@ -92,7 +98,8 @@ class TaskReward:
         fall = step.any_enters(off_table)
         if fallen:
             fall = torch.ones_like(fall)
-        violation = self.task.violation(step) & ~fall
+        violated = self.task.violation if self.criterion == "strict" else self.task.published_violation
+        violation = violated(step) & ~fall
         success = self.task.success(step) & ~fall & ~violation
         terms = self.task.terms(step, success, violation | fall, dense=self.dense)
         reward = reduce(add, terms.values())

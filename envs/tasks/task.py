@@ -96,6 +96,13 @@ class Task(ABC):
         """
         return torch.zeros_like(step.mask[..., 0])
 
+    def published_violation(self, step: Step) -> Tensor:
+        """As `violation`, by the published implementation's rules for real episodes: [...] bool; by default the same.
+
+        Planners are as strict as ever: this is `criterion=published` of an environment.
+        """
+        return self.violation(step)
+
     @abstractmethod
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the remaining distance in metres: [...]; its increase over a step is the dense reward's `progress`.

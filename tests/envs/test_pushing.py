@@ -96,7 +96,9 @@ def test_a_step_reports_all_that_happened(make: Make) -> None:
     assert env.observation_space.contains(observed) and info == {"steps": 0, "task": env.task}
     observed, reward, terminated, truncated, info = env.step(NOTHING)
     assert env.observation_space.contains(observed)
-    assert set(info) == {"steps", "unsafe", "ineffective", "stopped", "success", "violation", "fall", "terms"}
+    told = {"steps", "unsafe", "ineffective", "stopped", "success", "violation", "fall", "terms", "strict"}
+    assert set(info) == told
+    assert info["strict"] == {"success": False, "violation": False, "fall": False, "reward": -1}
     assert info["terms"] == {"goal": 0, "violation": 0, "time": -1, "progress": 0}
     assert (reward, terminated, truncated) == (-1, False, False)
     assert info["ineffective"] and not any(info[name] for name in ("unsafe", "success", "violation", "fall"))
@@ -200,6 +202,23 @@ def test_pushing_the_target_off_the_bridge_ends_the_episode_with_a_violation(mak
     _, reward, terminated, _, info = env.step(push)
     assert info["violation"] and terminated and reward == -101
     assert not info["success"] and not info["fall"]
+
+
+def test_by_the_published_criterion_the_same_push_goes_on_and_tells_the_strict_end(make: Make, put: Callable) -> None:
+    x, y = tile_center((2, 4))
+    push = normalised_push(np.array([x - 0.02, y]), np.array([0.1, 0.0])).astype(np.float32)
+    seen = {}
+    for criterion in ("strict", "published"):
+        env = make(put("rubiks_cube", x + 0.05, y), task=BRIDGE, objects=1, criterion=criterion)
+        first, _ = env.reset(seed=0)
+        observed, reward, terminated, _, info = env.step(push)
+        seen[criterion] = first["clouds"], observed["clouds"]
+        assert terminated == (criterion == "strict") and reward == (-101 if terminated else -1)
+        assert info["strict"] == {"success": False, "violation": True, "fall": False, "reward": -101}
+    for one, other in zip(*seen.values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="^unknown criterion 'lax': choose from strict, published$"):
+        make(criterion="lax")
 
 
 def test_an_object_off_the_table_ends_the_episode_with_a_fall(make: Make, put: Callable) -> None:

@@ -36,6 +36,13 @@ class EpisodeConfig:
     )
     tiles: TilesConfig = field(default_factory=TilesConfig)
     reward: str = option(ENVIRONMENT["reward"], "reward", choices=("dense", "sparse"), group="task")
+    criterion: str = option(
+        ENVIRONMENT["criterion"],
+        "what ends an episode as a violation: strict, the paper's text; published, the published implementation, "
+        "which tolerates 1.5 tiles beside the bridge and everything in insertion",
+        choices="envs.tasks.CRITERIA",
+        group="task",
+    )
     objects: int = option(
         ENVIRONMENT["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS, group="task"
     )

@@ -233,6 +233,35 @@ def test_within_the_margin_an_object_may_stay_or_go_back_but_not_further_out(pla
     assert fails(third, forbidden, 0.0)
 
 
+def test_the_published_criterion_tolerates_a_tile_and_a_half_beside_the_bridge() -> None:
+    reward, mask = TaskReward(CROSSING, criterion="published"), torch.tensor([True])
+
+    def violated(x: float) -> bool:
+        return bool(reward(torch.tensor([[0.6, 0.0, 0.0]]), torch.tensor([[x, 0.0, 0.0]]), mask).violation)
+
+    assert [violated(0.67 + d) for d in (-0.01, 0.01, 0.22, 0.23)] == [False, False, False, True]
+    assert TaskReward(CROSSING)(torch.zeros(1, 3), torch.tensor([[0.68, 0.0, 0.0]]), mask).violation
+
+
+def test_by_the_published_criterion_insertion_forbids_no_place() -> None:
+    inside = torch.tensor([[*tile(1, 1), 0.0]])
+    strict, published = (TaskReward(INSERTION, criterion=name) for name in ("strict", "published"))
+    mask = torch.tensor([True])
+    assert strict(inside, inside, mask).violation and not published(inside, inside, mask).violation
+    off = torch.tensor([[0.99, 0.0, 0.0]])
+    assert published(inside, off, mask).fall
+
+
+@pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
+def test_what_the_published_criterion_forbids_is_forbidden_by_the_strict_one(task: Task) -> None:
+    points = torch.cartesian_prod(torch.linspace(0.2, 1.0, 40), torch.linspace(-0.63, 0.63, 40))
+    centers = torch.cat((points, torch.zeros(len(points), 1)), -1).unsqueeze(-2)
+    mask = torch.ones(len(points), 1, dtype=torch.bool)
+    strict, published = (TaskReward(task, criterion=name)(centers, centers, mask) for name in ("strict", "published"))
+    assert not (published.violation & ~strict.violation).any()
+    assert (published.violation == published.failure & ~published.fall).all()
+
+
 @pytest.mark.parametrize("margin", [-0.01, math.nan])
 def test_a_negative_margin_is_refused(margin: float) -> None:
     with pytest.raises(ValueError, match=r"^margin must be at least 0 metres, not (-0.01|nan)$"):
