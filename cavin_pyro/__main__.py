@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cavin_pyro import __version__
 
-ORDER = ("demo", "plan", "evaluate", "collect", "pretrain", "train", "check", "assets")
+ORDER = ("demo", "plan", "evaluate", "collect", "pretrain", "train", "check", "reproduce", "assets")
 
 
 def main() -> None:

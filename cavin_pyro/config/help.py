@@ -29,6 +29,7 @@ EXAMPLES = {
         "-m task=clearing,insertion,crossing episodes=50",
     ),
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
+    "reproduce": ("scale=smoke", "scale=paper shard=2/3", "scale=paper merge=[runs/a,runs/b,runs/c]"),
 }
 UNREAD = {"demo": ("task", "tiles")}  # options and presets that a command shares with others and does not read
 HEADINGS = {  # of the groups, in the order of the page

@@ -21,6 +21,7 @@ FOLDERS = {
     "plan": ("runs/plan/{task}-{reward}-{objects}-{planner}-{seed}", ("video", "viewer")),
     "evaluate": ("runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}", ("episodes", "workers", "compare")),
     "demo": ("runs/demo", ()),
+    "reproduce": ("runs/reproduce/{scale}", ("workers", "merge")),
 }
 
 

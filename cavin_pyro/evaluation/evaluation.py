@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 
 Row = dict[str, Any]
+Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
+EPISODES_FILE = "episodes.jsonl"
 
 
 def evaluate(config: DictConfig, folder: Path) -> list[Row]:
@@ -27,23 +29,38 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     Each finished episode is one line of that file. Rerun the same command to resume a killed evaluation; an incomplete
     last line is dropped and its episode run again.
     """
-    path = folder / "episodes.jsonl"
-    rows = _finished(path)
-    seeds = [seed for seed in range(config.seed, config.seed + config.episodes) if seed not in rows]
-    if seeds:
+    rows = begin(folder)
+    missing = missing_seeds(config, rows)
+    if missing:
         announce_waiting(config)
     with progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar:
-        with atomic_write(path) as temporary:
-            temporary.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")
-        with open(path, "a", encoding="utf-8") as file:
-            for row in _run(config, seeds):
-                rows[row["seed"]] = row
-                file.write(json.dumps(row) + "\n")
-                file.flush()
-                bar.update()
-                successes = sum(one["outcome"] == "success" for one in rows.values())
-                bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
+        for _, row in run_jobs([(config, seed) for seed in missing], config.workers):
+            rows[row["seed"]] = row
+            append(folder, row)
+            bar.update()
+            successes = sum(one["outcome"] == "success" for one in rows.values())
+            bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
     return [rows[seed] for seed in sorted(rows)][: config.episodes]
+
+
+def begin(folder: Path) -> dict[int, Row]:
+    """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file."""
+    path = folder / EPISODES_FILE
+    rows = finished_episodes(path)
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")
+    return rows
+
+
+def append(folder: Path, row: Row) -> None:
+    """Add a finished episode to an evaluation's file."""
+    with open(folder / EPISODES_FILE, "a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def missing_seeds(config: DictConfig, rows: Mapping[int, Row]) -> list[int]:
+    """Seeds of the episodes that are still to be run."""
+    return [seed for seed in range(config.seed, config.seed + config.episodes) if seed not in rows]
 
 
 def episode_row(episode: Episode) -> Row:
@@ -66,7 +83,8 @@ def episode_row(episode: Episode) -> Row:
     }
 
 
-def _finished(path: Path) -> dict[int, Row]:
+def finished_episodes(path: Path) -> dict[int, Row]:
+    """The rows of a file of episodes by their seeds, without lines that were cut off; none if there is no file."""
     rows: dict[int, Row] = {}
     if path.exists():
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -78,31 +96,42 @@ def _finished(path: Path) -> dict[int, Row]:
     return rows
 
 
-_runner: EpisodeRunner | None = None  # one per worker process
+_runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process
 
 
-def _begin(config: DictConfig) -> None:
-    global _runner
-    # One thread per worker: more threads per process slow all of them down.
-    torch.set_num_threads(1)
-    _runner = make_runner(config)
+def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Row]]:
+    """Run episodes, one per job; yields a job's number and its row, in any order.
 
-
-def _episode(seed: int) -> Row:
-    assert _runner is not None
-    return episode_row(_runner.rollout(seed))
-
-
-def _run(config: DictConfig, seeds: list[int]) -> Iterator[Row]:
-    if not seeds:
+    A process keeps environment and planner until a job has another configuration, so jobs that share one should follow
+    one another.
+    """
+    if not jobs:
         return
-    if config.workers == 1:
-        _begin(config)
-        yield from map(_episode, seeds)
+    numbered = list(enumerate(jobs))
+    if workers == 1:
+        try:
+            yield from map(_episode, numbered)
+        finally:
+            _close()
         return
-    with multiprocessing.get_context("spawn").Pool(
-        min(config.workers, len(seeds)), initializer=_begin, initargs=(config,)
-    ) as pool:
-        yield from pool.imap_unordered(_episode, seeds)
+    with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
+        yield from pool.imap_unordered(_episode, numbered)
         pool.close()  # lets workers exit normally and release resources, such as the compiler's locks
         pool.join()
+
+
+def _episode(numbered: tuple[int, Job]) -> tuple[int, Row]:
+    global _runner
+    number, (config, seed) = numbered
+    if _runner is None or _runner[0] != config:
+        _close()
+        torch.set_num_threads(1)  # one thread per worker: more threads per process slow all of them down
+        _runner = config, make_runner(config)
+    return number, episode_row(_runner[1].rollout(seed))
+
+
+def _close() -> None:
+    global _runner
+    if _runner is not None:
+        _runner[1].env.close()
+        _runner = None

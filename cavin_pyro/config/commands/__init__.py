@@ -5,6 +5,7 @@ from __future__ import annotations
 from cavin_pyro.config.commands.collection import CollectConfig
 from cavin_pyro.config.commands.criticism import CheckConfig
 from cavin_pyro.config.commands.episodes import DemoConfig, EvaluateConfig, PlanConfig
+from cavin_pyro.config.commands.reproduction import ReproduceConfig
 from cavin_pyro.config.commands.training import PretrainConfig, TrainConfig
 
 COMMANDS: dict[str, type] = {
@@ -15,4 +16,5 @@ COMMANDS: dict[str, type] = {
     "plan": PlanConfig,
     "evaluate": EvaluateConfig,
     "demo": DemoConfig,
+    "reproduce": ReproduceConfig,
 }

@@ -1,0 +1,36 @@
+"""Options of the command reproduce."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.options import option
+
+
+@dataclass
+class ReproduceConfig:
+    """Options of `python -m cavin_pyro.reproduce`."""
+
+    defaults: list[Any] = field(default_factory=lambda: ["_self_", "base"])
+    scale: str = option(
+        "smoke",
+        "how large: smoke shows that everything runs (its rates mean nothing), small trains and evaluates little, "
+        "paper takes the paper's 500,000 transitions and 1,000 episodes per cell; minimal is for tests",
+        choices="cavin_pyro.reproduction.scales.SCALES",
+        group="run",
+    )
+    methods: list[str] = option(
+        ["cavin", "sectar", "cvae_mpc", "mpc"],
+        "methods to train and evaluate",
+        choices="cavin_pyro.reproduction.methods.METHODS",
+        group="run",
+    )
+    output: str | None = option(
+        None, "folder for everything, where an unfinished run is resumed; by default one in runs/reproduce", group="run"
+    )
+    workers: int = option(2, "processes; the table does not depend on it", minimum=1, group="run")
+    shard: str = option(
+        "1/1", "i/n: the i-th of every n trainings and their episodes, so that n machines share the work", group="run"
+    )
+    merge: list[str] = option([], "folders of finished shards, [a,b], whose tables are joined", group="run")

@@ -1,0 +1,38 @@
+"""Reproduce the paper's figure: `python -m cavin_pyro.reproduce scale=smoke`."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from cavin_pyro.config.application import command
+
+
+@command("reproduce")
+def main(config: DictConfig) -> None:
+    """Run the paper's experiments from nothing: collect, pretrain, train four methods, evaluate every cell, draw.
+
+    Resumes what was interrupted, and never does again what is finished.
+    """
+    from pathlib import Path
+
+    from cavin_pyro.reproduction.merging import IGNORED, merge_tables
+    from cavin_pyro.reproduction.pipeline import run_pipeline
+    from cavin_pyro.reproduction.results import write_results
+    from cavin_pyro.storage.files import output_folder, write_json
+    from cavin_pyro.storage.provenance import provenance
+    from cavin_pyro.storage.run_directory import check_same_run, write_config
+
+    check_same_run(Path(config.output), config, ignore=IGNORED)
+    home = output_folder(config.output)
+    write_config(home, config)
+    write_json(home / "provenance.json", provenance())
+    if config.merge:
+        rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
+    else:
+        rows = run_pipeline(config, home)
+    for path in write_results(home, rows, f"python -m cavin_pyro.reproduce scale={config.scale}"):
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

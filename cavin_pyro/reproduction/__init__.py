@@ -1,0 +1,1 @@
+"""The paper's experiments from nothing: stages, cells, table of episodes, statistics and figures."""

@@ -1,0 +1,87 @@
+"""The paper's figure: success with dense and sparse rewards, and against the number of objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
+from cavin_pyro.storage.files import atomic_write
+
+DOTS_PER_INCH = 120
+BAR_WIDTH = 0.2
+TITLES = {"paper": "planners as in the paper", "ours": "planners with our additions"}
+Rates = Sequence[Mapping[str, Any]]
+
+
+def draw_figure(path: Path, rates: Rates, *, planner: str, criterion: str) -> None:
+    """Both rows of the paper's figure, for one kind of planner and one criterion.
+
+    Args:
+        rates: as of `cavin_pyro.reproduction.statistics.rates`. Bars and lines are rates of success, whiskers the wider
+            of the two intervals on each side.
+    """
+    own = [rate for rate in rates if rate["planner"] == planner and rate["criterion"] == criterion]
+    tasks = list(dict.fromkeys(rate["task"] for rate in own))
+    figure = Figure(figsize=(3.6 * len(tasks) + 0.4, 5.6), dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(2, len(tasks), squeeze=False, sharey=True)
+    for column, task in enumerate(tasks):
+        of_task = [rate for rate in own if rate["task"] == task]
+        _draw_rewards(axes[0][column], of_task)
+        _draw_objects(axes[1][column], of_task)
+        axes[0][column].set_title(task)
+    for row in axes:
+        row[0].set_ylabel("success, %")
+    handles, labels = axes[1][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.suptitle(f"{TITLES.get(planner, planner)}; criterion: {criterion}", fontsize=10)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, facecolor="white", metadata={"Software": None})
+
+
+def _draw_rewards(axes: Axes, rates: Rates) -> None:
+    """Dense and sparse rewards, three objects."""
+    kinds = ("dense", "sparse")
+    for number, (name, method) in enumerate(METHODS.items()):
+        chosen = [rate for rate in rates if rate["method"] == name and rate["objects"] == TOP_ROW_OBJECTS]
+        for place, kind in enumerate(kinds):
+            for rate in chosen:
+                if rate["reward"] == kind:
+                    x = place + (number - (len(METHODS) - 1) / 2) * BAR_WIDTH
+                    axes.bar(x, 100 * rate["rate"], BAR_WIDTH * 0.9, color=method.color)
+                    axes.errorbar(x, 100 * rate["rate"], _whiskers([rate]), color="black", capsize=2, linewidth=0.8)
+                    axes.annotate(f"n={rate['episodes']}", (x, 1), rotation=90, fontsize=5, ha="center", va="bottom")
+    axes.set_xticks(range(len(kinds)), [f"{kind} reward" for kind in kinds])
+    axes.set_ylim(0, 104)
+
+
+def _draw_objects(axes: Axes, rates: Rates) -> None:
+    """Sparse rewards, against the number of objects."""
+    for name, method in METHODS.items():
+        chosen = [rate for rate in rates if rate["method"] == name and rate["reward"] == "sparse"]
+        chosen.sort(key=lambda rate: rate["objects"])
+        if chosen:
+            axes.errorbar(
+                [rate["objects"] for rate in chosen],
+                [100 * rate["rate"] for rate in chosen],
+                _whiskers(chosen),
+                color=method.color,
+                label=method.label,
+                marker="o",
+                markersize=4,
+                capsize=2,
+                linewidth=1.2,
+            )
+    axes.set_xticks(sorted({rate["objects"] for rate in rates}))
+    axes.set_xlabel("objects")
+
+
+def _whiskers(rates: Rates) -> list[list[float]]:
+    low = [100 * max(0.0, rate["rate"] - min(rate["low"], rate["seed_low"])) for rate in rates]
+    high = [100 * max(0.0, max(rate["high"], rate["seed_high"]) - rate["rate"]) for rate in rates]
+    return [low, high]

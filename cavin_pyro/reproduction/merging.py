@@ -1,0 +1,51 @@
+"""Join the tables of shards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.reproduction.cells import evaluations
+from cavin_pyro.reproduction.scales import SCALES
+from cavin_pyro.reproduction.table import TABLE, read_table, write_table
+from cavin_pyro.storage.run_directory import check_same_run
+
+IGNORED = ("output", "workers", "shard", "merge")  # options that may differ between shards
+
+
+def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """Join the episodes of shards, in the order that a run of all of them has, and write the table.
+
+    Raises:
+        UserError: a folder holds no finished shard or one of other options, or episodes are missing.
+    """
+    rows: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for folder in folders:
+        if not (folder / TABLE).exists():
+            raise UserError(f"merge={folder} holds no {TABLE}: let its shard end first")
+        check_same_run(folder, config, ignore=IGNORED)
+        for row in read_table(folder / TABLE):
+            rows[_key(row)] = row
+    wanted = [
+        (one.cell.method, one.cell.planner, one.cell.task, one.cell.reward, one.cell.objects, one.training_seed, seed)
+        for one in evaluations(SCALES[config.scale], config.methods)
+        for seed in range(one.seed, one.seed + one.episodes)
+    ]
+    missing = [key for key in wanted if key not in rows]
+    if missing:
+        method, _, task, *_, training_seed, _ = missing[0]
+        raise UserError(
+            f"the folders of merge lack {len(missing)} of {len(wanted)} episodes, the first of {method} in {task} with "
+            f"training seed {training_seed}: give every shard's folder"
+        )
+    ordered = [rows[key] for key in wanted]
+    write_table(home / TABLE, ordered)
+    return ordered
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("method", "planner", "task", "reward", "objects", "training_seed", "seed"))

@@ -1,0 +1,59 @@
+"""The four methods of the paper's figure, each with its training and two planners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# The paper's way of planning, for the baselines as `planner=paper` has it for CAVIN.
+WITHOUT_ADDITIONS = (
+    "planner.warm_start=false",
+    "pushes_per_plan=null",
+    "margin=0",
+    "matmul_precision=float32",
+)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method. label: in figures. training: overrides of `train`. planners: overrides of `evaluate`, by planner."""
+
+    name: str
+    label: str
+    color: str
+    training: tuple[str, ...]
+    planners: dict[str, tuple[str, ...]]
+
+
+METHODS: dict[str, Method] = {
+    one.name: one
+    for one in (
+        Method(
+            "cavin",
+            "CAVIN",
+            "#D55E00",
+            ("model=cascaded", "guide=cascaded"),
+            {"paper": ("planner=paper",), "ours": ("planner=cavin",)},
+        ),
+        Method(
+            "sectar",
+            "SeCTAR",
+            "#0072B2",
+            ("model=single_latent", "guide=single_latent"),
+            {"paper": ("planner=sectar", *WITHOUT_ADDITIONS), "ours": ("planner=sectar",)},
+        ),
+        Method(
+            "cvae_mpc",
+            "CVAE-MPC",
+            "#009E73",
+            ("model=flat", "guide=flat"),
+            {"paper": ("planner=cvae_mpc", *WITHOUT_ADDITIONS), "ours": ("planner=cvae_mpc",)},
+        ),
+        Method(
+            "mpc",
+            "MPC",
+            "#7F7F7F",
+            ("model=dynamics", "guide=none", "prior=standard"),
+            {"paper": ("planner=mpc", *WITHOUT_ADDITIONS), "ours": ("planner=mpc",)},
+        ),
+    )
+}

@@ -1,0 +1,158 @@
+"""The pipeline: what is finished is never done again, and a killed run goes on where it stopped."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
+from cavin_pyro.reproduction.cells import Evaluation, evaluations
+from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.scales import SCALES, Scale
+from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
+from cavin_pyro.reproduction.table import TABLE, episode_row, write_table
+
+SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
+
+
+def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
+    """Collect, pretrain, train and evaluate, as far as that has not been done, and write the table of episodes.
+
+    Args:
+        config: of the command `reproduce`. `shard=i/n`: the i-th of every n trainings and their episodes only.
+
+    Returns:
+        The table's rows.
+
+    Raises:
+        UserError: an option that cannot be used, or a stage that failed.
+    """
+    scale = SCALES[config.scale]
+    first = preparation(scale, home, workers=config.workers)
+    learning = of_shard(trainings(scale, home, config.methods), config.shard)
+    folders = {stage.folder for stage in learning}
+    own = [
+        one
+        for one in evaluations(scale, config.methods)
+        if training_folder(home, one.cell.method, one.training_seed) in folders
+    ]
+    with _whole_progress([*first, *learning], scale, own, home, config.workers) as bar:
+        for stages in ([first[0]], [first[1]], learning):  # each group needs the one before it
+            run_stages(stages, config.workers, bar.update_stages)
+        found = _evaluate(scale, own, home, config.workers, bar)
+    rows = [episode_row(one, row) for one in own for row in found[one]]
+    write_table(home / TABLE, rows)
+    return rows
+
+
+def of_shard(stages: list[Stage], shard: str) -> list[Stage]:
+    """The trainings of `i/n`: the i-th, counted from 1, and every n-th after it.
+
+    Raises:
+        UserError: it is not of that form.
+    """
+    number, _, count = shard.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise UserError(f"shard must be i/n with 1 <= i <= n, such as 2/3, not {shard}")
+    return stages[int(number) - 1 :: int(count)]
+
+
+def evaluation_folder(home: Path, evaluation: Evaluation) -> Path:
+    """Where the episodes of a cell and a training lie."""
+    return home / "evaluate" / evaluation.name
+
+
+def _evaluate(
+    scale: Scale, own: Sequence[Evaluation], home: Path, workers: int, bar: _Bar
+) -> dict[Evaluation, list[Row]]:
+    """The episodes of all evaluations, one queue for all, so that no worker waits for the end of a cell."""
+    rows = {one: begin(_made(evaluation_folder(home, one))) for one in own}
+    jobs, owners = [], []
+    for one, config in _configurations(scale, own, home):
+        for seed in missing_seeds(config, rows[one]):
+            jobs.append((config, seed))
+            owners.append(one)
+    for number, row in run_jobs(jobs, workers):
+        one = owners[number]
+        rows[one][row["seed"]] = row
+        append(evaluation_folder(home, one), row)
+        bar.update(scale.episode_seconds / workers)
+    return {one: [found[seed] for seed in sorted(found)][: one.episodes] for one, found in rows.items()}
+
+
+def _configurations(scale: Scale, own: Sequence[Evaluation], home: Path) -> Iterator[tuple[Evaluation, DictConfig]]:
+    """The options of every evaluation, composed once for each method, planner and task, because that takes time."""
+    composed: dict[tuple[str, str, str], DictConfig] = {}
+    for one in own:
+        cell = one.cell
+        key = cell.method, cell.planner, cell.task
+        if key not in composed:
+            planner = METHODS[cell.method].planners[cell.planner]
+            composed[key] = compose("evaluate", f"task={cell.task}", *SHARED, *planner, *scale.planning, "output=-")
+        config = composed[key].copy()
+        config.reward, config.objects = cell.reward, cell.objects
+        config.seed, config.episodes = one.seed, one.episodes
+        config.checkpoint = str(training_folder(home, cell.method, one.training_seed) / "checkpoint.safetensors")
+        config.output = str(evaluation_folder(home, one))
+        _write_once(evaluation_folder(home, one) / "config.yaml", config)
+        yield one, config
+
+
+class _Bar:
+    """Progress over the whole pipeline, in seconds of one reference machine; the bar scales the time left."""
+
+    def __init__(self, stages: Sequence[Stage], episodes_done: float, episodes: float) -> None:
+        self._stages, self._extra = stages, episodes_done
+        self._total = total = sum(stage.seconds for stage in stages) + episodes
+        self._bar = tqdm(
+            desc="reproducing",
+            total=total,
+            initial=min(self._done(), total),
+            file=sys.stderr,
+            bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left",
+            mininterval=0.5 if sys.stderr.isatty() else 30.0,
+        )
+
+    def _done(self) -> float:
+        return sum(stage.seconds_done for stage in self._stages) + self._extra
+
+    def update_stages(self) -> None:
+        self._bar.update(max(0.0, min(self._done(), self._total) - self._bar.n))
+
+    def update(self, seconds: float) -> None:
+        self._extra += seconds
+        self.update_stages()
+
+    def close(self) -> None:
+        self._bar.close()
+
+
+@contextmanager
+def _whole_progress(
+    stages: Sequence[Stage], scale: Scale, own: Sequence[Evaluation], home: Path, workers: int
+) -> Iterator[_Bar]:
+    each = scale.episode_seconds / workers
+    done = sum(len(begin(_made(evaluation_folder(home, one)))) for one in own)
+    bar = _Bar(stages, done * each, sum(one.episodes for one in own) * each)
+    try:
+        yield bar
+    finally:
+        bar.close()
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _write_once(path: Path, config: DictConfig) -> None:
+    if not path.exists():
+        OmegaConf.save(config, path)

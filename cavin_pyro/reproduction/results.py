@@ -1,0 +1,87 @@
+"""Everything that follows from the table of episodes: figures, statistics and a page of results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro.reproduction.figure import TITLES, draw_figure
+from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
+from cavin_pyro.reproduction.statistics import interquartile_means, paired_tests, rates
+from cavin_pyro.reproduction.table import CRITERIA, Row
+from cavin_pyro.storage.files import atomic_write, write_json
+
+PAGE, STATISTICS = "results.md", "statistics.json"
+
+
+def write_results(home: Path, rows: Sequence[Row], command: str) -> list[Path]:
+    """Write figures, `statistics.json` and `results.md`, from the table alone; returns their paths.
+
+    Args:
+        command: the line that makes them anew, for the page.
+    """
+    measured = rates(rows)
+    compared, means = paired_tests(rows), interquartile_means(rows)
+    write_json(home / STATISTICS, {"rates": measured, "tests": compared, "interquartile_means": means})
+    planners = list(dict.fromkeys(row["planner"] for row in rows))
+    figures = [(planner, criterion) for planner in planners for criterion in CRITERIA]
+    for planner, criterion in figures:
+        draw_figure(home / f"figure-{planner}-{criterion}.png", measured, planner=planner, criterion=criterion)
+    sections = [_section(planner, criterion, measured, compared) for planner, criterion in figures]
+    with atomic_write(home / PAGE) as temporary:
+        temporary.write_text("\n".join([*_head(rows, command), *sections]), encoding="utf-8")
+    return [home / PAGE, home / STATISTICS, *(home / f"figure-{one}-{other}.png" for one, other in figures)]
+
+
+def _head(rows: Sequence[Row], command: str) -> list[str]:
+    seeds = sorted({row["seed"] for row in rows})
+    trainings = len({row["training_seed"] for row in rows})
+    return [
+        "# The paper's experiments",
+        "",
+        f"{len(rows)} episodes, scenes {seeds[0]} to {seeds[-1]}, {trainings} training seed(s) of each method, objects",
+        "told apart in the depth image alone. Made by",
+        "",
+        f"    {command}",
+        "",
+        "Intervals are at 95 %: Wilson's, as if all episodes were of one model. p: CAVIN against the method, episode",
+        "by episode, exact McNemar test with Holm's correction.",
+        "",
+    ]
+
+
+def _section(planner: str, criterion: str, measured: Sequence[Mapping[str, Any]], compared: Sequence[Any]) -> str:
+    own = [one for one in measured if one["planner"] == planner and one["criterion"] == criterion]
+    p_values = {_key(one): one["p_holm"] for one in compared if one["criterion"] == criterion}
+    lines = [
+        f"## {TITLES.get(planner, planner).capitalize()}, criterion {criterion}",
+        "",
+        f"![](figure-{planner}-{criterion}.png)",
+        "",
+        "| task | reward | objects | " + " | ".join(METHODS[name].label for name in METHODS) + " |",
+        "| --- " * (3 + len(METHODS)) + "|",
+    ]
+    cells = dict.fromkeys((one["task"], one["reward"], one["objects"]) for one in own)
+    for task, reward, objects in sorted(cells, key=lambda cell: (cell[2] != TOP_ROW_OBJECTS, cell)):
+        entries = []
+        for name in METHODS:
+            found = [
+                one
+                for one in own
+                if (one["method"], one["task"], one["reward"], one["objects"]) == (name, task, reward, objects)
+            ]
+            entries.append(_entry(found[0], p_values) if found else "")
+        lines.append(f"| {task} | {reward} | {objects} | " + " | ".join(entries) + " |")
+    return "\n".join([*lines, ""])
+
+
+def _entry(rate: Mapping[str, Any], p_values: Mapping[tuple[Any, ...], float]) -> str:
+    text = f"{100 * rate['rate']:.1f} % ({100 * rate['low']:.1f} to {100 * rate['high']:.1f}), n = {rate['episodes']}"
+    p = p_values.get(_key(rate))
+    return text if p is None else f"{text}, p = {p:.2g}"
+
+
+def _key(one: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(one[name] for name in ("method", "planner", "task", "reward", "objects"))

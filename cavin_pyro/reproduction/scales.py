@@ -1,0 +1,110 @@
+"""How large a reproduction is: data, training, scenes and episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+TASKS = ("clearing", "insertion", "crossing")
+OBJECT_COUNTS = (1, 2, 3, 4, 5)
+TOP_ROW_OBJECTS = 3  # objects in the top row of the paper's figure, dense and sparse
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Numbers of a reproduction.
+
+    Attributes:
+        transitions: pushes to collect, for all methods alike. training_seeds: trainings of each method.
+        episodes: per cell of the top row. bottom_episodes: per cell of the bottom row. Both are shared by the training
+            seeds; each of them gets scenes of its own, which are the same for all methods.
+        first_scene: seed of the first scene; no other run uses these scenes.
+        planner_seconds: what an episode costs on one core, roughly, for the time left.
+        pretraining, training, planning: further overrides of `pretrain`, `train` and `evaluate`.
+    """
+
+    transitions: int
+    training_seeds: tuple[int, ...]
+    episodes: int
+    bottom_episodes: int
+    first_scene: int
+    episode_seconds: float
+    training_seconds: float
+    tasks: tuple[str, ...] = TASKS
+    object_counts: tuple[int, ...] = OBJECT_COUNTS
+    planners: tuple[str, ...] = ("paper", "ours")
+    pretraining: tuple[str, ...] = ()
+    training: tuple[str, ...] = ()
+    planning: tuple[str, ...] = ()
+
+
+TINY_TRAINING = (
+    "trainer.steps=20",
+    "trainer.validate_every=10",
+    "trainer.batch_size=16",
+    "trainer.validation_windows=32",
+    "windows.minimum_move=0.001",
+    "windows.validation_fraction=0.3",
+)
+QUICK_TRAINING = (
+    "trainer.learning_rate=1e-3",
+    "trainer.schedule=cosine",
+    "trainer.batch_size=256",
+    "trainer.batches=bucketed",
+    "trainer.matmul_precision=bfloat16",
+    "trainer.patience=100",
+    "windows.negative_fraction=0.5",
+    "prior=conditional",
+)
+
+SCALES: dict[str, Scale] = {
+    # For tests: every stage once, in a minute.
+    "minimal": Scale(
+        transitions=100,
+        training_seeds=(0,),
+        episodes=1,
+        bottom_episodes=1,
+        first_scene=50_000,
+        episode_seconds=0.5,
+        training_seconds=5.0,
+        tasks=("clearing",),
+        object_counts=(1, 3),
+        planners=("paper",),
+        pretraining=("clouds=100", "steps=2", "batch_size=8"),
+        training=TINY_TRAINING,
+        planning=("planner.samples=8", "planner.horizon=6", "maximum_steps=2"),
+    ),
+    # To see that everything runs: minutes. Its success rates mean nothing.
+    "smoke": Scale(
+        transitions=400,
+        training_seeds=(0,),
+        episodes=2,
+        bottom_episodes=1,
+        first_scene=51_000,
+        episode_seconds=1.0,
+        training_seconds=10.0,
+        pretraining=("clouds=1000", "steps=50", "batch_size=32"),
+        training=TINY_TRAINING,
+        planning=("planner.samples=32", "planner.horizon=6", "maximum_steps=3"),
+    ),
+    "small": Scale(
+        transitions=20_000,
+        training_seeds=(0, 1),
+        episodes=10,
+        bottom_episodes=4,
+        first_scene=60_000,
+        episode_seconds=5.0,
+        training_seconds=180.0,
+        pretraining=("clouds=20000", "steps=2000"),
+        training=(*QUICK_TRAINING, "trainer.steps=4000"),
+    ),
+    "paper": Scale(
+        transitions=500_000,
+        training_seeds=(0, 1, 2),
+        episodes=1_000,
+        bottom_episodes=300,
+        first_scene=100_000,
+        episode_seconds=5.0,
+        training_seconds=15_000.0,
+        training=("prior=conditional",),
+    ),
+}

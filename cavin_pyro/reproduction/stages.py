@@ -1,0 +1,168 @@
+"""Stages before the evaluation: collect, pretrain and train, each a command of this program and a folder of its own."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+
+from cavin_pyro.config.commands.training import TrainerConfig
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.scales import Scale
+
+COLLECTING_SECONDS = 0.03  # per transition and core, for the time left
+PRETRAINING_SECONDS = 60.0
+POLLING_SECONDS = 2.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One command. folder: where it writes. result: the file there that tells that it has finished.
+
+    seconds: what it costs, roughly, for the time left. fraction: how much of it is done, from its folder.
+    """
+
+    command: str
+    options: tuple[str, ...]
+    folder: Path
+    result: str
+    seconds: float
+    fraction: Callable[[Path], float] = lambda folder: 0.0
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        return (self.folder / self.result).exists()
+
+    @property
+    def seconds_done(self) -> float:
+        """Of `seconds`, as far as the folder tells."""
+        return self.seconds * (1.0 if self.finished else min(1.0, self.fraction(self.folder)))
+
+    @property
+    def line(self) -> str:
+        """The command as a user types it."""
+        return shlex.join(["python", "-m", f"cavin_pyro.{self.command}", *self.options, f"output={self.folder}"])
+
+    def run(self) -> None:
+        """Run the command in a process of its own; what it prints goes to `log.txt` in its folder.
+
+        Raises:
+            UserError: it failed, or an earlier process still runs it.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with open(self.folder / "lock", "w", encoding="utf-8") as lock, open(self.folder / "log.txt", "ab") as log:
+            try:
+                # The child inherits the lock and holds it until it ends, even if this process is killed.
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(
+                    f"{self.folder} is being written by a process of an earlier run: wait until it ends, or stop it"
+                ) from None
+            words = shlex.split(self.line)[1:]
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            done = subprocess.run(
+                [sys.executable, *words], stdout=log, stderr=log, pass_fds=[lock.fileno()], env=environment
+            )
+        if done.returncode:
+            last = (self.folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+            raise UserError(f"{self.line} failed: {' '.join(last).removeprefix('error: ')} ({self.folder}/log.txt)")
+
+
+def preparation(scale: Scale, home: Path, *, workers: int) -> list[Stage]:
+    """Data, then the PointNet that all methods share."""
+
+    def collected(folder: Path) -> float:
+        return _number(folder / "metadata.json", "transitions") / scale.transitions
+
+    collect = Stage(
+        "collect",
+        (f"transitions={scale.transitions}", f"workers={workers}"),
+        home / "data",
+        "statistics.png",
+        scale.transitions * COLLECTING_SECONDS / workers,
+        collected,
+    )
+    pretrain = Stage(
+        "pretrain",
+        (f"data={collect.folder}", *scale.pretraining),
+        home / "pretrain",
+        "reconstructions.png",
+        PRETRAINING_SECONDS,
+    )
+    return [collect, pretrain]
+
+
+def trainings(scale: Scale, home: Path, methods: Sequence[str]) -> list[Stage]:
+    """Every method with every training seed, on the same data and features."""
+    steps = next((int(one.partition("=")[2]) for one in scale.training if one.startswith("trainer.steps=")), None)
+
+    def trained(folder: Path) -> float:
+        return _last_step(folder / "metrics.csv") / (steps or TrainerConfig.steps)
+
+    return [
+        Stage(
+            "train",
+            (
+                f"data={home / 'data'}",
+                f"pointnet={home / 'pretrain' / 'pointnet.safetensors'}",
+                *scale.training,
+                *METHODS[name].training,
+                f"seed={seed}",
+            ),
+            training_folder(home, name, seed),
+            "training.png",
+            scale.training_seconds,
+            trained,
+        )
+        for seed in scale.training_seeds
+        for name in methods
+    ]
+
+
+def training_folder(home: Path, method: str, seed: int) -> Path:
+    """Where a training writes."""
+    return home / "train" / f"{method}-{seed}"
+
+
+def run_stages(stages: Sequence[Stage], workers: int, progress: Callable[[], None]) -> None:
+    """Run what is unfinished, `workers` at a time; the stages do not depend on one another.
+
+    Args:
+        progress: called every second or two.
+
+    Raises:
+        UserError: one has failed; those that run go on to their end, others do not begin.
+    """
+    with ThreadPoolExecutor(workers) as pool:
+        running = {pool.submit(stage.run) for stage in stages if not stage.finished}
+        while running:
+            ended, running = wait(running, timeout=POLLING_SECONDS, return_when=FIRST_COMPLETED)
+            progress()
+            for one in ended:
+                if one.exception() is not None:
+                    pool.shutdown(cancel_futures=True, wait=False)
+                one.result()
+
+
+def _number(path: Path, name: str) -> float:
+    try:
+        return float(json.loads(path.read_text(encoding="utf-8"))[name])
+    except (OSError, ValueError, KeyError):
+        return 0.0
+
+
+def _last_step(path: Path) -> float:
+    """The first column of the last line of a run's metrics."""
+    try:
+        return float(path.read_text(encoding="utf-8").splitlines()[-1].partition(",")[0])
+    except (OSError, ValueError, IndexError):
+        return 0.0

@@ -1,0 +1,73 @@
+"""One tidy table: a row per episode, from which every figure and number follows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow
+from pyarrow import parquet
+
+from cavin_pyro.reproduction.cells import Evaluation
+from cavin_pyro.storage.files import atomic_write
+
+CRITERIA = ("strict", "published")
+TABLE = "episodes.parquet"
+SCHEMA = pyarrow.schema(
+    [
+        ("method", pyarrow.string()),
+        ("planner", pyarrow.string()),
+        ("task", pyarrow.string()),
+        ("reward", pyarrow.string()),
+        ("objects", pyarrow.int8()),
+        ("training_seed", pyarrow.int32()),
+        ("seed", pyarrow.int64()),
+        ("strict_outcome", pyarrow.string()),
+        ("strict_steps", pyarrow.int16()),
+        ("strict_return", pyarrow.float64()),
+        ("published_outcome", pyarrow.string()),
+        ("published_steps", pyarrow.int16()),
+        ("published_return", pyarrow.float64()),
+        ("unsafe", pyarrow.int16()),
+        ("ineffective", pyarrow.int16()),
+    ]
+)
+Row = dict[str, Any]
+
+
+def episode_row(evaluation: Evaluation, row: Mapping[str, Any]) -> Row:
+    """A row of the table from a line of `episodes.jsonl`, of an episode by the published criterion.
+
+    Times are left out: they differ from run to run.
+    """
+    cell = evaluation.cell
+    return {
+        "method": cell.method,
+        "planner": cell.planner,
+        "task": cell.task,
+        "reward": cell.reward,
+        "objects": cell.objects,
+        "training_seed": evaluation.training_seed,
+        "seed": row["seed"],
+        **{f"strict_{name}": row[f"strict_{name}"] for name in ("outcome", "steps", "return")},
+        **{f"published_{name}": row[name] for name in ("outcome", "steps", "return")},
+        **{name: row[name] for name in ("unsafe", "ineffective")},
+    }
+
+
+def write_table(path: Path, rows: Iterable[Row]) -> None:
+    """Write Parquet, whose bytes depend on the rows and on pyarrow's version alone."""
+    with atomic_write(path) as temporary:
+        parquet.write_table(pyarrow.Table.from_pylist(list(rows), schema=SCHEMA), temporary)
+
+
+def read_table(path: Path) -> list[Row]:
+    """The rows of a table, in their order."""
+    return list(parquet.read_table(path, schema=SCHEMA).to_pylist())
+
+
+def as_text(value: Any) -> str:
+    """JSON whose bytes depend on the value alone."""
+    return json.dumps(value, indent=1, sort_keys=True) + "\n"

@@ -1,0 +1,90 @@
+"""`reproduce`, from an empty folder to the figure, in its smallest size."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from cavin_pyro.reproduction.stages import Stage, run_stages
+
+WHOLE = ("scale=minimal", "methods=[cavin,mpc]", "output=whole")
+RESULTS = ("episodes.parquet", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again(
+    shell: SimpleNamespace, tmp_path: Path
+) -> None:
+    first = shell.run_command("reproduce", *WHOLE, folder=tmp_path)
+    assert first.status == 0, first.errors
+    assert "whole/results.md" in first.output and "whole/figure-paper-strict.png" in first.output
+    home, made = tmp_path / "whole", contents(tmp_path / "whole")
+    finished = {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
+    episodes = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
+    assert len(finished) == 2 and len(episodes) == 6
+    cut = sorted(episodes)[0]
+    cut.write_bytes(episodes[cut][:-20])  # as a machine that lost its power leaves it
+    for name in RESULTS:
+        (home / name).unlink()
+    again = shell.run_command("reproduce", *WHOLE, folder=tmp_path)
+    assert again.status == 0, again.errors
+    assert contents(home) == made
+    assert finished == {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
+    other = shell.run_command("reproduce", "scale=smoke", "output=whole", folder=tmp_path)
+    assert other.status == 2 and "holds a run with" in other.complaints[0]
+
+
+@pytest.mark.soak
+def test_a_reproduction_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace, tmp_path: Path) -> None:
+    whole = shell.run_command("reproduce", *WHOLE, folder=tmp_path)
+    assert whole.status == 0, whole.errors
+    broken = ("scale=minimal", "methods=[cavin,mpc]", "output=broken")
+    reached = ("data/metadata.json", "train/cavin-0/metrics.csv", "evaluate/*/episodes.jsonl")
+    for pattern in reached:
+        process = shell.start_command("reproduce", *broken, folder=tmp_path, quiet=True)
+        while process.poll() is None and not any((tmp_path / "broken").glob(pattern)):
+            time.sleep(0.05)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        wait_for_orphans(tmp_path / "broken")
+    done = shell.run_command("reproduce", *broken, folder=tmp_path)
+    assert done.status == 0, done.errors
+    assert contents(tmp_path / "broken") == contents(tmp_path / "whole")
+
+
+def wait_for_orphans(home: Path) -> None:
+    """Processes of a killed run hold their locks until they end."""
+    import fcntl
+
+    for path in home.rglob("lock"):
+        with open(path) as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+
+
+def test_a_stage_that_another_process_writes_is_refused(tmp_path: Path) -> None:
+    import fcntl
+
+    stage = Stage("train", (), tmp_path / "train", "training.png", 1.0)
+    stage.folder.mkdir()
+    with open(stage.folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(Exception, match="is being written by a process of an earlier run"):
+            stage.run()
+
+
+def test_a_failed_stage_is_told_with_its_command_and_its_last_line(tmp_path: Path) -> None:
+    stage = Stage("train", ("data=nowhere", "trainer.steps=0"), tmp_path / "train", "training.png", 1.0)
+    expected = (
+        r"train data=nowhere trainer.steps=0 output=.* failed: trainer.steps must be at least 1, not 0 \(.*log.txt\)"
+    )
+    with pytest.raises(Exception, match=expected):
+        run_stages([stage], 1, lambda: None)
+    shutil.rmtree(stage.folder)

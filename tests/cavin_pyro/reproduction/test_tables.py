@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.reproduction.cells import evaluations
+from cavin_pyro.reproduction.merging import merge_tables
+from cavin_pyro.reproduction.results import write_results
+from cavin_pyro.reproduction.scales import SCALES
+from cavin_pyro.reproduction.table import TABLE, episode_row, read_table, write_table
+from cavin_pyro.storage.run_directory import write_config
+
+METHODS = ["cavin", "mpc"]
+
+
+def played() -> list[dict[str, Any]]:
+    """The rows of a minimal run, in which CAVIN succeeds and MPC runs out of time."""
+    rows = []
+    for one in evaluations(SCALES["minimal"], METHODS):
+        outcome = "success" if one.cell.method == "cavin" else "timeout"
+        line = {"seed": one.seed, "outcome": outcome, "steps": 2, "return": 97.5, "unsafe": 1, "ineffective": 0}
+        strict = {"strict_outcome": outcome, "strict_steps": 2, "strict_return": 97.5}
+        rows.append(episode_row(one, {**line, **strict, "planning_ms": [1.0]}))
+    return rows
+
+
+def config(**options: Any) -> DictConfig:
+    overrides = ["scale=minimal", f"methods=[{','.join(METHODS)}]"]
+    return compose("reproduce", *overrides, *(f"{name}={value}" for name, value in options.items()))
+
+
+def shard(folder: Path, rows: list[dict[str, Any]], **options: Any) -> Path:
+    folder.mkdir()
+    write_config(folder, config(output=folder, **options))
+    write_table(folder / TABLE, rows)
+    return folder
+
+
+def test_a_table_comes_back_as_it_was_and_has_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        write_table(tmp_path / name, played())
+    assert read_table(tmp_path / "one") == played()
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+
+
+def test_shards_are_joined_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
+    rows = played()
+    write_table(tmp_path / "whole", rows)
+    cut = len(rows) // 2
+    folders = [
+        shard(tmp_path / "b", rows[cut:], shard="2/2"),
+        shard(tmp_path / "a", rows[:cut], shard="1/2", workers=1),
+    ]
+    home = tmp_path / "joined"
+    home.mkdir()
+    assert merge_tables(config(output=home), home, folders) == rows
+    assert (home / TABLE).read_bytes() == (tmp_path / "whole").read_bytes()
+
+
+def test_shards_that_lack_episodes_or_have_other_options_are_refused(tmp_path: Path) -> None:
+    half = shard(tmp_path / "half", played()[:2])
+    with pytest.raises(UserError, match=r"lack 4 of 6 episodes, the first of cavin in clearing with training seed 0"):
+        merge_tables(config(), tmp_path, [half])
+    with pytest.raises(UserError, match="holds a run with scale=minimal, not smoke"):
+        merge_tables(compose("reproduce", "scale=smoke", f"methods=[{','.join(METHODS)}]"), tmp_path, [half])
+    with pytest.raises(UserError, match=f"holds no {TABLE}: let its shard end first"):
+        merge_tables(config(), tmp_path, [tmp_path / "none"])
+    assert not (tmp_path / TABLE).exists()
+
+
+def test_figures_and_page_follow_from_the_table_and_have_the_same_bytes(tmp_path: Path) -> None:
+    written = []
+    for name in ("one", "other"):
+        home = tmp_path / name
+        home.mkdir()
+        written.append([(path.name, path.read_bytes()) for path in write_results(home, played(), "the command")])
+    assert written[0] == written[1]
+    names = {name for name, _ in written[0]}
+    assert names == {"results.md", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png"}
+    page = (tmp_path / "one" / "results.md").read_text()
+    assert "| clearing | sparse | 1 | 100.0 % (20.7 to 100.0), n = 1 |" in page and "    the command" in page
+    statistics = json.loads((tmp_path / "one" / "statistics.json").read_text())
+    assert set(statistics) == {"rates", "tests", "interquartile_means"}
