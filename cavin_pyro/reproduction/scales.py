@@ -18,8 +18,8 @@ class Scale:
         episodes: per cell of the top row. bottom_episodes: per cell of the bottom row. Both are shared by the training
             seeds; each of them gets scenes of its own, which are the same for all methods.
         first_scene: seed of the first scene; no other run uses these scenes.
-        planner_seconds: what an episode costs on one core, roughly, for the time left.
-        pretraining, training, planning: further overrides of `pretrain`, `train` and `evaluate`.
+        episode_seconds, training_seconds: what an episode and a training cost on one core, roughly, for the time left.
+        collection, pretraining, training, planning: further overrides of `collect`, `pretrain`, `train` and `evaluate`.
     """
 
     transitions: int
@@ -32,6 +32,7 @@ class Scale:
     tasks: tuple[str, ...] = TASKS
     object_counts: tuple[int, ...] = OBJECT_COUNTS
     planners: tuple[str, ...] = ("paper", "ours")
+    collection: tuple[str, ...] = ()
     pretraining: tuple[str, ...] = ()
     training: tuple[str, ...] = ()
     planning: tuple[str, ...] = ()
@@ -69,6 +70,7 @@ SCALES: dict[str, Scale] = {
         tasks=("clearing",),
         object_counts=(1, 3),
         planners=("paper",),
+        collection=("episodes_per_shard=5",),
         pretraining=("clouds=100", "steps=2", "batch_size=8"),
         training=TINY_TRAINING,
         planning=("planner.samples=8", "planner.horizon=6", "maximum_steps=2"),
@@ -82,6 +84,7 @@ SCALES: dict[str, Scale] = {
         first_scene=51_000,
         episode_seconds=1.0,
         training_seconds=10.0,
+        collection=("episodes_per_shard=10",),
         pretraining=("clouds=1000", "steps=50", "batch_size=32"),
         training=TINY_TRAINING,
         planning=("planner.samples=32", "planner.horizon=6", "maximum_steps=3"),

@@ -85,7 +85,7 @@ def preparation(scale: Scale, home: Path, *, workers: int) -> list[Stage]:
 
     collect = Stage(
         "collect",
-        (f"transitions={scale.transitions}", f"workers={workers}"),
+        (f"transitions={scale.transitions}", *scale.collection, f"workers={workers}"),
         home / "data",
         "statistics.png",
         scale.transitions * COLLECTING_SECONDS / workers,

@@ -12,7 +12,7 @@ import pytest
 
 from cavin_pyro.reproduction.stages import Stage, run_stages
 
-WHOLE = ("scale=minimal", "methods=[cavin,mpc]", "output=whole")
+WHOLE = ("scale=minimal", "methods=[cavin,mpc]", "workers=1", "output=whole")
 RESULTS = ("episodes.parquet", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png")
 
 
