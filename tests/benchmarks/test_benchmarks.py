@@ -102,7 +102,7 @@ def test_an_arm_survives_adversarial_pushes_without_growing_memory(tmp_path: Pat
 
 
 @pytest.mark.soak
-def test_the_robots_pushes_are_compared_with_the_sticks_and_drawn(tmp_path: Path) -> None:
+def test_pushes_of_robots_are_compared_with_the_sticks_and_drawn(tmp_path: Path) -> None:
     file, pictures = tmp_path / "robots.json", tmp_path / "pictures"
     run("robots", "--pushes", "5", "--robots", "panda", "--weights", "heavy", "--json", str(file))
     found = json.loads(file.read_text())

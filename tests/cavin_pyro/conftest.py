@@ -1,4 +1,4 @@
-"""Small products of the commands, made once per test process, and ways to run the commands."""
+"""Small datasets and checkpoints, made once per test process, and helpers that run the commands."""
 
 from __future__ import annotations
 

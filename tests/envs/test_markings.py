@@ -73,7 +73,7 @@ def test_objects_hide_tiles(scene: Scene, put: Callable) -> None:
     np.testing.assert_array_equal(painted[body], plain[body])
 
 
-def test_colours_can_be_told_apart_without_red_or_without_green() -> None:
+def test_colours_differ_without_red_or_without_green() -> None:
     """Goals from what surrounds them, as people see them who lack a kind of cones (Viénot et al., 1999)."""
     lacking = {
         "red": np.array([[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]]),

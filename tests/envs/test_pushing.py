@@ -178,7 +178,7 @@ def test_an_episode_is_cut_off_after_its_steps(make: Make) -> None:
         assert ends == [(False, False), (False, False), (False, True)]
 
 
-def test_an_episode_has_sixty_steps_unless_told_otherwise(make: Make) -> None:
+def test_an_episode_has_sixty_steps_by_default(make: Make) -> None:
     assert EPISODE_STEPS == 60
     assert make().maximum_steps == 60
 

@@ -131,7 +131,7 @@ def test_the_arm_is_in_the_photograph_of_a_push_and_never_in_the_image_that_is_o
     scene.close()
 
 
-def test_who_looks_while_the_arm_is_in_the_way_is_told(scene_of: Callable, put: Callable) -> None:
+def test_observing_with_the_arm_in_view_raises(scene_of: Callable, put: Callable) -> None:
     scene = scene_of("panda")
     scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
     scene.robot.move(np.array([0.5, 0.2, ABOVE_HEIGHT]))
@@ -269,7 +269,7 @@ def test_the_answer_does_not_depend_on_what_was_asked_before(name: str) -> None:
 # Files.
 
 
-def test_missing_files_are_told_in_one_line(tmp_path: Path) -> None:
+def test_missing_files_are_named_in_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "sawyer"
     folder.mkdir()
     urdf = folder / "sawyer_stick.urdf"

@@ -59,7 +59,7 @@ def pixel(image: DepthImage, x: float, y: float, z: float = 0.05) -> tuple[int, 
     return row, column
 
 
-def test_a_segmenter_that_clusters_is_told_the_depth_and_the_camera_alone() -> None:
+def test_the_cluster_segmenter_gets_only_the_depth_and_the_camera() -> None:
     names = set(DepthImage.__dataclass_fields__)
     assert names == {"depth", "camera"}
     assert list(inspect.signature(ClusterSegmenter.follow).parameters) == ["self", "image"]
@@ -192,7 +192,7 @@ def test_three_in_a_row_that_touch_and_are_pushed_on_keep_their_places_until_the
     np.testing.assert_allclose(ys, first, atol=0.004)
 
 
-def test_a_bent_object_that_lies_around_another_is_told_from_it() -> None:
+def test_a_bent_object_around_another_is_separated_from_it() -> None:
     def bent(x: float, y: float) -> list[tuple[float, float, float, float]]:
         return [(x, y, 0.015, 0.07), (x + 0.05, y - 0.055, 0.05, 0.015), (x + 0.05, y + 0.055, 0.05, 0.015)]
 

@@ -45,7 +45,7 @@ def in_one_line(answer: Answer) -> str:
     return line.removeprefix("error: ")
 
 
-def is_told(line: str) -> bool:
+def is_on_the_page(line: str) -> bool:
     """Whether the page's table has the line, or its beginning."""
     return any(
         line == line_of_error
@@ -94,7 +94,7 @@ def test_the_commands_of_the_page_work_and_need_trust(
         line = in_one_line(refused)
         assert f"runs/{run}/checkpoint.safetensors asks to run my_lab.{target}" in line
         assert line.endswith("pass trust=[my_lab]")
-        assert is_told(line) or target != "MyGuide"
+        assert is_on_the_page(line) or target != "MyGuide"
         (output,) = (one.removeprefix("output=") for one in overrides if one.startswith("output="))
         assert not (folder / output).exists()
         done = run_command(command, *overrides, folder=folder)
@@ -110,7 +110,7 @@ def test_the_commands_of_the_page_work_and_need_trust(
 def test_error_lines_are_those_of_the_page(overrides: str, folder: Path) -> None:
     ((_, line),) = (one for one in commands("mine") if one[0] == "train" and "output=runs/mine" in one[1])
     line_of_error = in_one_line(run_command("train", *line, "output=runs/never", *overrides.split(), folder=folder))
-    assert is_told(line_of_error), line_of_error
+    assert is_on_the_page(line_of_error), line_of_error
     assert not (folder / "runs" / "never").exists()
 
 
@@ -150,7 +150,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_sites_that_do_not_fit_are_told_as_the_page_says(mistake: str, window: Window) -> None:
+def test_errors_of_incompatible_sites_are_those_of_the_page(mistake: str, window: Window) -> None:
     code = CODE[0]
     for right, wrong in MISTAKES[mistake].items():
         assert right in code
@@ -158,4 +158,4 @@ def test_sites_that_do_not_fit_are_told_as_the_page_says(mistake: str, window: W
     model = CascadedModel(width=8)
     with pytest.raises(UserError) as caught:
         check_compatibility(model, module_of(code).MyGuide(model), window)
-    assert is_told(str(caught.value)), str(caught.value)
+    assert is_on_the_page(str(caught.value)), str(caught.value)

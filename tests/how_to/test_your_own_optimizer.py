@@ -74,7 +74,7 @@ def test_the_commands_of_the_page_work(command: str, options: str, tmp_path: Pat
     assert any((tmp_path / output).iterdir())
 
 
-def test_an_argument_that_it_does_not_take_is_told_as_the_page_says(tmp_path: Path) -> None:
+def test_the_error_of_an_unknown_argument_is_that_of_the_page(tmp_path: Path) -> None:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
     overrides = "planner.optimizer._target_=my_lab.EvolutionStrategy", "+planner.optimizer.depth=3"
     answer = run_command("plan", *overrides, "output=never", folder=tmp_path)
@@ -94,7 +94,7 @@ class Idle:
 
 
 @pytest.mark.parametrize("optimizer", [object(), Narrow(), Idle()], ids=["no optimizer", "narrow", "idle"])
-def test_mistakes_are_told_as_the_page_says(optimizer: Any, toy: Any) -> None:
+def test_errors_of_mistakes_are_those_of_the_page(optimizer: Any, toy: Any) -> None:
     state = toy.scenes([[(0.0, 0.0)]])
     with pytest.raises(ValueError) as error:
         toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.6, 0.0)), optimizer=optimizer).plan(state, toy.generators(1))

@@ -92,7 +92,7 @@ MISTAKES = {
 }
 
 
-def test_mistakes_are_told_as_the_page_says(folder: Path) -> None:
+def test_errors_of_mistakes_are_those_of_the_page(folder: Path) -> None:
     for mistake in MISTAKES:
         (folder / mistake).mkdir()
         for name, text in FILES.items():

@@ -120,7 +120,7 @@ def test_where_every_plan_has_died_the_best_of_the_dead_is_chosen(toy: SimpleNam
     assert not plan.expected_success.any()
 
 
-def test_predicted_failures_lose_unless_told_otherwise(toy: SimpleNamespace) -> None:
+def test_predicted_failures_lose_by_default(toy: SimpleNamespace) -> None:
     # The chosen subgoal is -0.25; sequence 0 ends at -0.5 (a failure), sequence 2 at 0.25, farther away.
     effects, motions = [[-0.25] * 3, [0.0] * 3], [[-0.125, -0.5, 0.25], [0.0] * 3]
     assert replay(toy, effects, motions).motion_codes[0, 0, 0] == 0.25

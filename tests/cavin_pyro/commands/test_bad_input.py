@@ -62,7 +62,7 @@ def answers(shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.Tem
 
 
 @pytest.mark.parametrize("command", GOOD)
-def test_the_words_to_which_bad_ones_are_added_are_good(command: str, answers: SimpleNamespace) -> None:
+def test_the_options_without_the_bad_ones_are_valid(command: str, answers: SimpleNamespace) -> None:
     name = name_of(command, "")
     assert answers.ended[name].status == 0, answers.ended[name].errors
     assert answers.left[name]

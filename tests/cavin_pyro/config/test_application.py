@@ -91,7 +91,7 @@ def test_our_own_packages_are_ours() -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_a_foreign_package_of_the_same_name_is_told_apart(
+def test_a_foreign_package_of_the_same_name_is_detected(
     package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / package).mkdir()
@@ -204,7 +204,7 @@ def test_a_configuration_from_python_is_that_of_the_command() -> None:
     assert "hydra" not in config
 
 
-def test_words_from_python_are_refused_as_on_the_command_line() -> None:
+def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
     for overrides, complaint in {
         ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from cascaded, flat,",
         ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",

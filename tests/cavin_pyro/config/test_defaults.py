@@ -93,7 +93,7 @@ def test_presets_name_classes_that_exist_and_repeat_none_of_their_defaults(prese
     check(OmegaConf.to_container(OmegaConf.load(preset)))
 
 
-def test_one_word_is_the_papers_algorithm() -> None:
+def test_one_option_selects_the_papers_algorithm() -> None:
     config = compose("plan", "planner=paper")
     for name, value in PAPER.items():
         assert OmegaConf.select(config, name) == value

@@ -33,7 +33,7 @@ def test_collecting_packs_objects_closer_with_every_preset() -> None:
         assert object_ranges(compose("collect", *overrides).env).clearance == 0.12
 
 
-def test_the_objects_of_a_folder_are_all_drawn_by_default(tiny_assets: Path) -> None:
+def test_all_objects_of_a_folder_are_sampled_by_default(tiny_assets: Path) -> None:
     overrides = [f"env.assets={tiny_assets}", "env.objects="]
     scans, both = (object_ranges(compose("plan", overrides[0], overrides[1] + name).env) for name in ("ycb", "mixed"))
     assert scans.names == ("brick", "mug", "angle")

@@ -136,6 +136,6 @@ def test_what_json_cannot_hold_is_a_bug() -> None:
         plain({"folder": [Path("here")]})
 
 
-def test_a_rendered_section_survives_the_disk_and_is_rendered_alike_every_time() -> None:
+def test_a_rendered_section_survives_the_disk_and_rendering_is_deterministic() -> None:
     part = render(section())
     assert json.loads(json.dumps(part)) == part == render(section())

@@ -92,20 +92,20 @@ def test_a_corrupt_shard_has_no_features(own_pushes: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, 10, 40])
 def test_the_wanted_number_of_real_clouds_is_sampled_for_pretraining(count: int, pushes: Path) -> None:
-    drawn = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
-    assert drawn.shape == (count, 256, 3)
-    assert drawn.dtype == np.float32
-    np.testing.assert_allclose(drawn.mean(axis=1), 0.0, atol=1e-3)  # metres from their centres
-    assert (np.ptp(drawn, axis=1).max(axis=-1) > 0.01).all()  # padding would be a single point
+    sampled = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
+    assert sampled.shape == (count, 256, 3)
+    assert sampled.dtype == np.float32
+    np.testing.assert_allclose(sampled.mean(axis=1), 0.0, atol=1e-3)  # metres from their centres
+    assert (np.ptp(sampled, axis=1).max(axis=-1) > 0.01).all()  # padding would be a single point
     again = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
-    np.testing.assert_array_equal(drawn, again)
+    np.testing.assert_array_equal(sampled, again)
 
 
 def test_clouds_come_from_all_shards(pushes: Path) -> None:
-    drawn = sample_clouds([pushes], count=30, generator=np.random.default_rng(0))
+    sampled = sample_clouds([pushes], count=30, generator=np.random.default_rng(0))
     for number in range(3):
         clouds = read_shard(shard_path(pushes, number))["clouds"].astype(np.float32).reshape(-1, 256, 3)
-        assert sum((clouds == cloud).all(axis=(1, 2)).any() for cloud in drawn) == 10
+        assert sum((clouds == cloud).all(axis=(1, 2)).any() for cloud in sampled) == 10
 
 
 def test_clouds_come_from_all_datasets(pushes: Path, own_pushes: Path) -> None:
@@ -121,8 +121,8 @@ def test_clouds_of_held_out_objects_are_not_sampled(pushes: Path) -> None:
     name = read_metadata(pushes)["shape_names"][commonest]
     clouds = np.concatenate([arrays["clouds"].astype(np.float32).swapaxes(1, 2)[arrays["mask"]] for arrays in shards])
 
-    def shapes_of(drawn: NDArray[np.float32]) -> set[int]:
-        return {int(shape[(clouds == cloud).all(axis=(-1, -2)).any(axis=-1)][0]) for cloud in drawn}
+    def shapes_of(sampled: NDArray[np.float32]) -> set[int]:
+        return {int(shape[(clouds == cloud).all(axis=(-1, -2)).any(axis=-1)][0]) for cloud in sampled}
 
     assert commonest in shapes_of(sample_clouds([pushes], count=60, generator=np.random.default_rng(0)))
     others = sample_clouds([pushes], count=60, generator=np.random.default_rng(0), held_out_objects=[name])

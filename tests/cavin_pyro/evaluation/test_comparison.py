@@ -22,7 +22,7 @@ def rows(successes: list[bool], first: int = 0) -> list[dict[str, Any]]:
     ]
 
 
-def test_scenes_are_counted_by_who_solves_them() -> None:
+def test_scenes_are_counted_by_the_methods_that_solve_them() -> None:
     one = rows([True, True, True, False, False, True])
     other = rows([True, False, False, True, False, True])
     result = compare(one, other)

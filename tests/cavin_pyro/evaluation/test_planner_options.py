@@ -1,4 +1,4 @@
-"""`planner=` and `planner.optimizer=` with checkpoints of every model: what fits plans, what does not says so."""
+"""`planner=` and `planner.optimizer=` with checkpoints of every model: compatible ones plan, others are refused."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def site() -> Iterator[Site]:
 
 @pytest.fixture
 def assets(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Run the command: exit status, its last line of output, and the one line of its complaint."""
+    """Run the command: exit status, its last line of output, and its error line."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["assets", *map(str, arguments)])
@@ -205,8 +205,8 @@ def test_wrong_bytes_are_refused_and_nothing_of_them_stays(
     content: bytes, said: str, site: Site, assets: Callable, tmp_path: Path
 ) -> None:
     site.files[SUGAR] = content
-    status, _, complaint = assets("ycb", "--to", tmp_path / "assets", "--source", site.address)
-    assert status == 2 and said in complaint
+    status, _, error_line = assets("ycb", "--to", tmp_path / "assets", "--source", site.address)
+    assert status == 2 and said in error_line
     assert not left(tmp_path)
     site.files[SUGAR] = ARCHIVES[SUGAR]
     site.files.pop(CAN)
@@ -243,8 +243,8 @@ def test_a_server_that_does_not_answer_times_out(
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(arguments: list[str], said: str, assets: Callable) -> None:
-    status, _, complaint = assets(*arguments)
-    assert status == 2 and said in complaint
+    status, _, error_line = assets(*arguments)
+    assert status == 2 and said in error_line
 
 
 def test_a_disk_that_cannot_be_written_is_named(site: Site, assets: Callable, tmp_path: Path) -> None:
@@ -267,8 +267,8 @@ def test_a_damaged_folder_does_not_count_as_finished(
 ) -> None:
     assets("ycb", "--to", tmp_path, "--source", site.address)
     spoil(tmp_path / "ycb")
-    status, _, complaint = assets("ycb", "--to", tmp_path, "--source", site.address)
-    assert status == 2 and said in complaint and f"move {tmp_path / 'ycb'} away" in complaint
+    status, _, error_line = assets("ycb", "--to", tmp_path, "--source", site.address)
+    assert status == 2 and said in error_line and f"move {tmp_path / 'ycb'} away" in error_line
 
 
 # The arm.
@@ -311,8 +311,8 @@ def test_an_arm_gets_a_stick_and_meshes_of_its_own(site: Site, assets: Callable,
 )
 def test_another_arm_is_refused(archive: bytes, said: str, site: Site, assets: Callable, tmp_path: Path) -> None:
     site.files = {SawyerRobot.pieces["arm"]: archive}
-    status, _, complaint = assets("sawyer", "--to", tmp_path, "--source", site.address)
-    assert status == 2 and said in complaint
+    status, _, error_line = assets("sawyer", "--to", tmp_path, "--source", site.address)
+    assert status == 2 and said in error_line
     assert not (tmp_path / "sawyer").exists()
 
 

@@ -154,7 +154,7 @@ def push(step: int, *, along_x: float = 0.0) -> Transition:
     return Transition(step, np.zeros(4, np.float32), -1.0, **flags, centers=centers, subgoal_distance=0.0)
 
 
-def test_what_was_reached_is_drawn_beside_what_was_predicted(tmp_path: Path) -> None:
+def test_reached_and_predicted_paths_are_both_drawn(tmp_path: Path) -> None:
     run = episode(made_up_plan(), made_up_plan())
     run.transitions += [push(number, along_x=0.03 * number) for number in (1, 2, 3, 4)]
     first, second = run.plan_records

@@ -189,13 +189,13 @@ def test_bytes_that_are_no_text_get_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "3", "[[1, 2]]", "crossing"])
-def test_a_file_without_keys_is_told_which_keys_it_needs(tmp_path: Path, text: str) -> None:
+def test_the_error_of_a_file_without_keys_lists_them(tmp_path: Path, text: str) -> None:
     with pytest.raises(ValueError, match=r"mine\.yaml must hold the keys region, goal, target_start"):
         load_task("crossing", write(tmp_path, text))
 
 
 @pytest.mark.parametrize("layout", ["nowhere.yaml", -1, 1.0, None, "", "²"])
-def test_a_layout_that_is_no_file_is_told_what_to_give(tmp_path: Path, layout: Any) -> None:
+def test_the_error_of_a_layout_that_is_no_file_lists_the_choices(tmp_path: Path, layout: Any) -> None:
     with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, random or the path of a YAML file$"):
         load_task("crossing", layout)
     with pytest.raises(ValueError, match=r"cannot be read \(Is a directory\)"):
@@ -203,14 +203,14 @@ def test_a_layout_that_is_no_file_is_told_what_to_give(tmp_path: Path, layout: A
 
 
 @pytest.mark.parametrize("layout", [3, "3", "17"])
-def test_an_unknown_number_is_told_the_known_ones(layout: Any) -> None:
+def test_the_error_of_an_unknown_number_lists_the_known_ones(layout: Any) -> None:
     with pytest.raises(
         ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2, random or the path of a YAML file$"
     ):
         load_task("crossing", layout)
 
 
-def test_an_unknown_task_is_told_the_known_ones() -> None:
+def test_the_error_of_an_unknown_task_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match=rf"^unknown task 'juggling': choose from {KNOWN_TASKS}$"):
         load_task("juggling", 0)
 

@@ -268,7 +268,7 @@ def test_a_negative_margin_is_refused(margin: float) -> None:
         TaskReward(CROSSING, margin=margin)
 
 
-def test_an_unknown_reward_is_told_the_known_ones() -> None:
+def test_the_error_of_an_unknown_reward_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"^unknown reward 'shaped': choose from dense, sparse$"):
         TaskReward(CROSSING, reward="shaped")
 

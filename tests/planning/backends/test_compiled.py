@@ -1,4 +1,4 @@
-"""Compiled planning says what direct planning says, makes no code twice, and plans several environments at once."""
+"""Compiled plans equal eager ones, nothing is compiled twice, and several environments plan at once."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_code_is_for_numbers_as_they_lie_in_memory() -> None:
 
 
 @needs_a_compiler
-def test_products_are_rounded_where_torch_is_told_to_and_results_are_float32() -> None:
+def test_matrix_products_follow_torchs_precision_and_results_are_float32() -> None:
     torch.manual_seed(0)
     layer, numbers = torch.nn.Linear(64, 64), torch.randn(32, 64)
     backend = Compiled()
@@ -133,7 +133,7 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
     monkeypatch.setattr(Distribution, "_validate_args", True)  # as torch has it, and other tests may not
     monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", 1)
     state = toy.scenes([[(0.1 * number, 0.0), (0.3, 0.2)] for number in range(4)], gains=(1.0, 0.0))
-    direct, compiled = (
+    eager_planner, compiled = (
         toy.plain(
             toy.PointMass(),
             toy.GoalDisc(goal=(0.4, 0.1), forbidden_below=-0.05),
@@ -145,7 +145,7 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
         )
         for compile in (False, True)
     )
-    expected = direct.plan(state, toy.generators(*range(4)))
+    expected = eager_planner.plan(state, toy.generators(*range(4)))
     threads = torch.get_num_threads()
     torch.set_num_threads(2)  # so that two environments are planned at once
     try:

@@ -73,7 +73,7 @@ def chosen_motion(toy: SimpleNamespace, robustness: PerturbedRollouts | None, **
     return planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2]
 
 
-def test_without_it_the_motion_that_f_likes_best_is_taken_at_its_word(toy: SimpleNamespace) -> None:
+def test_without_it_the_best_motion_by_f_is_chosen(toy: SimpleNamespace) -> None:
     assert chosen_motion(toy, None) == pytest.approx(0.1)
 
 
@@ -86,14 +86,14 @@ def test_pushes_that_are_not_displaced_change_nothing(toy: SimpleNamespace) -> N
     assert chosen_motion(toy, PerturbedRollouts(candidates=SAMPLES, start_noise=0.0)) == pytest.approx(0.1)
 
 
-def test_only_finalists_are_tried_again(toy: SimpleNamespace) -> None:
+def test_only_the_best_candidates_get_perturbed_rollouts(toy: SimpleNamespace) -> None:
     assert chosen_motion(toy, PerturbedRollouts(candidates=1)) == pytest.approx(0.1)
     assert chosen_motion(toy, PerturbedRollouts(candidates=10 * SAMPLES)) == pytest.approx(
         0.09
     )  # there are no more than N
 
 
-def test_the_best_go_on_and_are_tried_more_often(toy: SimpleNamespace) -> None:
+def test_the_best_quarter_continues_with_more_rollouts(toy: SimpleNamespace) -> None:
     rolled_out = []
 
     def counting(function: Callable, *given: Any) -> Any:
@@ -114,7 +114,7 @@ def test_the_best_go_on_and_are_tried_more_often(toy: SimpleNamespace) -> None:
     assert often == [[32, 32], [8, 8], [2, 2]]
 
 
-def test_nobody_is_tried_again_who_is_the_last(toy: SimpleNamespace) -> None:
+def test_the_last_candidate_gets_no_more_rollouts(toy: SimpleNamespace) -> None:
     rolled_out = []
 
     def counting(function: Callable, *given: Any) -> Any:

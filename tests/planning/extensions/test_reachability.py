@@ -78,7 +78,7 @@ def test_counts_below_one_are_one_clear_line(name: str) -> None:
         Reachability(**{name: 0})
 
 
-def test_who_looks_at_many_plans_has_them_searched_to_their_end(toy: SimpleNamespace) -> None:
+def test_rescoring_many_plans_disables_early_stopping(toy: SimpleNamespace) -> None:
     def successes(reachability: Reachability | None) -> Tensor:
         reward = toy.GoalDisc(goal=(0.2, 0.0))
         planner = toy.plain(

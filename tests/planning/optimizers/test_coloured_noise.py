@@ -17,12 +17,12 @@ def test_every_number_keeps_mean_zero_and_variance_one(segments: int, exponent: 
     torch.testing.assert_close(noise.var(0), torch.ones(segments), rtol=0, atol=0.04)
 
 
-def test_neighbouring_segments_are_the_more_alike_the_larger_the_exponent() -> None:
+def test_the_correlation_of_neighbouring_segments_grows_with_the_exponent() -> None:
     white = torch.randn(1, 20_000, 10, 1, generator=torch.Generator().manual_seed(0))
     noises = [coloured(white, exponent) for exponent in (0.0, 1.0, 3.0)]
-    alike = [(noise[:, :, :-1] * noise[:, :, 1:]).mean().item() for noise in noises]
-    assert abs(alike[0]) < 0.02
-    assert 0.1 < alike[1] < alike[2] < 1.0
+    correlation = [(noise[:, :, :-1] * noise[:, :, 1:]).mean().item() for noise in noises]
+    assert abs(correlation[0]) < 0.02
+    assert 0.1 < correlation[1] < correlation[2] < 1.0
 
 
 def test_power_falls_with_the_frequency_as_the_exponent_says() -> None:

@@ -37,7 +37,7 @@ def test_the_temperature_keeps_the_fraction_of_the_living_and_hardly_more(
     torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
 
 
-def test_what_candidates_were_drawn_by_is_divided_out() -> None:
+def test_earlier_sampling_weights_are_divided_out() -> None:
     returns = torch.tensor([[0.0, -1.0, -2.0, -3.0]])
     before = 0.7 * returns
     inverse, logarithms = adapt_temperature(returns, 0.5, before=before)
