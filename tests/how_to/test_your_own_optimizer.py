@@ -20,7 +20,7 @@ FOLLOWS = " ..."  # in the page's table: the line goes on
 TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
 SHORT = {  # options that make each of the page's commands a matter of seconds
     "plan": ("maximum_steps=2", "planner.samples=32", "video=false"),
-    "evaluate": ("episodes=2", "maximum_steps=2", "planner.samples=32"),
+    "evaluate": ("episodes=2", "workers=1", "maximum_steps=2", "planner.samples=32"),
 }
 
 

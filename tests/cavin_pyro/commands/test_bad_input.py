@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.cavin_pyro.commands.bad_files import BAD_FILES, COMMANDS
+from tests.cavin_pyro.commands.bad_files import BAD_FILES, COMMANDS, MORE_BAD_FILES
 from tests.cavin_pyro.commands.bad_material import make_material
-from tests.cavin_pyro.commands.bad_options import BAD_OPTIONS
+from tests.cavin_pyro.commands.bad_options import BAD_OPTIONS, MORE_BAD_OPTIONS
 
 # @name is a file or folder that `make_material` makes.
 GOOD = {
@@ -23,7 +23,7 @@ GOOD = {
     "check": "checkpoint=@trained data=@pushes windows=2 sections=consistency sizes.consistency.scenes=1 "
     "sizes.consistency.samples=2",
 }
-BAD = [*BAD_OPTIONS, *BAD_FILES]
+BAD, MORE = [*BAD_OPTIONS, *BAD_FILES], [*MORE_BAD_OPTIONS, *MORE_BAD_FILES]
 assert tuple(GOOD) == COMMANDS
 
 
@@ -46,10 +46,13 @@ def without_features(contents: dict[str, bytes]) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def answers(shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """How every case ended, what it left in its folder, and what became of the material."""
+def answers(
+    shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> SimpleNamespace:
+    """How every case that is tested now ended, what it left in its folder, and what became of the material."""
     before = without_features(shell.contents(material))
-    rows = [(command, "", "") for command in GOOD] + BAD
+    tested = {getattr(getattr(item, "callspec", None), "id", None) for item in request.session.items}
+    rows = [(command, "", "") for command in GOOD] + [row for row in BAD + MORE if name_of(*row[:2]) in tested]
     cases = {}
     for command, overrides, _ in rows:
         line = f"output=out {GOOD[command]} {overrides}"
@@ -68,7 +71,13 @@ def test_the_options_without_the_bad_ones_are_valid(command: str, answers: Simpl
     assert answers.left[name]
 
 
-@pytest.mark.parametrize(("command", "overrides", "said"), BAD, ids=[f"{row[0]} {row[1]}" for row in BAD])
+@pytest.mark.parametrize(
+    ("command", "overrides", "said"),
+    [
+        *(pytest.param(*row, id=name_of(*row[:2])) for row in BAD),
+        *(pytest.param(*row, id=name_of(*row[:2]), marks=pytest.mark.soak) for row in MORE),
+    ],
+)
 def test_bad_input_ends_in_one_line_and_writes_nothing(
     command: str, overrides: str, said: str, answers: SimpleNamespace
 ) -> None:

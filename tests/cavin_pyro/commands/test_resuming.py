@@ -96,7 +96,7 @@ def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
     )
     before = rows_of(path)
     assert 3 <= len(before) < 24
-    answer = shell.run_command("evaluate", *overrides, "workers=2", "output=broken", folder=tmp_path)
+    answer = shell.run_command("evaluate", *overrides, "workers=1", "output=broken", folder=tmp_path)
     assert answer.status == 0, answer.errors
     after = rows_of(path)
     assert after[: len(before)] == before  # with the times of the first run

@@ -127,7 +127,7 @@ def test_folders_of_the_same_name_that_are_no_packages_do_no_harm(shell: SimpleN
     for package in PACKAGES:
         (tmp_path / package).mkdir()
     overrides = ["transitions=1", "steps=1", "episodes_per_shard=1", "workers=1", "output=out"]
-    answer = shell.run_command("collect", *overrides, folder=tmp_path)
+    answer = shell.run_as_users("collect", *overrides, folder=tmp_path)
     assert answer.status == 0, answer.errors
 
 

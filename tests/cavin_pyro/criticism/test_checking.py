@@ -23,6 +23,7 @@ from cavin_pyro.criticism.section import Section
 from cavin_pyro.data.dataset import content_fingerprint, read_metadata, write_metadata
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from tests.cavin_pyro.conftest import SMALL_CHECK
 
 WINDOWS = {
     "validation_fraction": 0.4,
@@ -31,7 +32,7 @@ WINDOWS = {
     "maximum_move": 0.5,
     "negative_fraction": 0.25,
 }
-SMALL = ["sizes.consistency.scenes=2", "sizes.consistency.objects=2", "sizes.consistency.samples=4", "windows=5"]
+SMALL = [*SMALL_CHECK, "sizes.consistency.scenes=2"]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from cavin_pyro.criticism.sections import SECTIONS
+from tests.cavin_pyro.conftest import SMALL_CHECK
 
 WINDOWS = {
     "validation_fraction": 0.4,
@@ -18,12 +19,6 @@ WINDOWS = {
     "negative_fraction": 0.25,
 }
 SECTIONS_OF_CODES = {"guide_error", "amortization", "codes", "aggregate_posterior", "consistency"}
-SMALL = (
-    "windows=5 sizes.guide_error.inner_windows=3 sizes.guide_error.inner_particles=2 sizes.amortization.steps=2 "
-    "sizes.amortization.particles=2 sizes.amortization.samples=20 sizes.aggregate_posterior.permutations=9 "
-    "sizes.predictive.replicates=4 sizes.calibration.samples=8 sizes.growth.episodes=2 sizes.growth.segments=2 "
-    "sizes.consistency.scenes=1 sizes.consistency.objects=2 sizes.consistency.samples=2"
-)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +31,7 @@ def test_a_check_runs_all_sections_or_says_which_do_not_apply(
     small.save_baseline(checkpoint, name, windows=WINDOWS, seed=1)
     overrides = [f"checkpoint={checkpoint}", "output=out"]
     cases = {
-        "check": shell.Case("check", [*overrides, f"data={pushes}", *SMALL.split()]),
+        "check": shell.Case("check", [*overrides, f"data={pushes}", *SMALL_CHECK]),
         "plan": shell.Case("plan", [*overrides, "planner=random", "maximum_steps=3", "video=false"]),
     }
     answers = shell.run_in_turn(cases, tmp_path)

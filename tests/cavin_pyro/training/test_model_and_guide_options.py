@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from importlib import resources
 
 import pytest
@@ -33,8 +34,10 @@ def preset_names(group: str) -> list[str]:
     return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
 
+@functools.cache
 def configuration(*overrides: str) -> DictConfig:
-    return compose("train", *overrides)
+    """To be read only."""
+    return compose("train", *overrides, "output=unused")
 
 
 def window(batch: int = 6) -> Window:
