@@ -15,6 +15,7 @@ from cavin_pyro.storage.files import atomic_write
 
 DOTS_PER_INCH = 120
 BAR_WIDTH = 0.2
+DODGE = 0.06  # of lines whose whiskers would lie on one another, in objects
 TITLES = {"paper": "planners as in the paper", "ours": "planners with our additions"}
 Rates = Sequence[Mapping[str, Any]]
 
@@ -38,7 +39,8 @@ def draw_figure(path: Path, rates: Rates, *, planner: str, criterion: str) -> No
     for row in axes:
         row[0].set_ylabel("success, %")
     handles, labels = axes[1][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    columns = min(len(labels), 2 * len(tasks))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(f"{TITLES.get(planner, planner)}; criterion: {criterion}", fontsize=10)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor="white", metadata={"Software": None})
@@ -55,19 +57,19 @@ def _draw_rewards(axes: Axes, rates: Rates) -> None:
                     x = place + (number - (len(METHODS) - 1) / 2) * BAR_WIDTH
                     axes.bar(x, 100 * rate["rate"], BAR_WIDTH * 0.9, color=method.color)
                     axes.errorbar(x, 100 * rate["rate"], _whiskers([rate]), color="black", capsize=2, linewidth=0.8)
-                    axes.annotate(f"n={rate['episodes']}", (x, 1), rotation=90, fontsize=5, ha="center", va="bottom")
+                    axes.annotate(f"n={rate['episodes']}", (x, 1), rotation=90, fontsize=6, ha="center", va="bottom")
     axes.set_xticks(range(len(kinds)), [f"{kind} reward" for kind in kinds])
     axes.set_ylim(0, 104)
 
 
 def _draw_objects(axes: Axes, rates: Rates) -> None:
     """Sparse rewards, against the number of objects."""
-    for name, method in METHODS.items():
+    for number, (name, method) in enumerate(METHODS.items()):
         chosen = [rate for rate in rates if rate["method"] == name and rate["reward"] == "sparse"]
         chosen.sort(key=lambda rate: rate["objects"])
         if chosen:
             axes.errorbar(
-                [rate["objects"] for rate in chosen],
+                [rate["objects"] + DODGE * (number - (len(METHODS) - 1) / 2) for rate in chosen],
                 [100 * rate["rate"] for rate in chosen],
                 _whiskers(chosen),
                 color=method.color,
