@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib.util
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -88,8 +89,16 @@ def _help_or_check(name: str, purpose: str) -> bool:
     if line.help:
         from cavin_pyro.config.help import help_page
 
-        print(help_page(name, purpose, config))
+        _print_page(help_page(name, purpose, config))
     return line.help
+
+
+def _print_page(text: str) -> None:
+    """Print, also to a reader that stops early, such as `head`."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains as it exits
 
 
 @dataclass(frozen=True)

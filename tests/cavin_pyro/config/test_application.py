@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError, at_least, user_input
 from cavin_pyro.storage.files import atomic_write
+from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT
 
 
 def refuse(number: int, place: str | None = None) -> None:
@@ -213,3 +215,14 @@ def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
         with pytest.raises(UserError) as caught:
             compose(*overrides)
         assert str(caught.value).startswith(complaint)
+
+
+def test_a_page_for_a_reader_that_stops_early_is_no_bug() -> None:
+    """As in `python -m cavin_pyro.plan --help | head`."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    program = "from cavin_pyro.config.application import _print_page; _print_page('a page')"
+    line = [sys.executable, "-c", program]
+    done = subprocess.run(line, cwd=ROOT, env=ENVIRONMENT, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
