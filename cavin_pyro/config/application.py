@@ -43,11 +43,13 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
                 print(f"cavin_pyro {__version__}")
                 return
             guarded(check_packages)
-            if guarded(lambda: _help_or_check(name, body.__doc__ or "")):
-                return
-            hydra.main(version_base="1.3", config_path=None, config_name=name)(
-                lambda config: guarded(lambda: _run(name, body, config))
-            )()
+            line, composed = guarded(lambda: _check(name))
+            if line.help:
+                guarded(lambda: _show_help(name, body.__doc__ or "", composed))
+            elif _is_one_run(sys.argv[1:]):  # as usual: Hydra's application would compose the same again
+                guarded(lambda: _run(name, body, composed))
+            else:
+                _run_by_hydra(name, body)
 
         main.__doc__ = body.__doc__
         return main
@@ -78,19 +80,21 @@ def _stop(line: str, status: int) -> NoReturn:
     raise SystemExit(status)
 
 
-def _help_or_check(name: str, purpose: str) -> bool:
-    """Check the overrides before Hydra's application reads them. Return whether the run ends here."""
+def _check(name: str) -> tuple[CommandLine, DictConfig]:
+    """Check the overrides of every run. Returns the command line and the configuration of its last run."""
     from cavin_pyro.config.composition import check_overrides, presets_by_name, sweeps
 
     sys.argv[1:] = presets_by_name(sys.argv[1:])
     line = read_command_line(sys.argv[1:])
     for overrides in sweeps(line.overrides) if line.multirun else [line.overrides]:
         config = check_overrides(name, overrides, line.config_dir)
-    if line.help:
-        from cavin_pyro.config.help import help_page
+    return line, config
 
-        _print_page(help_page(name, purpose, config))
-    return line.help
+
+def _show_help(name: str, purpose: str, config: DictConfig) -> None:
+    from cavin_pyro.config.help import help_page
+
+    _print_page(help_page(name, purpose, config))
 
 
 def _print_page(text: str) -> None:
@@ -137,11 +141,25 @@ def read_command_line(arguments: Sequence[str]) -> CommandLine:
     return CommandLine(overrides, known.help, known.version, known.multirun, known.config_dir)
 
 
+def _is_one_run(arguments: Sequence[str]) -> bool:
+    """Whether these are overrides of our own options alone: no flag, and nothing that Hydra's application reads."""
+    return not any(word.startswith("-") or "hydra" in word for word in arguments)
+
+
 def _run(name: str, body: Body, config: DictConfig) -> None:
+    from cavin_pyro.config.composition import completed
+
+    body(completed(name, config))
+
+
+def _run_by_hydra(name: str, body: Body) -> None:
+    """Let Hydra's application read the command line: for sweeps and for its own flags and options."""
     from cavin_pyro.config.composition import resolved
     from cavin_pyro.config.output import with_output
 
-    body(with_output(name, resolved(config), HydraConfig.get()))
+    hydra.main(version_base="1.3", config_path=None, config_name=name)(
+        lambda config: guarded(lambda: body(with_output(name, resolved(config), HydraConfig.get())))
+    )()
 
 
 def check_packages() -> None:

@@ -34,9 +34,17 @@ def compose(name: str, *overrides: str) -> DictConfig:
     Raises:
         UserError: an invalid override.
     """
+    return completed(name, check_overrides(name, presets_by_name(overrides)))
+
+
+def completed(name: str, config: DictConfig) -> DictConfig:
+    """What `check_overrides` has composed, without Hydra's own section, resolved, and with an output folder.
+
+    Raises:
+        UserError: an option has no value.
+    """
     from cavin_pyro.config.output import with_output
 
-    config = check_overrides(name, presets_by_name(overrides))
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     return with_output(name, resolved(own), config.hydra)
 
@@ -122,8 +130,15 @@ def _hydra() -> Iterator[None]:
 def _defaults(name: str, overrides: Sequence[str]) -> DictConfig:
     """The configuration with the presets that the user chose and no other overrides."""
     groups = _usual_presets(name)
-    chosen = [word for word in overrides if word.partition("=")[0] in groups or word.startswith("hydra.searchpath")]
-    return hydra.compose(name, overrides=chosen)
+    chosen = [word for word in overrides if word.partition("=")[0] in groups]
+    folders = [word for word in overrides if word.startswith("hydra.searchpath")]  # of users, who may change them
+    return hydra.compose(name, overrides=chosen + folders) if folders else _presets(name, tuple(chosen))
+
+
+@functools.cache  # a composition takes a twentieth of a second
+def _presets(name: str, chosen: tuple[str, ...]) -> DictConfig:
+    """The configuration with some of our presets, to be read only."""
+    return hydra.compose(name, overrides=[*chosen])
 
 
 @functools.cache  # a composition takes a tenth of a second

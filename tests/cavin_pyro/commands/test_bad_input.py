@@ -94,7 +94,14 @@ def test_bad_input_leaves_what_it_names_as_it_was(answers: SimpleNamespace) -> N
     assert answers.before == answers.after
 
 
-@pytest.mark.parametrize("line", ["plan task=juggling", "collect transitions", "evaluate workers=0"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "plan task=juggling",
+        pytest.param("collect transitions", marks=pytest.mark.soak),
+        pytest.param("evaluate workers=0", marks=pytest.mark.soak),
+    ],
+)
 def test_bad_input_of_a_user_at_a_terminal(line: str, shell: SimpleNamespace, tmp_path: Path) -> None:
     """The cases above share a process; these are on their own, as users are."""
     answer = shell.run_as_users(*line.split(), folder=tmp_path)

@@ -45,6 +45,15 @@ def test_every_command_knows_its_version(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_starts_with_an_interpreter_of_its_own(
+    command: str, shell: SimpleNamespace, tmp_path: Path
+) -> None:
+    """Other tests fork their commands from a process that has imported them."""
+    answer = shell.run_as_users(command, "--version", folder=tmp_path)
+    assert (answer.status, answer.output, answer.errors) == (0, f"cavin_pyro {__version__}\n", "")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_lists_every_option_that_the_command_reads(command: str, pages: dict[str, str]) -> None:
     def names(section: dict, prefix: str = "") -> set[str]:
         found: set[str] = set()

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from omegaconf import DictConfig
 
 from cavin_pyro.config import application as command_module
 from cavin_pyro.config.application import PACKAGES, check_packages, guarded
@@ -197,6 +198,20 @@ def test_what_we_added_to_the_papers_planner_can_be_left_out(
     answer = shell.run_command("evaluate", *overrides, "output=results", folder=tmp_path)
     assert answer.status == 0, answer.errors
     assert "robustness: null" in (tmp_path / "results" / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("overrides", [["seed=3", "planner.optimizer=cem"], ["planner=random", "output=mine"]])
+def test_a_command_without_options_of_hydra_gets_the_configuration_of_hydras_application(
+    overrides: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received: list[DictConfig] = []
+    main = command_module.command("evaluate")(received.append)
+    for of_hydra in ([], ["hydra.job.name=other"]):
+        monkeypatch.setattr(sys, "argv", ["evaluate", *overrides, *of_hydra])
+        main()
+    ours, hydras = received
+    assert ours == hydras == compose("evaluate", *overrides)
+    assert ours.output.startswith(("runs/evaluate/", "mine"))
 
 
 def test_a_configuration_from_python_is_that_of_the_command() -> None:
