@@ -12,7 +12,7 @@ from torch import Tensor
 class State(NamedTuple):
     """The observed state of `M` objects (padded to a fixed number) in any batch `[...]` of scenes.
 
-    `state[0]` is the tuple's first field, not a scene: use `scene`, `step` and `take_plans` to index.
+    `state[0]` is the tuple's first field, not a scene: use `scene` and `step` to index.
     """
 
     centers: Tensor  # [..., M, 3] metres, in the robot's base frame
@@ -53,11 +53,6 @@ class State(NamedTuple):
         """One copy (a view) per plan sample: `[B] -> [B, N]`."""
         single = State(self.centers.unsqueeze(-3), self.features.unsqueeze(-3), self.mask.unsqueeze(-2))
         return single.expand((*self.batch_shape, plans))
-
-    def take_plans(self, index: Tensor) -> State:
-        """Take plans by number, per scene: fields `[B, N, ...]`, `index: [B, n]` int64 -> `[B, n, ...]`."""
-        rows = torch.arange(index.shape[0], device=index.device).unsqueeze(-1)
-        return self.map(lambda field: field[rows, index])
 
 
 class Window(NamedTuple):

@@ -12,7 +12,6 @@ from planning.baselines.random_pushes import RandomPlanner
 from planning.baselines.sectar import SectarPlanner
 from planning.cavin import MOTION_HORIZONS, CavinPlanner
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
-from planning.extensions.reachability import Reachability
 from planning.plan import Plan
 from planning.protocol import Outcome, Planner, PlanningModel, RewardFunction
 
@@ -28,7 +27,6 @@ __all__ = [
     "PlanningModel",
     "PushBox",
     "RandomPlanner",
-    "Reachability",
     "RewardFunction",
     "SectarPlanner",
 ]

@@ -13,8 +13,6 @@ from planning.backends.chunking import chunked
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, most_robust
-from planning.extensions.reachability import Reachability, most_reachable
-from planning.extensions.warm_start import warm_start_noise
 from planning.inputs import check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
@@ -51,7 +49,6 @@ class CavinPlanner(SearchingPlanner):
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
     warm_start: our addition to line 5: the last plan's noise is among the candidates.
-    reachability: our addition to line 7: rescores the best effect codes by f; None trusts h (paper).
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
     idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
@@ -77,7 +74,6 @@ class CavinPlanner(SearchingPlanner):
         avoid_failures: bool = True,
         robustness: PerturbedRollouts | None = ROBUSTNESS,
         idle_distance: float = 0.01,
-        reachability: Reachability | None = None,
         **options: Any,
     ) -> None:
         super().__init__(model, reward, samples, horizon, **options)
@@ -94,7 +90,6 @@ class CavinPlanner(SearchingPlanner):
         self.avoid_failures = avoid_failures
         self.robustness = robustness
         self.idle_distance = idle_distance
-        self.reachability = reachability
 
     @chunked
     @torch.inference_mode()
@@ -111,15 +106,10 @@ class CavinPlanner(SearchingPlanner):
         s_t, T = state, self.segment_length
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
-        warm_start = warm_start_noise(previous, generators) if self.warm_start else None
-        effect_space, objective = EffectSpace(self.model), self.cumulative_reward()
-        best_only = self.reachability is None
-        effects = self.search(effect_space, objective, s_t, generators, warm_start=warm_start, best_only=best_only)
+        effects = self.search_by_reward(EffectSpace(self.model), s_t, generators, previous)
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
-        if self.reachability is not None:
-            i = most_reachable(self.reachability, effects, effect_space.predict, self.model, reward)
         chosen = effects.take(i.unsqueeze(-1))
         c_star, subgoals = chosen.codes[:, 0], chosen.states.map(lambda field: field[:, 0])
 
@@ -178,10 +168,6 @@ class EffectSpace(NamedTuple):
         """See `planning.rollouts.segment.SearchSpace`."""
         # Line 5: sample c_k, a segment at a time, since a learned prior p(c | s) depends on the state before it.
         c = sample_codes(self.model.effect_prior, [plans], noise, generators)
-        return self.predict(here, plans, c)
-
-    def predict(self, here: State, plans: State, c: Tensor) -> SegmentRollout:
-        """`here`: `plans: [B, n]`, or `[B, 1]` where all are in one state; `c: [B, n, C]`."""
         # Line 6: predict the subgoal by equation 2 ...
         subgoal = self.model.subgoal(here, c).expand(plans.batch_shape)
         # ... and interpolate the state trajectory.

@@ -23,10 +23,6 @@ class Progress(NamedTuple):
         """`[...]` bool: neither succeeded nor failed."""
         return ~(self.succeeded | self.failed)
 
-    def take_plans(self, index: Tensor) -> Progress:
-        """Choose plans by number, per environment: fields `[B, N]`, `index: [B, n]` -> `[B, n]`."""
-        return Progress(*(field.gather(1, index) for field in self))
-
 
 def start(centers: Tensor) -> Progress:
     """Progress of candidates without a step, for `centers: [..., M, 3]`: fields `[...]`."""

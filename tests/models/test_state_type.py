@@ -23,16 +23,6 @@ def test_expanding_to_plans_repeats_each_scene_without_copying(random_state: Cal
     assert plans.centers.untyped_storage().data_ptr() == state.centers.untyped_storage().data_ptr()
 
 
-def test_taking_plans_chooses_per_scene(random_state: Callable[..., State]) -> None:
-    state = random_state(2, 3)
-    taken = state.take_plans(torch.tensor([[2, 2, 0, 1], [1, 0, 0, 2]]))
-    assert taken.batch_shape == (2, 4)
-    for field, original in zip(taken, state, strict=True):
-        assert torch.equal(field[0, 0], original[0, 2])
-        assert torch.equal(field[1, 0], original[1, 1])
-        assert torch.equal(field[1, 3], original[1, 2])
-
-
 def test_steps_are_the_last_leading_dimension_and_scenes_the_first(
     random_state: Callable[..., State],
 ) -> None:

@@ -31,7 +31,6 @@ PAPER = {  # Algorithm 1 as it is printed
     "planner.warm_start": False,
     "planner.avoid_failures": False,
     "planner.robustness": None,
-    "planner.reachability": None,
     "planner.idle_distance": 0.0,
     "planner.optimizer._target_": "planning.optimizers.Shooting",
     "pushes_per_plan": None,

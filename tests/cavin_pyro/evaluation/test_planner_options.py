@@ -92,7 +92,6 @@ def test_every_planner_plans_with_every_optimizer(
         ("cavin", "planner.warm_start=false"),
         ("cavin", "matmul_precision=float32"),
         ("cavin_evolution", "planner.optimizer.generations=1"),
-        ("cavin", "planner.reachability={_target_:planning.Reachability}"),
         ("mpc", "planner.stride_limits=[0.01,0.15]"),
         ("mpc", "planner.proposal=heuristic"),
     ],
