@@ -147,8 +147,11 @@ def _is_one_run(arguments: Sequence[str]) -> bool:
 
 
 def _run(name: str, body: Body, config: DictConfig) -> None:
+    from hydra.core.utils import configure_log
+
     from cavin_pyro.config.composition import completed
 
+    configure_log(config.hydra.job_logging)  # none: what Hydra logs about a wrong class is told in our line
     body(completed(name, config))
 
 
