@@ -39,7 +39,7 @@ LINES = {
     "trainer.steps=4 trainer.validate_every=2 trainer.batch_size=8 windows.minimum_move=0.005 "
     "windows.validation_fraction=0.3",
     "plan": f"{EPISODE} layout=bridge.yaml reward=dense seed=7 output=episode",
-    "evaluate": f"{EPISODE} layout=bridge.yaml episodes=2 workers=2 seed=6 output=evaluation",
+    "evaluate": f"{EPISODE} layout=bridge.yaml episodes=2 workers=1 seed=6 output=evaluation",
 }
 
 

@@ -43,7 +43,7 @@ def test_training_killed_twice_equals_an_unbroken_run(
 ) -> None:
     overrides = [
         *("data=pushes", f"pointnet={checkpoint_file}", "model.width=8", "guide.width=8", "seed=2"),
-        *("trainer.steps=160", "trainer.validate_every=8", "trainer.batch_size=8", "trainer.learning_rate=0.003"),
+        *("trainer.steps=96", "trainer.validate_every=8", "trainer.batch_size=8", "trainer.learning_rate=0.003"),
         *("trainer.schedule=cosine", "trainer.patience=1000"),
         *("windows.minimum_move=0.005", "windows.validation_fraction=0.3"),
     ]
@@ -52,14 +52,14 @@ def test_training_killed_twice_equals_an_unbroken_run(
     def validations() -> int:
         return len(metrics.read_text().splitlines()) - 1 if metrics.exists() else 0
 
-    for count in (1, 5):
+    for count in (1, 4):
         kill_after(shell, "train", [*overrides, "output=broken"], tmp_path, lambda count=count: validations() >= count)
-        assert validations() < 20
+        assert validations() < 12
     for output in ("broken", "whole"):
         answer = shell.run_command("train", *overrides, f"output={output}", folder=tmp_path)
         assert answer.status == 0, answer.errors
     broken, whole = tmp_path / "broken", tmp_path / "whole"
-    assert len(read_csv(whole / "metrics.csv")) == 20
+    assert len(read_csv(whole / "metrics.csv")) == 12
     assert read_csv(broken / "metrics.csv") == read_csv(whole / "metrics.csv")
     for name in ("checkpoint.safetensors", "resume.safetensors"):
         ours, theirs = load_file(broken / name), load_file(whole / name)
@@ -84,7 +84,7 @@ def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
 ) -> None:
     overrides = [
         *("task=insertion", "reward=dense", f"checkpoint={checkpoint_file}", "objects=2", "maximum_steps=4"),
-        *("planner.samples=16", "planner.horizon=6", "episodes=24", "seed=100"),
+        *("planner.samples=16", "planner.horizon=6", "episodes=12", "seed=100"),
     ]
     path = tmp_path / "broken" / "episodes.jsonl"
     kill_after(
@@ -95,12 +95,12 @@ def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
         lambda: path.exists() and len(rows_of(path)) >= 3,
     )
     before = rows_of(path)
-    assert 3 <= len(before) < 24
+    assert 3 <= len(before) < 12
     answer = shell.run_command("evaluate", *overrides, "workers=1", "output=broken", folder=tmp_path)
     assert answer.status == 0, answer.errors
     after = rows_of(path)
     assert after[: len(before)] == before  # with the times of the first run
-    assert sorted(row["seed"] for row in after) == list(range(100, 124))
+    assert sorted(row["seed"] for row in after) == list(range(100, 112))
     results = json.loads((tmp_path / "broken" / "results.json").read_text())
     assert results["per_episode"] == sorted(after, key=lambda row: row["seed"])
     (tmp_path / "whole").mkdir()
