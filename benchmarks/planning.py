@@ -84,9 +84,8 @@ def planning(planner: Planner, state: State, batch: int) -> Callable[[], object]
     return plan
 
 
-def matrix_rate() -> float:
-    """Floating-point operations per second of one large product in float32, whose factors are not rounded."""
-    size = 2048
+def matrix_rate(size: int) -> float:
+    """Floating-point operations per second of one product of large float32 matrices, whose factors are not rounded."""
     left, right = torch.rand(size, size), torch.rand(size, size)
     rounded = torch.get_float32_matmul_precision()  # as the planners have set it
     torch.set_float32_matmul_precision("highest")
@@ -114,7 +113,8 @@ def planners(objects: int, samples: int, ways: list[str]) -> tuple[dict[str, Any
     return found, state
 
 
-def grid(samples: list[int], objects: list[int], repetitions: int, ways: list[str]) -> None:
+def grid(samples: list[int], objects: list[int], repetitions: int, ways: list[str], *, size: int) -> None:
+    """`size`: of the matrices whose product tells this machine's rate."""
     plain = ["Algorithm 1"] if "compiled" in ways else []
     print(f"{torch.get_num_threads()} thread(s); ms per plan, median (fastest), and what share of the matrix rate")
     titles = [*(f"{way:>15}  share" for way in ways), *(f"{way:>15}" for way in plain)]
@@ -124,7 +124,7 @@ def grid(samples: list[int], objects: list[int], repetitions: int, ways: list[st
             found, state = planners(number, count, ways)
             work = operations(planning(found["eager"], state, 1)) / SCENES
             for batch in (1, SCENES):
-                rate = matrix_rate()  # anew each time: where cores are shared, it changes by the minute
+                rate = matrix_rate(size)  # anew each time: where cores are shared, it changes by the minute
                 actions = {way: planning(found[way], state, batch) for way in (*ways, *plain)}
                 figures = [f"{count:7d}  {number:7d}  {batch:5d}  {work / 1e9:5.2f}  {rate / 1e9:14.0f}"]
                 for way, times in milliseconds(actions, repetitions if count < 8192 else 2).items():
@@ -251,7 +251,7 @@ def main() -> None:
     ways = ["eager"] if arguments.no_compile else ["eager", "compiled"]
     samples, objects, repetitions = ([32], [2], 2) if arguments.quick else ([256, 1024, 8192], [1, 3, 5], 4)
     if not arguments.no_grid:
-        grid(samples, objects, repetitions, ways)
+        grid(samples, objects, repetitions, ways, size=512 if arguments.quick else 2048)
     if not arguments.no_flat:
         flat([32] if arguments.quick else [1024, 8192], 2 * repetitions, ways)
 

@@ -3,6 +3,7 @@
 Reads jobs, a line of JSON each, and prints the exit status of each. A job has `folder`, `output` and `errors` (files),
 and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder, or
 `cases`, which run in turn in one process, each from its own `folder`, with their answers as JSON in `output`.
+With `file_limit`, no file can grow beyond so many bytes.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import importlib
 import io
 import json
 import os
+import resource
 import runpy
 import signal
 import sys
@@ -57,6 +59,8 @@ def run(job: dict[str, Any]) -> None:
     ):
         os.dup2(os.open(path, flags), number)
     os.chdir(job["folder"])
+    if job.get("file_limit"):  # as inherited by a command that a user starts under `ulimit -f`
+        resource.setrlimit(resource.RLIMIT_FSIZE, (job["file_limit"], resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     if "cases" in job:
         sys.path[0] = ""  # the folder of each case
         print(json.dumps([run_case(**case) for case in job["cases"]]))

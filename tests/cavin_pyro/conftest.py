@@ -79,9 +79,14 @@ def run_as_users(command: str, *overrides: str, folder: Path) -> Answer:
     return Answer(process.returncode, output, errors)
 
 
-def run_command(command: str, *overrides: str, folder: Path) -> Answer:
-    """Run a command in a process of its own, from the folder, without waiting for its imports (command_server.py)."""
-    status, output, errors = _forked({"command": command, "overrides": overrides}, folder)
+def run_command(command: str, *overrides: str, folder: Path, file_limit: int | None = None) -> Answer:
+    """Run a command in a process of its own, from the folder, without waiting for its imports (command_server.py).
+
+    Args:
+        file_limit: bytes beyond which a file cannot grow.
+    """
+    job = {"command": command, "overrides": overrides, "file_limit": file_limit}
+    status, output, errors = _forked(job, folder)
     return Answer(status, output, errors)
 
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -161,13 +160,7 @@ def test_a_disk_that_takes_no_more_ends_a_command_in_one_line(
 ) -> None:
     """The system's limit on the size of a file stands in for a full disk: writing fails half-way in the same manner."""
     line = overrides.format(checkpoint=checkpoint_file, pushes=own_pushes).split()
-    limit = (kilobytes * 1024, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, limit)  # which the command inherits
-    try:
-        answer = shell.run_as_users(command, *line, "output=out", folder=tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    answer = shell.run_command(command, *line, "output=out", folder=tmp_path, file_limit=kilobytes * 1024)
     assert answer.status == 2, answer.errors
     complaint = answer.complaints[-1]
     assert complaint.startswith(f"error: the disk refused to store results at out/{refused}: ")

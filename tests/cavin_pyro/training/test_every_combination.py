@@ -53,7 +53,7 @@ REPRESENTATIVES = {
     if names[0] == "dynamics"
     or (GUIDES.index(names[1]) + PRIORS.index(names[2])) % len(OBJECTIVES) == OBJECTIVES.index(names[3])
 }
-STEPS = TrainerConfig(steps=60, batch_size=16, learning_rate=1e-2, validate_every=60, validation_windows=64)
+STEPS = TrainerConfig(steps=40, batch_size=16, learning_rate=1e-2, validate_every=40, validation_windows=64)
 
 
 @functools.cache
@@ -88,7 +88,7 @@ def validation_loss(model: Any, guide: Any, table: WindowTable) -> float:
 
 
 def losses(config: DictConfig, table: WindowTable, folder: Path) -> tuple[float, float]:
-    """On held-out windows, before and after 60 steps."""
+    """On held-out windows, before and after 40 steps."""
     torch.manual_seed(0)
     with pyro.settings.context(
         module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False
@@ -120,6 +120,19 @@ def test_the_sections_are_those_of_one_composition() -> None:
     overrides = [f"{group}={choice}" for group, choice in choices.items()]
     config = compose("train", *overrides, "model.width=8", "guide.width=8")
     assert composed(*names) == {group: config[group] for group in choices}
+
+
+@pytest.mark.soak
+def test_sections_of_their_own_are_those_of_one_composition_for_one_combination_of_each_kind() -> None:
+    some = {names[:2]: names for names in VALID}.values()  # the last of each model with each guide
+    assert len(some) >= 7
+    for names in some:
+        choices = dict(zip(("model", "guide", "prior", "objective"), names, strict=True))
+        overrides = [f"{group}={choice}" for group, choice in choices.items()] + ["model.width=8"]
+        overrides += [] if names[1] == "none" else ["guide.width=8"]
+        overrides += ["objective.elbo.num_particles=2"] if names[3] == "iwae" else []
+        config = compose("train", *overrides)
+        assert composed(*names) == {group: config[group] for group in [*choices, "scales"]}
 
 
 @pytest.mark.parametrize(
