@@ -15,7 +15,7 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
     from cavin_pyro.evaluation.evaluation import evaluate
-    from cavin_pyro.evaluation.factory import make_runner
+    from cavin_pyro.evaluation.factory import make_runner, planner_name
     from cavin_pyro.evaluation.statistics import summarize, table
     from cavin_pyro.storage.files import atomic_write, output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
@@ -28,9 +28,8 @@ def main(config: DictConfig) -> None:
     check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
     write_config(folder, config)
     results = summarize(evaluate(config, folder))
-    text = table(
-        results, f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
-    )
+    scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
+    text = table(results, f"{scene}, {planner_name(config)}")
     if others:
         comparison = compare(results["per_episode"], others)
         results["comparison"] = record(comparison, Path(config.compare))

@@ -84,7 +84,7 @@ def _check(name: str) -> tuple[CommandLine, DictConfig]:
     """Check the overrides of every run. Returns the command line and the configuration of its last run."""
     from cavin_pyro.config.composition import check_overrides, presets_by_name, sweeps
 
-    sys.argv[1:] = presets_by_name(sys.argv[1:])
+    sys.argv[1:] = presets_by_name(multirun_first(sys.argv[1:]))
     line = read_command_line(sys.argv[1:])
     for overrides in sweeps(line.overrides) if line.multirun else [line.overrides]:
         config = check_overrides(name, overrides, line.config_dir)
@@ -125,7 +125,7 @@ def read_command_line(arguments: Sequence[str]) -> CommandLine:
     """Separate overrides from flags.
 
     Raises:
-        UserError: a flag without its value.
+        UserError: an unknown flag, or one without its value.
     """
     parser = _Parser(add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
@@ -137,8 +137,15 @@ def read_command_line(arguments: Sequence[str]) -> CommandLine:
         parser.add_argument(*flag)
     parser.add_argument("--info", "-i", nargs="?")
     known, others = parser.parse_known_intermixed_args(list(arguments))
-    overrides = [*known.overrides, *(one for one in others if not one.startswith("-"))]
-    return CommandLine(overrides, known.help, known.version, known.multirun, known.config_dir)
+    if unknown := [one for one in others if one.startswith("-")]:
+        raise UserError(f"unknown flag {unknown[0]}: --help lists flags and options")
+    return CommandLine([*known.overrides, *others], known.help, known.version, known.multirun, known.config_dir)
+
+
+def multirun_first(arguments: Sequence[str]) -> list[str]:
+    """The same arguments with `-m` before the overrides, where Hydra's own parser wants it."""
+    sweep = [one for one in arguments if one in ("-m", "--multirun")]
+    return [*sweep, *(one for one in arguments if one not in sweep)]
 
 
 def _is_one_run(arguments: Sequence[str]) -> bool:

@@ -168,7 +168,8 @@ def _check_additions(name: str, overrides: list[str]) -> None:
 def _explain_choice(error: MissingConfigException) -> str:
     group, _, choice = (error.missing_cfg_file or "").rpartition("/")
     options = ", ".join(error.options or ()) or "none"
-    return f"unknown {group or 'configuration'} {choice!r}: choose from {options}"
+    own = f"; a class of your own is {group.replace('/', '.')}._target_={choice}" if "." in choice else ""
+    return f"unknown {group or 'configuration'} {choice!r}: choose from {options}{own}"
 
 
 def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
@@ -187,7 +188,9 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
             continue
         parent, _, last = key.rpartition(".")
         if not last.startswith("_") and last not in _names(known, parent):
-            return _unknown(key, known)
+            own = [one for one in _parsed(overrides) if one.key_or_group == f"{parent}._target_"]
+            hint = f"; for an argument of {own[0].value()} write +{override.input_line}" if own else ""
+            return _unknown(key, known) + hint
     cause = error.__cause__ or error
     if isinstance(cause, ValidationError) and cause.full_key:
         option = re.sub(r"\[.*", "", str(cause.full_key))
@@ -196,6 +199,9 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
         if wanted and values:
             return f"{option} must be {wanted}, not {shown(values[-1])}"
     first = str(error).splitlines()[0].rstrip(".")
+    several = re.match(r"Ambiguous value for argument '(.+)'$", first)
+    if several:
+        return f"several values need -m: python -m cavin_pyro.{name} -m {several[1]}"
     group = re.match(r"Could not override '(\w+)/(\w+)'. No match in the defaults list", first)
     if group:
         return f"unknown override '{group[1]}.{group[2]}': the chosen {group[1]} has no {group[2]}"
@@ -204,7 +210,7 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
 
 def _unknown(key: str, known: DictConfig) -> str:
     parent, _, last = key.rpartition(".")
-    close = difflib.get_close_matches(last, _names(known, parent), n=1)
+    close = difflib.get_close_matches(last, _names(known, parent), n=1, cutoff=0.7)
     while parent and not _names(known, parent):
         parent = parent.rpartition(".")[0]
     valid = f"valid{' under ' if parent else ''}{parent} are {', '.join(_names(known, parent))}"

@@ -67,7 +67,8 @@ def help_page(name: str, purpose: str, config: DictConfig) -> str:
     lines += [f"  python -m cavin_pyro.{name} {overrides}".rstrip() for overrides in EXAMPLES[name]]
     chosen = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     own = {group: choice for group, choice in chosen.items() if presets(group) and group not in unread}
-    lines += ["", "Presets: each sets several options, which are listed below"]
+    if own:
+        lines += ["", "Presets: each sets several options, which are listed below"]
     for group, choice in own.items():
         lines += _entry(f"{group}={choice}", f"one of {', '.join(presets(group))}")
     declared = [one for one in options(COMMANDS[name]) if one.name.partition(".")[0] not in unread]

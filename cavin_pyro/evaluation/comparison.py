@@ -88,9 +88,9 @@ def sentences(result: Comparison, other: Path) -> str:
     """The comparison for people."""
     share = [100 * (result.both + alone) / result.episodes for alone in (result.one_alone, result.other_alone)]
     return (
-        f"against {other} in the {result.episodes} scenes of both: {share[0]:.1f} % to {share[1]:.1f} %\n"
-        f"both solve {result.both}, this one alone in {result.one_alone}, the other alone in {result.other_alone}, "
-        f"neither in {result.neither}; exact McNemar test p = {result.p_value:.3g}"
+        f"success in the {result.episodes} scenes of both: {share[0]:.1f} % here, {share[1]:.1f} % in {other}\n"
+        f"both solve {result.both}, this one alone {result.one_alone}, the other alone {result.other_alone}, "
+        f"neither {result.neither}; exact McNemar test p = {result.p_value:.3g}"
     )
 
 

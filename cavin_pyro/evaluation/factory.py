@@ -70,6 +70,12 @@ def check_options(config: DictConfig) -> None:
         )
 
 
+def planner_name(config: DictConfig) -> str:
+    """The planner's class, and its optimizer's where it has one: "CavinPlanner, Shooting"."""
+    parts = (config.planner, config.planner.get("optimizer") or {})
+    return ", ".join(str(part["_target_"]).rpartition(".")[2] for part in parts if part.get("_target_"))
+
+
 def announce_waiting(config: DictConfig) -> None:
     """Announce on standard error, before the first plan, that plans will take long."""
     planner = config.planner

@@ -36,8 +36,8 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         UserError: the earlier run had another configuration; the first option that differs is named.
     """
     path = folder / "config.yaml"
-    if not path.exists():
-        return
+    if not path.exists() or [one.name for one in folder.iterdir()] == ["config.yaml"]:
+        return  # a run that failed before its first result holds nothing to protect
     try:
         earlier = stored_options(path)
     except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:

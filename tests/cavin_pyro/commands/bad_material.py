@@ -33,6 +33,7 @@ def make_material(folder: Path, pushes: Path, checkpoint_file: Path, small: Simp
     (folder / "no_yaml.yaml").write_text("region: [[1, 2]")
     (folder / "used").mkdir()
     (folder / "used" / "config.yaml").write_text("seed: 17\n")
+    (folder / "used" / "results.json").write_text("{}")
     (folder / "used_otherwise").mkdir()
     (folder / "used_otherwise" / "data.json").write_text('[{"transitions": 7, "fingerprint": "0a1b"}]')
 

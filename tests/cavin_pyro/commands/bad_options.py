@@ -75,7 +75,18 @@ BAD_OPTIONS = [
     # Overrides that Hydra refuses.
     ("collect", "transitions", "'transitions': write overrides as name=value"),
     ("collect", "transitions=[1,", "write overrides as name=value"),
-    ("plan", "seed=1,2", "seed=1,2"),
+    ("plan", "seed=1,2", "several values need -m: python -m cavin_pyro.plan -m seed=1,2"),
+    ("plan", "--foo task=crossing", "unknown flag --foo: --help lists flags and options"),
+    (
+        "plan",
+        "planner.optimizer=my_lab.Mine",
+        "smc; a class of your own is planner.optimizer._target_=my_lab.Mine",
+    ),
+    (
+        "plan",
+        "planner.optimizer._target_=my_lab.Mine planner.optimizer.sigma=0.1",
+        "; for an argument of my_lab.Mine write +planner.optimizer.sigma=0.1",
+    ),
     ("plan", "reward=???", "Missing mandatory value: reward"),
     ("plan", "reward=${nowhere}", "'nowhere' not found"),
     ("plan", "~task", "task cannot be removed: give it a value as task=value"),

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from cavin_pyro import __main__ as listing
 from cavin_pyro import __version__, plan
-from cavin_pyro.config.application import read_command_line
+from cavin_pyro.config.application import multirun_first, read_command_line
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.composition import check_overrides, compose
 from cavin_pyro.config.errors import UserError
@@ -84,6 +84,15 @@ def test_the_examples_of_help_are_valid(command: str) -> None:
         line = read_command_line(overrides.split())
         if not line.multirun:
             compose(command, *line.overrides)
+
+
+@pytest.mark.parametrize(
+    "words", ["task=crossing -m seed=0,1", "-m task=crossing seed=0,1", "task=crossing seed=0,1 -m"]
+)
+def test_a_sweep_may_be_asked_for_anywhere_on_the_line(words: str) -> None:
+    assert multirun_first(words.split()) == ["-m", "task=crossing", "seed=0,1"]
+    line = read_command_line(multirun_first(words.split()))
+    assert line.multirun and line.overrides == ["task=crossing", "seed=0,1"]
 
 
 def test_different_configurations_have_different_folders() -> None:

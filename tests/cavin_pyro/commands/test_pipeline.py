@@ -178,7 +178,8 @@ def test_evaluation_leaves_rates_with_intervals_and_every_episode(chain: SimpleN
     for name in ("planning_ms", "steps", "return"):
         assert all(math.isfinite(value) for value in results[name].values())
     table = (folder / "results.txt").read_text()
-    assert table.startswith("crossing, layout bridge.yaml, sparse reward, 2 objects, 2 episodes\n")
+    scene, planner = "crossing, layout bridge.yaml, sparse reward, 2 objects", "CavinPlanner, Shooting"
+    assert table.startswith(f"{scene}, {planner}, 2 episodes\n")
     assert chain.answers["evaluate"].output.startswith(table)
     assert yaml.safe_load((folder / "config.yaml").read_text())["episodes"] == 2
 

@@ -27,7 +27,7 @@ def test_scenes_are_counted_by_the_methods_that_solve_them() -> None:
     other = rows([True, False, False, True, False, True])
     result = compare(one, other)
     assert (result.both, result.one_alone, result.other_alone, result.neither) == (2, 2, 1, 1)
-    assert sentences(result, Path("other")).startswith("against other in the 6 scenes of both: 66.7 % to 50.0 %")
+    assert sentences(result, Path("other")).startswith("success in the 6 scenes of both: 66.7 % here, 50.0 % in other")
 
 
 @given(st.integers(0, 20), st.integers(0, 20))

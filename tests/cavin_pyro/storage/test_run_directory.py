@@ -47,19 +47,30 @@ def test_a_run_with_another_configuration_is_refused_and_the_option_is_named(
     changes: dict, said: str, tmp_path: Path
 ) -> None:
     write_config(tmp_path, config())
+    (tmp_path / "metrics.csv").touch()
     with pytest.raises(UserError, match=f"{said}: resume with the same options, or choose another output=DIR"):
         check_same_run(tmp_path, config(**changes), ignore=())
 
 
 def test_a_run_whose_task_was_stored_by_name_resumes(tmp_path: Path) -> None:
     write_config(tmp_path, config(task="crossing"))
+    (tmp_path / "metrics.csv").touch()
     check_same_run(tmp_path, config(task={"_target_": "envs.tasks.crossing.Crossing"}), ignore=())
     with pytest.raises(UserError, match=r"a run with task\._target_=envs\.tasks\.crossing\.Crossing, not my\.Own"):
         check_same_run(tmp_path, config(task={"_target_": "my.Own"}), ignore=())
 
 
+def test_a_run_that_failed_before_its_first_result_may_begin_otherwise(tmp_path: Path) -> None:
+    write_config(tmp_path, config())
+    check_same_run(tmp_path, config(seed=4, name="a-3"), ignore=())
+    (tmp_path / "metrics.csv").touch()
+    with pytest.raises(UserError, match="a run with seed=3, not 4"):
+        check_same_run(tmp_path, config(seed=4, name="a-3"), ignore=())
+
+
 def test_a_damaged_configuration_is_named(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("seed: [1")
+    (tmp_path / "metrics.csv").touch()
     with pytest.raises(UserError, match=r"config\.yaml is damaged"):
         check_same_run(tmp_path, config(), ignore=())
 
