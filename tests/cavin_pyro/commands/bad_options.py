@@ -80,7 +80,7 @@ BAD_OPTIONS = [
     (
         "plan",
         "planner.optimizer=my_lab.Mine",
-        "smc; a class of your own is planner.optimizer._target_=my_lab.Mine",
+        "shooting, smc; a class of your own is planner.optimizer._target_=my_lab.Mine",
     ),
     (
         "plan",

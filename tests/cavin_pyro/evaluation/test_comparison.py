@@ -51,7 +51,7 @@ def test_an_evaluation_is_compared_on_the_command_line(shell: SimpleNamespace, t
     assert evaluation("episodes=2", "output=one").status == 0
     answer = evaluation("episodes=3", "output=two", "compare=one")
     assert answer.status == 0, answer.errors
-    assert "neither in 2; exact McNemar test p = 1" in answer.output
+    assert "neither 2; exact McNemar test p = 1" in answer.output
     found = json.loads((tmp_path / "two" / "results.json").read_text())["comparison"]
     assert found == {"against": "one", "both": 0, "one_alone": 0, "other_alone": 0, "neither": 2, "p_value": 1.0}
     for more, said in (
