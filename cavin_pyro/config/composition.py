@@ -94,7 +94,8 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
 
 def presets_by_name(overrides: Sequence[str]) -> list[str]:
     """`planner.optimizer=cem` as `planner/optimizer=cem`, which brings the options of `cem` with it."""
-    return [re.sub(r"^planner\.optimizer=(?!null$)(?=[A-Za-z_][\w.,]*$)", "planner/optimizer=", word) for word in overrides]
+    named = r"^planner\.optimizer=(?!null$)(?=[A-Za-z_][\w.,]*$)"
+    return [re.sub(named, "planner/optimizer=", word) for word in overrides]
 
 
 def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
