@@ -92,9 +92,9 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
         if declared not in tuple(TASKS):
             raise ValueError(f"layout {path}: unknown task {declared!r}, choose from {', '.join(TASKS)}")
         raise ValueError(f"layout {path} is for task {declared}: run it with task={declared}")
-    content |= {name: value for name, value in (tiles or {}).items() if value is not None}
-    where = f"layout {path} with overrides" if tiles else f"layout {path}"
-    return parse_task(kind, content, where=where)
+    overrides = {name: value for name, value in (tiles or {}).items() if value is not None}
+    where = f"layout {path} with overrides" if overrides else f"layout {path}"
+    return parse_task(kind, content | overrides, where=where)
 
 
 def parse_task(task: str | type[Task], content: Mapping[str, Any], *, where: str = "layout") -> Task:

@@ -30,8 +30,8 @@ class Crossing(Task):
     def check(self) -> None:
         """The target starts on the bridge, off the goal."""
         check_apart(self.goal, self.target_start, "tile {tile} is both goal and target_start")
-        on_bridge = (*self.target_start, *self.goal)
-        check_inside(on_bridge, self.region, "tile {tile} is off the bridge, add it to region")
+        for name in ("target_start", "goal"):
+            check_inside(getattr(self, name), self.region, name + " tile {tile} is off the bridge, add it to region")
 
     def success(self, step: Step) -> Tensor:
         """The target is on a goal tile: [...] bool."""

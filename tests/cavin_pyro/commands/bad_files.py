@@ -79,7 +79,7 @@ BAD_FILES = [
     ("plan", "layout=@no_yaml.yaml", "no_yaml.yaml is not YAML"),
     ("plan", "layout=@overlapping.yaml", "tile [2, 3] is listed twice, tiles must not overlap"),
     ("plan", "layout=@off_table.yaml", "tile [5, 3] is off the table, which holds [0, 0] to [4, 6]"),
-    ("plan", "layout=@off_bridge.yaml", "tile [4, 4] is off the bridge, add it to region"),
+    ("plan", "layout=@off_bridge.yaml", "off_bridge.yaml: goal tile [4, 4] is off the bridge, add it to region"),
     ("plan", "layout=@no_room.yaml", "no room for 3 objects"),
     ("plan", "task=clearing layout=@off_table.yaml", "is for task crossing: run it with task=crossing"),
     ("plan", "tiles.goal=[[9,9]]", "tile [9, 9] is off the table"),

@@ -137,8 +137,8 @@ def test_overrides_replace_the_fields_that_they_name() -> None:
         ("crossing", {"obstacle_start": []}, r"obstacle_start needs at least one tile"),
         ("crossing", {"goal": []}, r"goal needs at least one tile"),
         ("crossing", {"goal": [[2, 4]]}, r"tile \[2, 4\] is both goal and target_start"),
-        ("crossing", {"goal": [[3, 2]]}, r"tile \[3, 2\] is off the bridge, add it to region"),
-        ("crossing", {"target_start": [[2, 5]]}, r"tile \[2, 5\] is off the bridge, add it to region"),
+        ("crossing", {"goal": [[3, 2]]}, r"goal tile \[3, 2\] is off the bridge, add it to region"),
+        ("crossing", {"target_start": [[2, 5]]}, r"target_start tile \[2, 5\] is off the bridge, add it to region"),
         ("insertion", {"region": [[2, 2], [2, 1]]}, r"goal tile \[2, 2\] overlaps the restricted region"),
         ("insertion", {"region": [[2, 4]]}, r"target_start tile \[2, 4\] overlaps the restricted region"),
         ("insertion", {"region": [[1, 3]]}, r"obstacle_start tile \[1, 3\] overlaps the restricted region"),
@@ -219,10 +219,16 @@ def test_the_error_of_an_unknown_task_lists_the_known_ones() -> None:
     ("overrides", "message"),
     [
         ({"goals": [[2, 1]]}, r"crossing_0\.yaml with overrides: unknown key 'goals'"),
-        ({"goal": [[4, 6]]}, r"with overrides: tile \[4, 6\] is off the bridge"),
+        ({"goal": [[4, 6]]}, r"with overrides: goal tile \[4, 6\] is off the bridge"),
         ({"goal": [[2, 0.5]]}, r"with overrides: goal: a tile is two whole numbers"),
     ],
 )
 def test_overrides_are_checked_like_files(overrides: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load_task("crossing", 0, overrides)
+
+
+def test_an_error_speaks_of_overrides_only_if_there_are_some(tmp_path: Path) -> None:
+    path = write(tmp_path, {**CROSSING, "goal": [[4, 6]]})
+    with pytest.raises(ValueError, match=r"\.yaml: goal tile \[4, 6\] is off the bridge"):
+        load_task("crossing", path, {"goal": None, "region": None})
