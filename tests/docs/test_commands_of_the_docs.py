@@ -16,7 +16,7 @@ import pytest
 
 from cavin_pyro.config.composition import compose
 from tests.cavin_pyro.conftest import Case, run_in_turn
-from tests.docs.pages import PAGES, ROOT, Line, commands
+from tests.docs.pages import FENCE, PAGES, ROOT, Line, code_in_prose, commands, name
 from tests.test_repository import PROJECT
 
 LINES = [line for page in PAGES for line in commands(page)]
@@ -42,6 +42,15 @@ WITHOUT_HYDRA = {"assets"}  # its options are those of argparse
 
 def composable(lines: list[Line]) -> list[Line]:
     return [line for line in lines if line.command and line.command not in WITHOUT_HYDRA]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_braces_and_brackets_are_quoted(page: Path) -> None:
+    """bash expands braces with commas, and zsh takes brackets for patterns of file names."""
+    blocks = [block for language, block in FENCE.findall(page.read_text(encoding="utf-8")) if not language]
+    said = [line for block in blocks for line in block.splitlines()] + list(code_in_prose(page))
+    bare = re.compile(r"(?:^|\s)[+~]*[a-z_./]+=[^\s'\"(]*[\[{]")
+    assert not [one for one in said if bare.search(one)]
 
 
 @pytest.mark.parametrize("line", composable(EACH_ONCE), ids=str)

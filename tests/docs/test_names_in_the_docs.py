@@ -77,7 +77,7 @@ def test_options_that_the_page_names_exist(page: Path, options: set[str]) -> Non
         tokens = tokens[3:] if tokens[:2] == ["python", "-m"] else tokens
         tokens = [] if "(" in code else tokens  # Python
         for token in tokens:
-            if match := re.fullmatch(r"([a-z_/]+(?:\.[a-z_]+)*\.?)=.*", token):
+            if match := re.fullmatch(r"'?([a-z_/]+(?:\.[a-z_]+)*\.?)=.*", token):
                 named.add(match[1])
             elif re.fullmatch(r"(env|planner|windows|trainer|objective|model|guide|sizes)(\.[a-z_]+)+", token):
                 named.add(token)
