@@ -18,6 +18,10 @@ class NoFiniteCandidateError(ValueError):
         self.environment, self.what = environment, what
 
 
+class OptimizerError(ValueError):
+    """An optimizer breaks the interface `planning.optimizers.Optimizer`; the message names its class."""
+
+
 def check_positive(name: str, value: int) -> None:
     """Raise ValueError if a count is zero or negative."""
     if value < 1:

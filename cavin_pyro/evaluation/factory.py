@@ -27,6 +27,7 @@ from models.model import Model
 from models.networks.pointnet import PointNet
 from models.priors.flow import FlowPrior
 from planning import Planner
+from planning.inputs import OptimizerError
 from planning.optimizers import Shooting
 from planning.protocol import RewardFunction
 from planning.searching import SearchingPlanner
@@ -50,10 +51,16 @@ class EpisodeRunner:
         return self.env.task
 
     def rollout(self, seed: int, **options: Any) -> Episode:
-        """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`."""
-        return rollout(
-            self.env, self.planner, self.pointnet, seed=seed, pushes_per_plan=self.pushes_per_plan, **options
-        )
+        """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`.
+
+        Raises:
+            UserError: an optimizer of the user's own breaks the interface of optimizers.
+        """
+        parts = self.env, self.planner, self.pointnet
+        try:
+            return rollout(*parts, seed=seed, pushes_per_plan=self.pushes_per_plan, **options)
+        except OptimizerError as error:
+            raise UserError(str(error)) from error
 
 
 def check_options(config: DictConfig) -> None:

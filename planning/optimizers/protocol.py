@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
+from planning.inputs import OptimizerError
 from planning.rollouts.candidates import Candidates, SearchProblem
 
 
@@ -24,7 +25,10 @@ class Optimizer(Protocol):
 def search(optimizer: Optimizer, problem: SearchProblem, samples: int) -> Candidates:
     """All whole candidates `[B, n]` that the optimizer has evaluated.
 
-    Raises ValueError for an optimizer that has evaluated none.
+    Raises OptimizerError, naming the optimizer's class, for candidates of a wrong shape and if it has evaluated none.
     """
-    optimizer.optimize(problem, samples)
-    return problem.take_considered()
+    try:
+        optimizer.optimize(problem, samples)
+        return problem.take_considered()
+    except OptimizerError as error:
+        raise OptimizerError(f"optimizer {type(optimizer).__name__}: {error}") from error

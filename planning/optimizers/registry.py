@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+
+from planning.inputs import OptimizerError
 from planning.optimizers.cross_entropy import CrossEntropy
 from planning.optimizers.evolution import Evolution
 from planning.optimizers.improved_cross_entropy import ImprovedCrossEntropy
@@ -25,18 +28,30 @@ ITERATIVE = (CrossEntropy, ImprovedCrossEntropy, PathIntegral, Evolution)
 def make_optimizer(optimizer: str | Optimizer, *, samples: int) -> Optimizer:
     """The optimizer of that name, with its defaults, or the given one.
 
-    Raises ValueError, naming the valid ones, for an unknown name or for an object that is no optimizer; and for fewer
-    samples than iterations.
+    Raises ValueError, naming the valid ones, for an unknown name or for an object that is no optimizer; for a method
+    `optimize` that takes other arguments; and for fewer samples than iterations.
     """
     if isinstance(optimizer, str):
         if optimizer not in OPTIMIZERS:
             raise ValueError(f"unknown optimizer '{optimizer}': choose from {', '.join(OPTIMIZERS)}")
         optimizer = OPTIMIZERS[optimizer]()
-    if not isinstance(optimizer, Optimizer):
+    if isinstance(optimizer, type) or not isinstance(optimizer, Optimizer):
         raise ValueError(
             f"optimizer must be one of {', '.join(OPTIMIZERS)}, or an object with a method optimize(problem, samples), "
             f"not {optimizer!r}"
         )
+    _check_arguments(optimizer)
     if isinstance(optimizer, ITERATIVE):
         samples_of_iteration(samples, optimizer.iterations, 0)
     return optimizer
+
+
+def _check_arguments(optimizer: Optimizer) -> None:
+    """Raise OptimizerError unless `optimize` takes a problem and a number of samples."""
+    taken = inspect.signature(optimizer.optimize)
+    try:
+        taken.bind("problem", "samples")
+    except TypeError as error:
+        raise OptimizerError(
+            f"optimizer {type(optimizer).__name__}: optimize must take the arguments (problem, samples), not {taken}"
+        ) from error

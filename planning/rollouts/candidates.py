@@ -13,6 +13,7 @@ from torch import Tensor
 from models.state import State
 from planning import records
 from planning.backends.eager import Backend, eager
+from planning.inputs import OptimizerError
 from planning.rollouts.extend import extend_segment
 from planning.rollouts.sampling import noise_each, uniform_each
 from planning.rollouts.segment import Objective, SearchSpace, SegmentRecord, SegmentRollout, actions_of
@@ -41,13 +42,12 @@ class SearchProblem:
     def __call__(self, noise: Tensor) -> Tensor:
         """The returns `[B, n]` of the candidates that standard normal `noise: [B, n, K, D]` determines.
 
-        Raises ValueError for noise of another shape.
+        Raises OptimizerError for noise of another shape.
         """
-        expected = (len(self.generators), self.segments, self.dimension)
-        if noise.ndim != 4 or (noise.shape[0], *noise.shape[2:]) != expected:
-            environments, *rest = expected
-            raise ValueError(
-                f"an optimizer's candidates must be noise [B, n, K, D] = {[environments, 'n', *rest]}, "
+        environments, segments, dimension = len(self.generators), self.segments, self.dimension
+        if noise.ndim != 4 or (noise.shape[0], *noise.shape[2:]) != (environments, segments, dimension):
+            raise OptimizerError(
+                f"candidates must be noise [B, n, K, D] = [{environments}, n, {segments}, {dimension}], "
                 f"not {list(noise.shape)}"
             )
         return self.evaluate(noise).returns
@@ -88,10 +88,10 @@ class SearchProblem:
     def take_considered(self) -> Candidates:
         """Remove and return all whole candidates so far, in order (they refer to this problem).
 
-        Raises ValueError if there are none.
+        Raises OptimizerError if there are none.
         """
         if not self.considered:
-            raise ValueError("the optimizer has evaluated no candidate: call problem(noise) at least once")
+            raise OptimizerError("it has evaluated no candidate, call problem(noise) at least once")
         candidates = join(self.considered)
         self.considered.clear()
         return candidates

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from planning.optimizers import Optimizer
-from tests.cavin_pyro.conftest import ROOT, run_command
+from tests.cavin_pyro.conftest import ROOT, Case, run_command, run_in_turn
 
 PAGE = (ROOT / "docs" / "how-to" / "your-own-optimizer.md").read_text(encoding="utf-8")
 (CODE,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -74,28 +74,46 @@ def test_the_commands_of_the_page_work(command: str, options: str, tmp_path: Pat
     assert any((tmp_path / output).iterdir())
 
 
-def test_the_error_of_an_unknown_argument_is_that_of_the_page(tmp_path: Path) -> None:
+MISTAKES = {  # what the class of the page has, and what a user wrote instead
+    "no method": ("def optimize(", "def optimise("),
+    "other arguments": ("(self, problem, samples):\n        count = samples", "(self, problem):\n        count = 512"),
+    "another shape": ("problem(noise)", "problem(noise[..., :4])"),
+    "no candidate": ("in range(self.generations)", "in range(0)"),
+}
+SHORTLY = ("planner.samples=512", "maximum_steps=2", "video=false", "output=mine")
+
+
+def mistaken(module: Path, right: str, wrong: str) -> None:
+    """The page's class with something else in one place."""
+    assert CODE.count(right) == 1
+    module.parent.mkdir(exist_ok=True)
+    module.write_text(CODE.replace(right, wrong), encoding="utf-8")
+
+
+def test_errors_of_mistakes_are_those_of_the_page(tmp_path: Path) -> None:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
-    overrides = "planner.optimizer._target_=my_lab.EvolutionStrategy", "+planner.optimizer.depth=3"
-    answer = run_command("plan", *overrides, "output=never", folder=tmp_path)
-    assert answer.status == 2
-    (line,) = answer.complaints
-    assert is_told(line.removeprefix("error: ")), line
+    cases = {".": Case("plan", ["planner.optimizer._target_=my_lab.EvolutionStrategy", "+planner.optimizer.depth=3"])}
+    for mistake, (right, wrong) in MISTAKES.items():
+        module = mistake.replace(" ", "_")
+        mistaken(tmp_path / mistake / f"{module}.py", right, wrong)
+        cases[mistake] = Case("plan", [f"planner.optimizer._target_={module}.EvolutionStrategy", *SHORTLY])
+    answers = run_in_turn(cases, tmp_path)
+    assert {name: answer.status for name, answer in answers.items()} == dict.fromkeys(cases, 2), answers
+    for name, answer in answers.items():
+        (line,) = answer.complaints
+        assert is_told(line.removeprefix("error: ")), f"{name}: {line}"
 
 
-class Narrow:
-    def optimize(self, problem: Any, samples: int) -> None:
-        problem(problem.noise(128)[..., :4])
+def test_other_errors_of_a_users_class_keep_their_traceback(tmp_path: Path) -> None:
+    mistaken(tmp_path / "my_lab.py", "returns = problem(noise)", 'raise ValueError("mine")')
+    overrides = ("planner.optimizer._target_=my_lab.EvolutionStrategy", *SHORTLY)
+    answer = run_command("plan", *overrides, folder=tmp_path)
+    assert answer.status == 1
+    assert "Traceback" in answer.errors and answer.errors.rstrip().endswith("ValueError: mine")
 
 
-class Idle:
-    def optimize(self, problem: Any, samples: int) -> None:
-        pass
-
-
-@pytest.mark.parametrize("optimizer", [object(), Narrow(), Idle()], ids=["no optimizer", "narrow", "idle"])
-def test_errors_of_mistakes_are_those_of_the_page(optimizer: Any, toy: Any) -> None:
-    state = toy.scenes([[(0.0, 0.0)]])
+@pytest.mark.parametrize("optimizer", [object(), type(own())], ids=["no optimizer", "class"])
+def test_what_is_no_optimizer_is_refused(optimizer: Any, toy: Any) -> None:
     with pytest.raises(ValueError) as error:
-        toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.6, 0.0)), optimizer=optimizer).plan(state, toy.generators(1))
+        toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.6, 0.0)), optimizer=optimizer)
     assert is_told(str(error.value)), str(error.value)
