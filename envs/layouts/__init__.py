@@ -20,6 +20,7 @@ from typing import Any
 import yaml
 
 from envs.tasks import TASKS, Task
+from envs.tasks.contract import check_fields
 
 RANDOM = "random"
 _FOLDER = Path(__file__).parent
@@ -29,7 +30,7 @@ def task_class(task: str | type[Task]) -> type[Task]:
     """The class of a task, by its name; a class is returned unchanged.
 
     Raises:
-        ValueError: unknown name, or a class with missing methods.
+        ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
     """
     if isinstance(task, str):
         if task not in TASKS:
@@ -39,6 +40,7 @@ def task_class(task: str | type[Task]) -> type[Task]:
         raise ValueError(f"{task!r} is no task: derive it from envs.tasks.Task")
     if task.__abstractmethods__:
         raise ValueError(f"task {task.__name__} lacks {' and '.join(sorted(task.__abstractmethods__))}")
+    check_fields(task)
     return task
 
 

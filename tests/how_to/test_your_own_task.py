@@ -88,7 +88,10 @@ MISTAKES = {
     "no layout": OWN[:1],
     "no such field": (*OWN, "tiles.goal=[[1,1]]"),
     "off the table": (*OWN, "+task.left=[[9,9]]"),
-    "half a task": ("task._target_=half_a_task.Sorting", OWN[1]),
+}
+REWRITTEN = {  # what the class of the page has, and what a user wrote instead
+    "half a task": ("def potential(", "def potency("),
+    "no decoration": ("@dataclass(frozen=True, kw_only=True)\n", ""),
 }
 
 
@@ -97,10 +100,17 @@ def test_errors_of_mistakes_are_those_of_the_page(folder: Path) -> None:
         (folder / mistake).mkdir()
         for name, text in FILES.items():
             (folder / mistake / name).write_text(text, encoding="utf-8")
-    half = FILES["my_tasks.py"].replace("def potential(", "def potency(")
-    (folder / "half a task" / "half_a_task.py").write_text(half, encoding="utf-8")
+    chosen = dict(MISTAKES)
+    for mistake, (right, wrong) in REWRITTEN.items():
+        module = mistake.replace(" ", "_")
+        assert FILES["my_tasks.py"].count(right) == 1
+        (folder / mistake).mkdir()
+        (folder / mistake / "my_layout.yaml").write_text(FILES["my_layout.yaml"], encoding="utf-8")
+        text = FILES["my_tasks.py"].replace(right, wrong)
+        (folder / mistake / f"{module}.py").write_text(text, encoding="utf-8")
+        chosen[mistake] = (f"task._target_={module}.Sorting", OWN[1])
     answers = run_in_turn(
-        {name: Case("plan", [*overrides, "output=never"]) for name, overrides in MISTAKES.items()}, folder
+        {name: Case("plan", [*overrides, "output=never"]) for name, overrides in chosen.items()}, folder
     )
     told = {name: in_one_line(answer) for name, answer in answers.items()}
     assert [line for line in told.values() if not is_told(line)] == []

@@ -86,6 +86,19 @@ def test_what_is_no_whole_task_is_refused() -> None:
         load_task(int)  # type: ignore[arg-type]
 
 
+def test_a_class_without_the_decoration_of_its_fields_is_refused() -> None:
+    class Plain(Visit):
+        wanted: int = 2
+
+    class Further(Visit):
+        def success(self, step: Step) -> Tensor:
+            return ~super().success(step)
+
+    with pytest.raises(ValueError, match=r"^decorate Plain with @dataclass\(frozen=True, kw_only=True\)$"):
+        load_task(Plain)
+    assert isinstance(parse_task(Further, {"places": [[0, 0]], **STARTS}), Further)  # it has no fields of its own
+
+
 def test_a_users_class_is_not_among_the_built_in_tasks() -> None:
     assert Visit not in TASKS.values()
     assert {"clearing", "insertion", "crossing"} <= set(TASKS)
