@@ -20,7 +20,8 @@ from envs.randomness import layout_stream, next_scene_stream
 from envs.scene import Scene
 from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
-from envs.tasks import Outcome, Task, TaskReward, TileSet
+from envs.tasks import TASKS, Outcome, Task, TaskReward, TileSet
+from envs.tasks.contract import check_functions
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
 
 EPISODE_STEPS = 60
@@ -57,8 +58,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
 
     Raises:
-        ValueError: an argument is out of its range, the layout has no room for the objects, or the robot's files
-            are missing.
+        ValueError: an argument is out of its range, a function of the user's task returns another type or shape than
+            `Task` documents, the layout has no room for the objects, or the robot's files are missing.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -91,6 +92,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if isinstance(task, Task) and (layout != 0 or tiles):
             raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
         self.tasks = (task,) if isinstance(task, Task) else possible_tasks(task, layout, tiles)
+        if type(self.tasks[0]) not in TASKS.values():
+            check_functions(self.tasks[0], int(objects))
         self._rewards = [TaskReward(one, reward=reward, criterion=criterion) for one in self.tasks]
         self._strict_rewards = [TaskReward(one, reward=reward) for one in self.tasks]
         self.task, self.reward, self._strict_reward = self.tasks[0], self._rewards[0], self._strict_rewards[0]

@@ -92,6 +92,8 @@ MISTAKES = {
 REWRITTEN = {  # what the class of the page has, and what a user wrote instead
     "half a task": ("def potential(", "def potency("),
     "no decoration": ("@dataclass(frozen=True, kw_only=True)\n", ""),
+    "not bool": ("~step.mask).all(-1)", "~step.mask).float().amin(-1)"),
+    "of each object": ("0.0).sum(-1)", "0.0)"),
 }
 
 

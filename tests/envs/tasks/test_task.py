@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -97,6 +98,39 @@ def test_a_class_without_the_decoration_of_its_fields_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^decorate Plain with @dataclass\(frozen=True, kw_only=True\)$"):
         load_task(Plain)
     assert isinstance(parse_task(Further, {"places": [[0, 0]], **STARTS}), Further)  # it has no fields of its own
+
+
+MISTAKES: list[tuple[str, Callable[[Tensor], object], str]] = [
+    ("success", Tensor.float, r"success must return bool \[\.\.\.\], here \[8, 6\], not float32 \[8, 6\]"),
+    ("success", lambda right: right.unsqueeze(-1), r"success must return bool .*, not bool \[8, 6, 1\]"),
+    ("success", lambda right: right[:, 0], r"success must return bool .*, not bool \[8\]"),
+    ("success", lambda right: True, r"success must return bool .*, not builtins\.bool$"),
+    ("violation", Tensor.float, r"violation must return bool .*, not float32 \[8, 1\]"),
+    ("published_violation", Tensor.float, r"published_violation must return bool .*, not float32"),
+    ("potential", lambda right: right.sum(-1), r"potential must return metres .*, here \[8, 7\], not float32 \[8\]"),
+    ("potential", lambda right: right.sum(-1, keepdim=True), r"potential must return metres .*, not float32 \[8, 1\]"),
+    ("potential", lambda right: right > 0, r"potential must return metres .*, not bool \[8, 7\]"),
+]
+
+
+@pytest.mark.parametrize(("function", "change", "message"), MISTAKES)
+@pytest.mark.parametrize("objects", [1, 3])
+def test_functions_of_a_users_task_are_checked_when_an_environment_is_built(
+    function: str,
+    change: Callable[[Tensor], object],
+    message: str,
+    objects: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    right = getattr(Visit, function)
+    monkeypatch.setattr(Visit, function, lambda self, *arguments: change(right(self, *arguments)))
+    with pytest.raises(ValueError, match=f"^task Visit: {message}"):
+        PushingEnv(task=Visit(places=[(0, 0)], **STARTS), objects=objects)
+
+
+def test_constants_of_a_users_task_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Visit, "success", lambda self, step: torch.tensor(False))
+    PushingEnv(task=Visit(places=[(0, 0)], **STARTS)).close()
 
 
 def test_a_users_class_is_not_among_the_built_in_tasks() -> None:
