@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("plan")
 def main(config: DictConfig) -> None:
-    """Run one closed-loop episode from depth images, and write its table, pictures and video."""
+    """Run one closed-loop episode from segmented depth images, and write its table, pictures and video."""
     import copy
     from pathlib import Path
 

@@ -142,7 +142,7 @@ def rollout(
     photograph: bool = False,
     callbacks: Sequence[EpisodeCallback] = (),
 ) -> Episode:
-    """Run one episode from depth images alone.
+    """Run one episode from depth images, which the environment segments.
 
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
