@@ -32,6 +32,7 @@ test: $(installed_for_tests)
 
 soak: $(installed_for_tests)
 	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist worksteal -m soak
+	HYPOTHESIS_PROFILE=soak OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist worksteal $$(grep -rl --include='test_*.py' hypothesis tests)
 
 docs: $(installed_for_tests)
 	$(build_docs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from hypothesis import settings
 
 from tests.real_assets import REAL_ASSETS
 
-# Other processes may hold the machine up: how long an example takes says nothing.
-settings.register_profile("cavin_pyro", deadline=None)
-settings.load_profile("cavin_pyro")
+# Other processes may hold the machine up: how long an example takes says nothing. Continuous integration tries the same
+# examples every time, so that it fails for what a change did; make soak tries new ones.
+settings.register_profile("cavin_pyro", deadline=None, derandomize=True)
+settings.register_profile("soak", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "cavin_pyro"))
 
 
 @pytest.fixture(autouse=True)

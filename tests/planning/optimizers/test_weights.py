@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from planning.optimizers.weights import adapt_temperature, effective_sample_size, samples_of_iteration
+from planning.optimizers.weights import (
+    RANGE,
+    SAME,
+    TEMPERATURES,
+    adapt_temperature,
+    effective_sample_size,
+    samples_of_iteration,
+)
 
 INFINITE = float("inf")
+STEP = (RANGE[1] / RANGE[0]) ** (1 / (TEMPERATURES - 1))  # between neighbours on the grid of inverse temperatures
 
 
 def test_effective_size_counts_equal_weights_and_nothing_else() -> None:
@@ -24,14 +32,19 @@ def test_effective_size_counts_equal_weights_and_nothing_else() -> None:
     scale=st.sampled_from([1e-4, 1.0, 1e4]),
     failed=st.integers(0, 100),
 )
+@example(seed=264, fraction=0.3, scale=1e-4, failed=0)  # a gap between the best returns
 def test_the_temperature_keeps_the_fraction_of_the_living_and_hardly_more(
     seed: int, fraction: float, scale: float, failed: int
 ) -> None:
     returns = scale * torch.randn(1, 200, generator=torch.Generator().manual_seed(seed))
     returns[:, :failed] = -INFINITE
     inverse, logarithms = adapt_temperature(returns, fraction)
-    size, valid = effective_sample_size(logarithms), 200 - failed
-    assert fraction * valid <= size <= (fraction + 0.25) * valid  # temperatures are tried on a grid
+    least = fraction * (200 - failed) * (1 - 1e-9)
+    lower = [logarithms * STEP**number for number in range(12)]  # at lower and lower temperatures of the grid
+    sizes = effective_sample_size(torch.cat(lower))
+    enough = sizes >= least
+    assert enough[0] and not enough[-1]
+    assert sizes[0] <= SAME * sizes[enough].min()
     assert (logarithms[:, :failed] == -INFINITE).all()
     expected = torch.softmax(inverse[:, None] * (returns - returns.max()), -1)
     torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
