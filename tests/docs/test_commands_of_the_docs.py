@@ -1,9 +1,8 @@
 """The commands of README and documentation, taken from the pages.
 
-`make test` composes every command, and runs those of the README in short sizes, in order and in one folder. `make soak`
-runs those of the tutorial and of the how-to pages, too. The pages about parts of one's own have tests in tests/how_to,
-which run theirs. Commands that need files from publishers (`env.assets=`) and those of the measurements are composed
-only.
+Every command is composed. Those of the README, the tutorial and the how-to pages run in short sizes, in this order and in
+one folder. The pages about parts of one's own have tests in tests/how_to, which run theirs. Commands that need files
+from publishers (`env.assets=`) and those of the measurements are composed only.
 """
 
 from __future__ import annotations
@@ -93,10 +92,5 @@ def run_in_order(pages: Sequence[str], folder: Path) -> None:
         assert answer.status == 0, f"{line}\n{answer.errors}"
 
 
-def test_the_commands_of_the_readme_run_in_order(tmp_path: Path) -> None:
-    run_in_order(["README.md"], tmp_path)
-
-
-@pytest.mark.soak
-def test_the_commands_of_tutorial_and_how_to_pages_run_in_order(tmp_path: Path) -> None:
+def test_the_commands_of_readme_tutorial_and_how_to_pages_run_in_order(tmp_path: Path) -> None:
     run_in_order(["README.md", *TUTORIAL_AND_HOW_TO], tmp_path)
