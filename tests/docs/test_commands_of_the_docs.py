@@ -1,7 +1,7 @@
 """The commands of README and documentation, taken from the pages.
 
-Every command is composed. Those of the README, the tutorial and the how-to pages run in short sizes, in this order and in
-one folder. The pages about parts of one's own have tests in tests/how_to, which run theirs. Commands that need files
+Every command is composed. Those of the README, the tutorial and the how-to pages run in short sizes, in this order and
+in one folder. The pages about parts of one's own have tests in tests/how_to, which run theirs. Commands that need files
 from publishers (`env.assets=`) and those of the measurements are composed only.
 """
 
