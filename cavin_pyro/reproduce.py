@@ -16,21 +16,21 @@ def main(config: DictConfig) -> None:
     from pathlib import Path
 
     from cavin_pyro.reproduction.merging import IGNORED, merge_tables
-    from cavin_pyro.reproduction.pipeline import run_pipeline
+    from cavin_pyro.reproduction.pipeline import as_typed, run_pipeline
     from cavin_pyro.reproduction.results import write_results
-    from cavin_pyro.storage.files import output_folder, write_json
-    from cavin_pyro.storage.provenance import provenance
+    from cavin_pyro.storage.files import output_folder
+    from cavin_pyro.storage.provenance import append_provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
     check_same_run(Path(config.output), config, ignore=IGNORED)
     home = output_folder(config.output)
     write_config(home, config)
-    write_json(home / "provenance.json", provenance())
+    append_provenance(home / "provenance.json")
     if config.merge:
         rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
     else:
         rows = run_pipeline(config, home)
-    for path in write_results(home, rows, f"python -m cavin_pyro.reproduce scale={config.scale}"):
+    for path in write_results(home, rows, as_typed(config)):
         print(path)
 
 

@@ -78,6 +78,8 @@ def episode_row(episode: Episode) -> Row:
         "strict_return": strict_return,
         "unsafe": sum(transition.unsafe for transition in episode.transitions),
         "ineffective": sum(transition.ineffective for transition in episode.transitions),
+        "plans": len(episode.plan_records),
+        "hopeful_plans": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }

@@ -7,6 +7,12 @@ from dataclasses import dataclass
 
 from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS, Scale
 
+FIGURES = ("paper", "ours")  # kinds of planners that have a figure of their own
+PLANNERS = (*FIGURES, "variants")
+# Between one method of the paper's figure and another: what each step of the way brings.
+VARIANTS = (("cavin", "first_segment"),)
+SCENES_PER_TRAINING = 1000  # so that more episodes per cell can join those of an earlier run
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -39,20 +45,27 @@ class Evaluation:
         return f"{self.cell.name}-{self.training_seed}"
 
 
-def cells(scale: Scale, methods: Sequence[str]) -> Iterator[Cell]:
-    """Top row: dense and sparse with 3 objects. Bottom row: sparse, against the number of objects."""
-    for planner in scale.planners:
+def cells(scale: Scale, methods: Sequence[str], planners: Sequence[str] = PLANNERS) -> Iterator[Cell]:
+    """Of every kind of planner in `planners`; see `PLANNERS`.
+
+    Top row: dense and sparse with 3 objects. Bottom row: sparse, against the number of objects. Variants: sparse, with
+    3 objects.
+    """
+    for planner in planners:
         for task in scale.tasks:
+            if planner == "variants":
+                yield from (Cell(*one, task, "sparse", TOP_ROW_OBJECTS) for one in VARIANTS if one[0] in methods)
+                continue
             for method in methods:
                 yield Cell(method, planner, task, "dense", TOP_ROW_OBJECTS)
                 for objects in scale.object_counts:
                     yield Cell(method, planner, task, "sparse", objects)
 
 
-def evaluations(scale: Scale, methods: Sequence[str]) -> Iterator[Evaluation]:
+def evaluations(scale: Scale, methods: Sequence[str], planners: Sequence[str] = PLANNERS) -> Iterator[Evaluation]:
     """Every cell for every training seed. A training seed has scenes of its own, which all methods share."""
-    for cell in cells(scale, methods):
-        total = scale.episodes if cell.objects == TOP_ROW_OBJECTS else scale.bottom_episodes
-        share = -(-total // len(scale.training_seeds))
+    for cell in cells(scale, methods, planners):
+        top = cell.objects == TOP_ROW_OBJECTS and cell.planner in FIGURES
+        share = -(-(scale.episodes if top else scale.bottom_episodes) // len(scale.training_seeds))
         for number, training_seed in enumerate(scale.training_seeds):
-            yield Evaluation(cell, training_seed, scale.first_scene + number * share, share)
+            yield Evaluation(cell, training_seed, scale.first_scene + number * SCENES_PER_TRAINING, share)

@@ -10,11 +10,12 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.reproduction.cells import evaluations
-from cavin_pyro.reproduction.scales import SCALES
+from cavin_pyro.reproduction.pipeline import chosen_scale
 from cavin_pyro.reproduction.table import TABLE, read_table, write_table
 from cavin_pyro.storage.run_directory import check_same_run
 
-IGNORED = ("output", "workers", "shard", "merge")  # options that may differ between shards
+EXTENDED = ("planners", "episodes", "bottom_episodes")  # options that may change when a run goes on
+IGNORED = ("output", "workers", "shard", "merge", *EXTENDED)
 
 
 def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> list[dict[str, Any]]:
@@ -32,7 +33,7 @@ def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> lis
             rows[_key(row)] = row
     wanted = [
         (one.cell.method, one.cell.planner, one.cell.task, one.cell.reward, one.cell.objects, one.training_seed, seed)
-        for one in evaluations(SCALES[config.scale], config.methods)
+        for one in evaluations(chosen_scale(config), config.methods, config.planners)
         for seed in range(one.seed, one.seed + one.episodes)
     ]
     missing = [key for key in wanted if key not in rows]

@@ -32,14 +32,21 @@ METHODS: dict[str, Method] = {
             "CAVIN",
             "#D55E00",
             ("model=cascaded", "guide=cascaded"),
-            {"paper": ("planner=paper",), "ours": ("planner=cavin",)},
+            {
+                "paper": ("planner=paper",),
+                "ours": ("planner=cavin",),
+                "first_segment": ("planner=paper", "planner.motion_horizon=first_segment"),
+            },
         ),
         Method(
             "sectar",
             "SeCTAR",
             "#0072B2",
             ("model=single_latent", "guide=single_latent"),
-            {"paper": ("planner=sectar", *WITHOUT_ADDITIONS), "ours": ("planner=sectar",)},
+            {
+                "paper": ("planner=sectar", *WITHOUT_ADDITIONS),
+                "ours": ("planner=sectar",),
+            },
         ),
         Method(
             "cvae_mpc",

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from cavin_pyro.config.commands.reproduction import ReproduceConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
-from cavin_pyro.reproduction.cells import Evaluation, evaluations
+from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
 from cavin_pyro.reproduction.table import TABLE, episode_row, write_table
 
+ROUND = 10  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
 
 
@@ -28,6 +32,7 @@ def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
 
     Args:
         config: of the command `reproduce`. `shard=i/n`: the i-th of every n trainings and their episodes only.
+            With more `episodes` or other `planners` than an earlier run, only what is missing is run.
 
     Returns:
         The table's rows.
@@ -35,13 +40,13 @@ def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: an option that cannot be used, or a stage that failed.
     """
-    scale = SCALES[config.scale]
+    scale = chosen_scale(config)
     first = preparation(scale, home, workers=config.workers)
     learning = of_shard(trainings(scale, home, config.methods), config.shard)
     folders = {stage.folder for stage in learning}
     own = [
         one
-        for one in evaluations(scale, config.methods)
+        for one in evaluations(scale, config.methods, config.planners)
         if training_folder(home, one.cell.method, one.training_seed) in folders
     ]
     with _whole_progress([*first, *learning], scale, own, home, config.workers) as bar:
@@ -51,6 +56,31 @@ def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
     rows = [episode_row(one, row) for one in own for row in found[one]]
     write_table(home / TABLE, rows)
     return rows
+
+
+def chosen_scale(config: DictConfig) -> Scale:
+    """The scale by its name, with the numbers of episodes that replace its own.
+
+    Raises:
+        UserError: more episodes than there are scenes.
+    """
+    scale = SCALES[config.scale]
+    given = {name: config[name] for name in ("episodes", "bottom_episodes") if config[name] is not None}
+    most = SCENES_PER_TRAINING * len(scale.training_seeds)
+    for name, value in given.items():
+        if value > most:
+            raise UserError(f"{name} must be at most {most} with scale={config.scale}, not {value}")
+    return replace(scale, **given)
+
+
+def as_typed(config: DictConfig) -> str:
+    """The command that makes the same table, for the page of results."""
+    default, words = ReproduceConfig(), [f"scale={config.scale}"]
+    for name in ("methods", "planners", "episodes", "bottom_episodes"):
+        if config[name] != getattr(default, name):
+            value = config[name]
+            words.append(f"{name}={value if isinstance(value, int) else '[' + ','.join(value) + ']'}")
+    return shlex.join(["python", "-m", "cavin_pyro.reproduce", *words])
 
 
 def of_shard(stages: list[Stage], shard: str) -> list[Stage]:
@@ -73,15 +103,19 @@ def evaluation_folder(home: Path, evaluation: Evaluation) -> Path:
 def _evaluate(
     scale: Scale, own: Sequence[Evaluation], home: Path, workers: int, bar: _Bar
 ) -> dict[Evaluation, list[Row]]:
-    """The episodes of all evaluations, one queue for all, so that no worker waits for the end of a cell."""
+    """The episodes of all evaluations, one queue for all, so that no worker waits for the end of a cell.
+
+    The queue goes in rounds over the cells, so that an interrupted run has about as many episodes of each.
+    """
     rows = {one: begin(_made(evaluation_folder(home, one))) for one in own}
-    jobs, owners = [], []
-    for one, config in _configurations(scale, own, home):
-        for seed in missing_seeds(config, rows[one]):
-            jobs.append((config, seed))
-            owners.append(one)
-    for number, row in run_jobs(jobs, workers):
-        one = owners[number]
+    missing = [
+        ((seed - one.seed) // ROUND, place, one, config, seed)
+        for place, (one, config) in enumerate(_configurations(scale, own, home))
+        for seed in missing_seeds(config, rows[one])
+    ]
+    missing.sort(key=lambda job: (job[0], job[1], job[-1]))
+    for number, row in run_jobs([(config, seed) for *_, config, seed in missing], workers):
+        one = missing[number][2]
         rows[one][row["seed"]] = row
         append(evaluation_folder(home, one), row)
         bar.update(scale.episode_seconds / workers)

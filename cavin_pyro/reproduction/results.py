@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cavin_pyro.reproduction.cells import FIGURES, VARIANTS
 from cavin_pyro.reproduction.figure import TITLES, draw_figure
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
@@ -25,13 +26,14 @@ def write_results(home: Path, rows: Sequence[Row], command: str) -> list[Path]:
     measured = rates(rows)
     compared, means = paired_tests(rows), interquartile_means(rows)
     write_json(home / STATISTICS, {"rates": measured, "tests": compared, "interquartile_means": means})
-    planners = list(dict.fromkeys(row["planner"] for row in rows))
+    planners = [name for name in FIGURES if any(row["planner"] == name for row in rows)]
     figures = [(planner, criterion) for planner in planners for criterion in CRITERIA]
     for planner, criterion in figures:
         draw_figure(home / f"figure-{planner}-{criterion}.png", measured, planner=planner, criterion=criterion)
     sections = [_section(planner, criterion, measured, compared) for planner, criterion in figures]
+    lines = [*_head(rows, command), *sections, *_variants(measured, compared)]
     with atomic_write(home / PAGE) as temporary:
-        temporary.write_text("\n".join([*_head(rows, command), *sections]), encoding="utf-8")
+        temporary.write_text("\n".join(lines), encoding="utf-8")
     return [home / PAGE, home / STATISTICS, *(home / f"figure-{one}-{other}.png" for one, other in figures)]
 
 
@@ -50,6 +52,37 @@ def _head(rows: Sequence[Row], command: str) -> list[str]:
         "by episode, exact McNemar test with Holm's correction.",
         "",
     ]
+
+
+def _variants(measured: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What lies between the methods: a table with the paper's planners above their variants."""
+    shown = [one for one in measured if (one["method"], one["planner"]) in VARIANTS]
+    if not shown:
+        return []
+    p_values = {(*_key(one), one["criterion"]): one["p_holm"] for one in compared}
+    tasks = list(dict.fromkeys(one["task"] for one in shown))
+    columns = [(task, criterion) for criterion in CRITERIA for task in tasks]
+    lines = [
+        "## Between the methods, sparse rewards, 3 objects",
+        "",
+        "Without our additions, except what the second column says. p: against `paper` of the same method.",
+        "",
+        "| method | variant | " + " | ".join(f"{task}, {criterion}" for task, criterion in columns) + " |",
+        "| --- " * (2 + len(columns)) + "|",
+    ]
+    places = {(*_key(one), one["criterion"]): one for one in measured}
+    for method in dict.fromkeys(one["method"] for one in shown):
+        for planner in ("paper", *(name for owner, name in VARIANTS if owner == method)):
+            entries = []
+            for task, criterion in columns:
+                rate = places.get((method, planner, task, "sparse", TOP_ROW_OBJECTS, criterion))
+                entries.append(_entry(rate, _of_criterion(p_values, criterion)) if rate else "")
+            lines.append(f"| {METHODS[method].label} | `{planner}` | " + " | ".join(entries) + " |")
+    return [*lines, ""]
+
+
+def _of_criterion(p_values: Mapping[tuple[Any, ...], float], criterion: str) -> dict[tuple[Any, ...], float]:
+    return {key[:-1]: value for key, value in p_values.items() if key[-1] == criterion and key[1] not in FIGURES}
 
 
 def _section(planner: str, criterion: str, measured: Sequence[Mapping[str, Any]], compared: Sequence[Any]) -> str:

@@ -15,9 +15,11 @@ class Scale:
 
     Attributes:
         transitions: pushes to collect, for all methods alike. training_seeds: trainings of each method.
-        episodes: per cell of the top row. bottom_episodes: per cell of the bottom row. Both are shared by the training
-            seeds; each of them gets scenes of its own, which are the same for all methods.
-        first_scene: seed of the first scene; no other run uses these scenes.
+        episodes: per cell of the top row. bottom_episodes: per cell of the bottom row, and of the variants of
+            `cavin_pyro.reproduction.cells.VARIANTS`. Both are shared by the training seeds; each of them gets scenes of
+            its own, which are the same for all methods.
+        first_scene: seed of the first scene; no other run uses these scenes. The training seed at place i has those
+            from first_scene + 1000 i on.
         episode_seconds, training_seconds: what an episode and a training cost on one core, roughly, for the time left.
         collection, pretraining, training, planning: further overrides of `collect`, `pretrain`, `train` and `evaluate`.
     """
@@ -31,7 +33,6 @@ class Scale:
     training_seconds: float
     tasks: tuple[str, ...] = TASKS
     object_counts: tuple[int, ...] = OBJECT_COUNTS
-    planners: tuple[str, ...] = ("paper", "ours")
     collection: tuple[str, ...] = ()
     pretraining: tuple[str, ...] = ()
     training: tuple[str, ...] = ()
@@ -69,7 +70,6 @@ SCALES: dict[str, Scale] = {
         training_seconds=5.0,
         tasks=("clearing",),
         object_counts=(1, 3),
-        planners=("paper",),
         collection=("episodes_per_shard=5",),
         pretraining=("clouds=100", "steps=2", "batch_size=8"),
         training=TINY_TRAINING,
@@ -99,6 +99,17 @@ SCALES: dict[str, Scale] = {
         training_seconds=180.0,
         pretraining=("clouds=20000", "steps=2000"),
         training=(*QUICK_TRAINING, "trainer.steps=4000"),
+    ),
+    # What two cores do in an afternoon, with trainings long enough to compare the methods.
+    "medium": Scale(
+        transitions=240_000,
+        training_seeds=(0, 1, 2),
+        episodes=60,
+        bottom_episodes=30,
+        first_scene=70_000,
+        episode_seconds=2.5,
+        training_seconds=500.0,
+        training=(*QUICK_TRAINING, "trainer.steps=12000"),
     ),
     "paper": Scale(
         transitions=500_000,

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import binomtest, trim_mean
 
 from cavin_pyro.evaluation.statistics import wilson
+from cavin_pyro.reproduction.cells import FIGURES
 from cavin_pyro.reproduction.table import CRITERIA, Row
 
 RESAMPLES = 2000
@@ -69,37 +70,45 @@ def hierarchical_interval(success: Sequence[bool], groups: Sequence[int], seed: 
 
 
 def paired_tests(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """CAVIN against every other method in every cell, episode by episode: exact McNemar tests, and Holm's p values.
+    """Exact McNemar tests, episode by episode, with Holm's p values.
 
-    A family is all comparisons of one planner and one criterion.
+    CAVIN against every other method, both with the same kind of planner; and every variant against `paper` of the same
+    method. A family is all comparisons of one kind of planner (all variants together) and one criterion.
     """
     cells, found = by_cell(rows), []
     for criterion in CRITERIA:
-        for planner in sorted({cell[1] for cell in cells}):
-            family = []
-            for (method, own_planner, *rest), others in cells.items():
-                ours = cells.get((OURS, planner, *rest))
-                if method == OURS or own_planner != planner or ours is None:
-                    continue
-                one, other = (_successes(part, criterion) for part in (ours, others))
-                common = sorted(set(one) & set(other))
-                alone = sum(one[scene] and not other[scene] for scene in common)
-                other_alone = sum(other[scene] and not one[scene] for scene in common)
-                p = float(binomtest(alone, alone + other_alone).pvalue) if alone + other_alone else 1.0
-                family.append(
-                    {
-                        **dict(zip(CELL, (method, planner, *rest), strict=True)),
-                        "criterion": criterion,
-                        "scenes": len(common),
-                        "difference": sum(one[s] - other[s] for s in common) / len(common) if common else 0.0,
-                        "cavin_alone": alone,
-                        "other_alone": other_alone,
-                        "p": p,
-                    }
-                )
+        families: dict[str, list[dict[str, Any]]] = {}
+        for cell, others in cells.items():
+            method, planner, *rest = cell
+            reference = (OURS, planner) if planner in FIGURES else (method, "paper")
+            against = cells.get((*reference, *rest))
+            if reference != (method, planner) and against is not None:
+                family = families.setdefault(planner if planner in FIGURES else "variants", [])
+                compared = {
+                    **dict(zip(CELL, cell, strict=True)),
+                    "criterion": criterion,
+                    "against": "-".join(reference),
+                }
+                family.append(compared | _paired(against, others, criterion))
+        for _, family in sorted(families.items()):
             for entry, corrected in zip(family, holm([entry["p"] for entry in family]), strict=True):
                 found.append({**entry, "p_holm": corrected})
     return found
+
+
+def _paired(reference: Sequence[Row], others: Sequence[Row], criterion: str) -> dict[str, Any]:
+    """The comparison of two cells on the scenes that both have; `difference`: reference minus other."""
+    one, other = (_successes(part, criterion) for part in (reference, others))
+    common = sorted(set(one) & set(other))
+    alone = sum(one[scene] and not other[scene] for scene in common)
+    other_alone = sum(other[scene] and not one[scene] for scene in common)
+    return {
+        "scenes": len(common),
+        "difference": sum(one[s] - other[s] for s in common) / len(common) if common else 0.0,
+        "reference_alone": alone,
+        "other_alone": other_alone,
+        "p": float(binomtest(alone, alone + other_alone).pvalue) if alone + other_alone else 1.0,
+    }
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

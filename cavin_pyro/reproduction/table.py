@@ -32,6 +32,9 @@ SCHEMA = pyarrow.schema(
         ("published_return", pyarrow.float64()),
         ("unsafe", pyarrow.int16()),
         ("ineffective", pyarrow.int16()),
+        ("plans", pyarrow.int16()),
+        ("hopeful_plans", pyarrow.int16()),  # of these, those that the model expects to reach the goal
+        ("subgoal_distance", pyarrow.float64()),  # metres, mean over segments; null for planners without subgoals
     ]
 )
 Row = dict[str, Any]
@@ -53,7 +56,7 @@ def episode_row(evaluation: Evaluation, row: Mapping[str, Any]) -> Row:
         "seed": row["seed"],
         **{f"strict_{name}": row[f"strict_{name}"] for name in ("outcome", "steps", "return")},
         **{f"published_{name}": row[name] for name in ("outcome", "steps", "return")},
-        **{name: row[name] for name in ("unsafe", "ineffective")},
+        **{name: row[name] for name in ("unsafe", "ineffective", "plans", "hopeful_plans", "subgoal_distance")},
     }
 
 

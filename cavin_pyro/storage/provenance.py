@@ -14,6 +14,7 @@ from typing import Any
 
 from cavin_pyro import __version__
 from cavin_pyro.config.application import PACKAGES
+from cavin_pyro.storage.files import read_json, write_json
 
 
 def provenance() -> dict[str, Any]:
@@ -27,6 +28,12 @@ def provenance() -> dict[str, Any]:
         "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
         "machine": f"{platform.system()} {platform.machine()}",
     }
+
+
+def append_provenance(path: Path) -> None:
+    """Add a record of this run to those of the runs that it goes on from: a JSON list."""
+    earlier = read_json(path) if path.exists() else []
+    write_json(path, [*(earlier if isinstance(earlier, list) else [earlier]), provenance()])
 
 
 def program_fingerprint() -> str:

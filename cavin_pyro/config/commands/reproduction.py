@@ -16,7 +16,8 @@ class ReproduceConfig:
     scale: str = option(
         "smoke",
         "how large: smoke shows that everything runs (its rates mean nothing), small trains and evaluates little, "
-        "paper takes the paper's 500,000 transitions and 1,000 episodes per cell; minimal is for tests",
+        "medium is an afternoon on 2 cores, paper takes the paper's 500,000 transitions and 1,000 episodes per cell; "
+        "minimal is for tests",
         choices="cavin_pyro.reproduction.scales.SCALES",
         group="run",
     )
@@ -25,6 +26,18 @@ class ReproduceConfig:
         "methods to train and evaluate",
         choices="cavin_pyro.reproduction.methods.METHODS",
         group="run",
+    )
+    planners: list[str] = option(
+        ["paper", "ours", "variants"],
+        "kinds of planners to evaluate: the paper's, ours with its additions, and what lies between the methods",
+        choices="cavin_pyro.reproduction.cells.PLANNERS",
+        group="run",
+    )
+    episodes: int | None = option(
+        None, "per cell of the top row; by default the scale's. A finished run goes on to more", minimum=1, group="run"
+    )
+    bottom_episodes: int | None = option(
+        None, "per cell of the bottom row and of the variants; by default the scale's", minimum=1, group="run"
     )
     output: str | None = option(
         None, "folder for everything, where an unfinished run is resumed; by default one in runs/reproduce", group="run"

@@ -1,19 +1,21 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.reproduction.cells import cells, evaluations
+from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.pipeline import SHARED, of_shard
+from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale, of_shard
 from cavin_pyro.reproduction.scales import SCALES
 from cavin_pyro.reproduction.stages import trainings
 from tests.cavin_pyro.conftest import ROOT
 
 
 def test_the_paper_figure_has_seventy_two_cells_for_each_kind_of_planner() -> None:
-    found = list(cells(SCALES["paper"], list(METHODS)))
+    found = list(cells(SCALES["paper"], list(METHODS), FIGURES))
     assert len(found) == len(set(found)) == 2 * 72
     top = [one for one in found if one.planner == "paper" and one.objects == 3]
     assert len(top) == 4 * 3 * 2
@@ -22,7 +24,7 @@ def test_the_paper_figure_has_seventy_two_cells_for_each_kind_of_planner() -> No
 @pytest.mark.parametrize("scale", SCALES)
 def test_methods_meet_the_same_scenes_and_training_seeds_other_ones(scale: str) -> None:
     scenes: dict[tuple, set[int]] = {}
-    for one in evaluations(SCALES[scale], list(METHODS)):
+    for one in evaluations(SCALES[scale], list(METHODS), FIGURES):
         cell = one.cell
         seeds = set(range(one.seed, one.seed + one.episodes))
         assert scenes.setdefault((cell.objects, one.training_seed), seeds) == seeds
@@ -34,7 +36,7 @@ def test_methods_meet_the_same_scenes_and_training_seeds_other_ones(scale: str) 
 
 def test_the_papers_scale_has_at_least_the_episodes_of_the_paper() -> None:
     total: dict[tuple, int] = {}
-    for one in evaluations(SCALES["paper"], list(METHODS)):
+    for one in evaluations(SCALES["paper"], list(METHODS), FIGURES):
         total[one.cell] = total.get(one.cell, 0) + one.episodes
     assert all(count >= (1000 if cell.objects == 3 else 300) for cell, count in total.items())
 
@@ -57,6 +59,32 @@ def test_every_command_line_of_a_stage_is_accepted(method: str, scale: str) -> N
     for planner in METHODS[method].planners.values():
         composed = compose("evaluate", *SHARED, *planner, *SCALES[scale].planning, "output=-")
         assert composed.env.segmentation == "clusters" and composed.criterion == "published"
+
+
+def test_variants_have_a_planner_each_and_differ_from_the_papers() -> None:
+    assert set(VARIANTS) == {
+        (method.name, planner) for method in METHODS.values() for planner in method.planners if planner not in FIGURES
+    }
+    found = list(cells(SCALES["paper"], ["cavin"], ["variants"]))
+    assert {one.planner for one in found} == {"first_segment"} and len(found) == 3
+    for method, planner in VARIANTS:
+        own, paper = (compose("evaluate", *METHODS[method].planners[name], "output=-") for name in (planner, "paper"))
+        assert own.planner != paper.planner
+        assert (own.margin, own.pushes_per_plan) == (paper.margin, paper.pushes_per_plan)
+
+
+def test_more_episodes_contain_those_of_a_shorter_run() -> None:
+    scale = SCALES["medium"]
+    short, long = (
+        {(one.name, seed) for one in evaluations(some, ["mpc"]) for seed in range(one.seed, one.seed + one.episodes)}
+        for some in (scale, replace(scale, episodes=300, bottom_episodes=90))
+    )
+    assert short < long
+
+
+def test_more_episodes_than_scenes_are_refused() -> None:
+    with pytest.raises(UserError, match="episodes must be at most 3000 with scale=medium, not 3001"):
+        chosen_scale(compose("reproduce", "scale=medium", "episodes=3001", "output=-"))
 
 
 def test_the_papers_planners_have_no_additions_and_ours_have_some() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
 import time
@@ -12,8 +13,8 @@ import pytest
 
 from cavin_pyro.reproduction.stages import Stage, run_stages
 
-WHOLE = ("scale=minimal", "methods=[mpc]", "workers=1", "output=whole")
-TWO_METHODS = ("scale=minimal", "methods=[cavin,mpc]")  # in make soak
+WHOLE = ("scale=minimal", "methods=[mpc]", "planners=[paper]", "workers=1", "output=whole")
+TWO_METHODS = ("scale=minimal", "methods=[cavin,mpc]", "planners=[paper]")  # in make soak
 RESULTS = ("episodes.parquet", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png")
 
 
@@ -39,6 +40,16 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     assert again.status == 0, again.errors
     assert contents(home) == made
     assert finished == {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
+    more = shell.run_command("reproduce", *WHOLE, "bottom_episodes=2", folder=tmp_path)
+    assert more.status == 0, more.errors
+    longer = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
+    assert all(longer[path].startswith(kept) for path, kept in episodes.items() if path != cut)
+    assert sum(text.count(b"\n") for text in longer.values()) == 3 + 1
+    assert [run["command"].split()[-1] for run in json.loads((home / "provenance.json").read_text())] == [
+        "output=whole",
+        "output=whole",
+        "bottom_episodes=2",
+    ]
     other = shell.run_command("reproduce", "scale=smoke", "output=whole", folder=tmp_path)
     assert other.status == 2 and "holds a run with" in other.complaints[0]
 

@@ -68,10 +68,18 @@ def test_methods_are_compared_scene_by_scene() -> None:
     ours = episodes("cavin", {0: [WON] * 12 + [LOST, WON]})
     theirs = episodes("mpc", {0: [LOST] * 12 + [WON, WON]})
     (found,) = (one for one in paired_tests([*ours, *theirs]) if one["criterion"] == "strict")
-    assert (found["scenes"], found["cavin_alone"], found["other_alone"]) == (14, 12, 1)
+    assert (found["scenes"], found["reference_alone"], found["other_alone"]) == (14, 12, 1)
     assert found["difference"] == pytest.approx(11 / 14)
     # Of 13 fair coins at most one the other way, both tails.
     assert found["p"] == found["p_holm"] == pytest.approx(2 * 14 / 2**13)
+
+
+def test_a_variant_is_compared_with_the_papers_planner_of_its_own_method() -> None:
+    paper = episodes("sectar", {0: [WON] * 3})
+    variant = episodes("sectar", {0: [LOST, WON, LOST]}, planner="perturbed_rollouts")
+    (found,) = (one for one in paired_tests([*paper, *variant]) if one["criterion"] == "strict")
+    assert (found["planner"], found["against"]) == ("perturbed_rollouts", "sectar-paper")
+    assert (found["reference_alone"], found["other_alone"]) == (2, 0)
 
 
 def test_equal_methods_are_not_told_apart() -> None:

@@ -22,16 +22,17 @@ METHODS = ["cavin", "mpc"]
 def played() -> list[dict[str, Any]]:
     """The rows of a minimal run, in which CAVIN succeeds and MPC runs out of time."""
     rows = []
-    for one in evaluations(SCALES["minimal"], METHODS):
+    for one in evaluations(SCALES["minimal"], METHODS, ["paper"]):
         outcome = "success" if one.cell.method == "cavin" else "timeout"
         line = {"seed": one.seed, "outcome": outcome, "steps": 2, "return": 97.5, "unsafe": 1, "ineffective": 0}
+        line |= {"plans": 2, "hopeful_plans": 1, "subgoal_distance": None}
         strict = {"strict_outcome": outcome, "strict_steps": 2, "strict_return": 97.5}
         rows.append(episode_row(one, {**line, **strict, "planning_ms": [1.0]}))
     return rows
 
 
 def config(**options: Any) -> DictConfig:
-    overrides = ["scale=minimal", f"methods=[{','.join(METHODS)}]"]
+    overrides = ["scale=minimal", "planners=[paper]", f"methods=[{','.join(METHODS)}]"]
     return compose("reproduce", *overrides, *(f"{name}={value}" for name, value in options.items()))
 
 
