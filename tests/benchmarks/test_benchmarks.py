@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from cavin_pyro.data.collection import CollectionConfig, collect
+from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
+from cavin_pyro.reproduction.stages import preparation
 
 ROOT = Path(__file__).parents[2]
 
@@ -111,3 +113,17 @@ def test_pushes_of_robots_are_compared_with_the_sticks_and_drawn(tmp_path: Path)
     assert max(found["heavy, panda"]["line"]) < 0.005
     run("robots", "--read", str(file), "--robots", "panda", "--draw", str(pictures))
     assert sorted(path.name for path in pictures.iterdir()) == ["robots-deviations.png", "robots.png"]
+
+
+@pytest.mark.soak
+def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    for stage in preparation(SCALES["minimal"], home, workers=1):
+        stage.run()
+    options = ("--methods", "cvae_mpc", "mpc", "--steps", "2", "--episodes", "1", "--workers", "1")
+    fast = ("--training", *TINY_TRAINING[1:], "--planning", "planner.samples=8", "planner.horizon=6", "maximum_steps=1")
+    printed = run("tuning", str(home), *options, *fast)
+    rows = [line.split(" | ") for line in printed.splitlines()[2:]]
+    assert [row[1] for row in rows] == ["code 32", "code 16", "code 64", "no codes"]
+    assert all(float(row[2]) for row in rows) and all(row[-2].endswith(" of 3") for row in rows)
+    assert run("tuning", str(home), *options, *fast) == printed
