@@ -102,7 +102,7 @@ SCALES: dict[str, Scale] = {
     ),
     # What two cores do in an afternoon, with trainings long enough to compare the methods.
     "medium": Scale(
-        transitions=240_000,
+        transitions=200_000,
         training_seeds=(0, 1, 2),
         episodes=60,
         bottom_episodes=30,
