@@ -45,6 +45,7 @@ HEADINGS = {  # of the groups, in the order of the page
     "run": "Run",
 }
 # "name: what it means" or "one, other: what both mean", up to the next of its kind.
+FACTS_OF_PRESETS = ("model_free", "default_checkpoint")  # which a preset tells the program, and users need not set
 MEANING = r"(?:(?<=\s)|^)([a-z_]+(?:, [a-z_]+)*): (.+?)(?=\s[a-z_, ]+: |\n\n|$)"
 FLAGS = """
 -m                       one run for each value: -m seed=0,1,2 (Hydra's launchers: hydra/launcher=...)
@@ -111,7 +112,7 @@ def _part_entries(prefix: str, section: Any) -> Iterator[tuple[str, str]]:
             yield from _part_entries(f"{prefix}.{name}", value)
         elif name == "_target_" and value is not None:
             yield f"{prefix}._target_={value}", "the class; name one of your own to take its place"
-        elif name != "model_free":
+        elif name not in FACTS_OF_PRESETS:
             yield f"{prefix}.{name}={_text(value)}", meanings.get(name, "")
 
 

@@ -12,6 +12,7 @@ import pyro
 import torch
 from omegaconf import DictConfig
 
+from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.errors import UserError, user_input, whole_number
 from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.parts import build_model, class_of, construct
@@ -129,6 +130,7 @@ def make_planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, P
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     pointnet = pointnet_of(checkpoint, path)
     options = {str(name): value for name, value in config.planner.items()}
+    options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
         return construct(options), pointnet
     if "model" not in checkpoint.config:
@@ -208,9 +210,12 @@ def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
         else None
     )
     if violation is not None:
+        wanted = planner.requires.model
+        fitting = "|".join(name for name, (model_name, _) in CHECKPOINTS.items() if model_name == wanted)
+        choice = f"choose checkpoint={fitting}, or " if fitting else "choose "
         raise UserError(
-            f"{planner.__name__} needs a checkpoint of model={planner.requires.model}, but {path} holds "
-            f"{type(model).__name__}, which {violation}; planner=random takes any"
+            f"{planner.__name__} needs a checkpoint of model={wanted}, but {path} holds {type(model).__name__}, "
+            f"which {violation}: {choice}planner=random, which takes any"
         )
     if options.get("compile") and any(isinstance(part, FlowPrior) for part in model.modules()):
         raise UserError(

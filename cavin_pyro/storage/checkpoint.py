@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands.episodes import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.renamed import renamed
@@ -127,6 +127,12 @@ def find_checkpoint(name: str) -> Path:
     shipped = shipped_folder() / f"{name}.safetensors"
     if not shipped.is_file():
         names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.safetensors")))
+        if name in CHECKPOINTS:
+            model, guide = CHECKPOINTS[name]
+            raise UserError(
+                f"there is no checkpoint {name} in {shipped_folder()}, which has {names}: train one with "
+                f"python -m cavin_pyro.train model={model} guide={guide}, and give the path of its .safetensors file"
+            )
         raise UserError(f"unknown checkpoint {name!r}: choose from {names}, or give the path of a .safetensors file")
     return shipped
 

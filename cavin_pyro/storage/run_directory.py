@@ -14,6 +14,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 from envs.tasks import TASKS
 
+# It only decides `checkpoint`, which is compared; older versions did not know it.
+NEVER_COMPARED = ("planner.default_checkpoint",)
 RENAMED_KEYS = {"mark": "fingerprint", "settings": "configuration"}  # of the record of a dataset
 
 
@@ -44,7 +46,7 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
     now = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
-        if name not in ignore and now.get(name) != earlier.get(name):
+        if name not in (*ignore, *NEVER_COMPARED) and now.get(name) != earlier.get(name):
             raise UserError(
                 f"{folder} holds a run with {name}={earlier.get(name)}, not {now.get(name)}: "
                 "resume with the same options, or choose another output=DIR"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands.episodes import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.commands.training import DATA
 from cavin_pyro.config.commands.world import WorldConfig, collection_world
 from cavin_pyro.config.options import option, seed_option
@@ -20,7 +20,7 @@ class CheckConfig:
     )
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
-        "a shipped one (cavin, kinect, held_out), or the path of a checkpoint from train",
+        f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train",
         group="model",
     )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")

@@ -9,6 +9,14 @@ from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
 from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
 from envs.workspace import MAXIMUM_OBJECTS
 
+CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
+    "cavin": ("cascaded", "cascaded"),
+    "kinect": ("cascaded", "cascaded"),
+    "held_out": ("cascaded", "cascaded"),
+    "sectar": ("single_latent", "single_latent"),
+    "cvae_mpc": ("flat", "flat"),
+    "mpc": ("dynamics", "none"),
+}
 DEFAULT_CHECKPOINT = "cavin"
 DEFAULTS: list[Any] = ["_self_", {"task": ENVIRONMENT["task"]}, {"planner": "cavin"}, {"env/ranges": "paper"}, "base"]
 
@@ -65,8 +73,9 @@ class EpisodeConfig:
         group="planning",
     )
     checkpoint: str = option(
-        DEFAULT_CHECKPOINT,
-        "a shipped one (cavin, kinect, held_out), or the path of a checkpoint from train",
+        f"${{oc.select:planner.default_checkpoint,{DEFAULT_CHECKPOINT}}}",
+        f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train; by default the planner's "
+        "own, such as sectar for planner=sectar",
         group="model",
     )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")

@@ -23,7 +23,7 @@ BAD_FILES = [
         (
             command,
             f"checkpoint=@{name} {overrides}",
-            f"{said}; planner=random takes any",
+            f"{said}: choose checkpoint=cavin|kinect|held_out, or planner=random, which takes any",
         )
         for command in ("plan", "evaluate")
         for name, overrides, said in (
@@ -46,10 +46,10 @@ BAD_FILES = [
     ),
     (
         "plan",
-        "planner=sectar",
-        "SectarPlanner needs a checkpoint of model=single_latent, but",
+        "planner=sectar checkpoint=cavin",
+        "CascadedModel, which has motion_prior besides: choose checkpoint=sectar, or planner=random, which takes any",
     ),
-    ("plan", "planner=cvae_mpc", "CvaeMpcPlanner needs a checkpoint of model=flat, but"),
+    ("evaluate", "planner=cvae_mpc checkpoint=cavin", "CvaeMpcPlanner needs a checkpoint of model=flat, but"),
     ("check", "checkpoint=@no_model", "holds no model: give one that train has written"),
     ("check", "checkpoint=@no_guide", "holds no guide: give one that train has written"),
     ("check", "checkpoint=@untrusted", "asks to run numpy.save"),

@@ -15,10 +15,12 @@ from cavin_pyro import __main__ as listing
 from cavin_pyro import __version__, plan
 from cavin_pyro.config.application import multirun_first, read_command_line
 from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.composition import check_overrides, compose
+from cavin_pyro.config.commands.episodes import CHECKPOINTS
+from cavin_pyro.config.composition import check_overrides, completed, compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.help import EXAMPLES, WIDTH, help_page
-from cavin_pyro.storage.checkpoint import default_checkpoint, find_checkpoint
+from cavin_pyro.config.help import EXAMPLES, FACTS_OF_PRESETS, WIDTH, help_page
+from cavin_pyro.storage import checkpoint
+from cavin_pyro.storage.checkpoint import default_checkpoint, find_checkpoint, shipped_folder
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +66,8 @@ def test_help_lists_every_option_that_the_command_reads(command: str, pages: dic
     page = pages[command]
     listed = set(re.findall(r"(?m)^  ([a-z_./]+)=", page))
     known = names(_plain(command))
-    read_by_nobody = {"planner.model_free"} | {name for name in known if name.endswith("prior._target_")}
+    read_by_nobody = {name for name in known if name.endswith("prior._target_")}
+    read_by_nobody |= {f"planner.{name}" for name in FACTS_OF_PRESETS}
     unread = {name for name in known if command == "demo" and name.startswith(("task.", "tiles."))}
     assert known - listed <= read_by_nobody | unread
     assert not [name for name in listed if name.startswith("hydra")]
@@ -132,8 +135,62 @@ def test_checkpoints_have_names() -> None:
     assert find_checkpoint("cavin") == default_checkpoint()
     assert find_checkpoint("kinect").is_file()
     assert find_checkpoint("runs/a.safetensors") == Path("runs/a.safetensors")
-    with pytest.raises(UserError, match="^unknown checkpoint 'best': choose from cavin, held_out, kinect, or give"):
+    with pytest.raises(UserError, match="^unknown checkpoint 'best': choose from cavin, .*held_out, kinect.*, or give"):
         find_checkpoint("best")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        ("", "cavin"),
+        ("planner=paper", "cavin"),
+        ("planner=cavin_evolution", "cavin"),
+        ("planner=random", "cavin"),
+        ("planner._target_=my_lab.Mine", "cavin"),
+        ("planner=sectar", "sectar"),
+        ("planner=cvae_mpc", "cvae_mpc"),
+        ("planner=sectar planner.samples=8 planner.optimizer=cem", "sectar"),
+        ("planner=sectar checkpoint=runs/mine.safetensors", "runs/mine.safetensors"),
+        ("checkpoint=sectar", "sectar"),
+    ],
+)
+@pytest.mark.parametrize("command", ["plan", "evaluate", "demo"])
+def test_the_planner_brings_its_checkpoint(command: str, overrides: str, name: str) -> None:
+    assert compose(command, *overrides.split()).checkpoint == name
+
+
+def test_mpc_takes_its_own_checkpoint_as_soon_as_it_is_shipped() -> None:
+    """Until then it takes f of `cavin`; whoever ships the file changes `default_checkpoint` in planner/mpc.yaml."""
+    shipped = (shipped_folder() / "mpc.safetensors").is_file()
+    assert compose("plan", "planner=mpc").checkpoint == ("mpc" if shipped else "cavin")
+
+
+def test_a_planner_preset_of_the_users_own_takes_cavin(tmp_path: Path) -> None:
+    preset = tmp_path / "planner" / "mine.yaml"
+    preset.parent.mkdir()
+    preset.write_text("_target_: planning.RandomPlanner\nmodel_free: true\n")
+    config = completed("plan", check_overrides("plan", ["planner=mine", "output=unused"], str(tmp_path)))
+    assert config.checkpoint == "cavin"
+
+
+def test_help_names_the_checkpoint_of_the_planner() -> None:
+    for overrides, name in (([], "cavin"), (["planner=sectar"], "sectar")):
+        page = help_page("plan", "What it does.", check_overrides("plan", overrides))
+        assert f"\n  checkpoint={name} " in page
+        assert all(f"{one}" in page for one in CHECKPOINTS)
+
+
+def test_a_named_checkpoint_that_is_not_there_says_how_to_train_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cavin.safetensors").touch()
+    monkeypatch.setattr(checkpoint, "shipped_folder", lambda: tmp_path)
+    for name, options in (("sectar", "model=single_latent guide=single_latent"), ("mpc", "model=dynamics guide=none")):
+        line = f"^there is no checkpoint {name} in .*, which has cavin: train one with .*train {options}, and give the"
+        with pytest.raises(UserError, match=line):
+            find_checkpoint(name)
+        model, guide = CHECKPOINTS[name]
+        compose("train", f"model={model}", f"guide={guide}")
 
 
 def test_a_sweep_has_a_folder_for_each_run(shell: SimpleNamespace, tmp_path: Path) -> None:

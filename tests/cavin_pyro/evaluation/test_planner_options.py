@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, rollout
+from cavin_pyro.storage import checkpoint
 from cavin_pyro.storage.checkpoint import save_checkpoint
 from cavin_pyro.visualization.plan import draw_plan
 from models.networks.pointnet import PointNet
 from planning.optimizers import OPTIMIZERS
+from planning.searching import SearchingPlanner
 from tests.compiler import needs_a_compiler
 
 FITTING = {
@@ -56,6 +59,19 @@ def make_small_runner(checkpoints: dict[str, Path]) -> Callable[..., EpisodeRunn
         return make_runner(compose("evaluate", *overrides, "output=unused"))
 
     return make
+
+
+@pytest.mark.parametrize(("planner", "model"), [("sectar", "single_latent"), ("cvae_mpc", "flat")])
+def test_a_baseline_plans_with_the_checkpoint_of_its_name(
+    planner: str, model: str, checkpoints: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(checkpoints[model], tmp_path / f"{planner}.safetensors")
+    monkeypatch.setattr(checkpoint, "shipped_folder", lambda: tmp_path)
+    runner = make_runner(compose("evaluate", f"planner={planner}", *SMALL, "output=unused"))
+    config = checkpoint.load_checkpoint(checkpoints[model]).config
+    assert isinstance(runner.planner, SearchingPlanner)
+    assert type(runner.planner.model) is type(building.build_model(config))
+    runner.env.close()
 
 
 # `make test` runs every optimizer with Algorithm 1, and every other planner with two optimizers in turn.

@@ -60,6 +60,15 @@ def test_a_run_whose_task_was_stored_by_name_resumes(tmp_path: Path) -> None:
         check_same_run(tmp_path, config(task={"_target_": "my.Own"}), ignore=())
 
 
+def test_a_run_from_before_checkpoints_had_planners_resumes(tmp_path: Path) -> None:
+    write_config(tmp_path, config(checkpoint="cavin", planner={"samples": 8}))
+    (tmp_path / "episodes.jsonl").touch()
+    now = {"samples": 8, "default_checkpoint": "cavin"}
+    check_same_run(tmp_path, config(checkpoint="cavin", planner=now), ignore=())
+    with pytest.raises(UserError, match="a run with checkpoint=cavin, not mpc"):
+        check_same_run(tmp_path, config(checkpoint="mpc", planner={**now, "default_checkpoint": "mpc"}), ignore=())
+
+
 def test_a_run_that_failed_before_its_first_result_may_begin_otherwise(tmp_path: Path) -> None:
     write_config(tmp_path, config())
     check_same_run(tmp_path, config(seed=4, name="a-3"), ignore=())

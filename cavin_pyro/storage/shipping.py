@@ -1,0 +1,113 @@
+"""Ship checkpoints out of a reproduction: `python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import save
+
+from cavin_pyro.config.commands.episodes import CHECKPOINTS
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.checkpoint import FORMAT, FORMAT_VERSION, Checkpoint, load_checkpoint, shipped_folder
+from cavin_pyro.storage.files import atomic_write, read_json, write_json
+
+BASELINES = ("sectar", "cvae_mpc", "mpc")
+PARTS = ("model", "guide", "pointnet")
+PUBLIC_HOME = "runs/reproduce"  # in shipped files, instead of the folder of the machine that trained
+
+
+def ship(home: Path, method: str, to: Path) -> dict[str, Any]:
+    """Copy the training with the lowest validation loss to `to/METHOD.safetensors`, and its facts beside it as JSON.
+
+    Args:
+        home: the folder of a reproduction, with `train/METHOD-SEED`.
+
+    Returns:
+        The facts, for the model card.
+
+    Raises:
+        UserError: there is no training of the method, or one has not finished.
+    """
+    if method not in CHECKPOINTS:
+        raise UserError(f"unknown method {method!r}: choose from {', '.join(CHECKPOINTS)}")
+    folders = sorted((home / "train").glob(f"{method}-*"))
+    if not folders:
+        raise UserError(f"{home} holds no training of {method} (train/{method}-SEED)")
+    if unfinished := [folder for folder in folders if not (folder / "metrics.json").exists()]:
+        raise UserError(f"{unfinished[0]} has not finished: rerun reproduce to resume it")
+    trained = {folder: load_checkpoint(folder / "checkpoint.safetensors") for folder in folders}
+    best = min(folders, key=lambda folder: _loss(trained[folder]))
+    chosen = trained[best]
+    to.mkdir(parents=True, exist_ok=True)
+    _write(to / f"{method}.safetensors", chosen)
+    found = facts(chosen, steps=read_json(best / "metrics.json")["steps"])
+    found["validation_losses"] = {str(one.config["seed"]): _loss(one) for one in trained.values()}
+    write_json(to / f"{method}.json", found)
+    return found
+
+
+def facts(checkpoint: Checkpoint, *, steps: int) -> dict[str, Any]:
+    """What a model card says of a training. steps: of gradient, in all; the checkpoint is of the best of them."""
+    about = _public(checkpoint.provenance, checkpoint)
+    return {
+        "training_seed": checkpoint.config["seed"],
+        "steps": steps,
+        "best_step": about["step"],
+        "validation_loss": _loss(checkpoint),
+        "transitions": sum(data["transitions"] for data in about["data"]),
+        "episodes": sum(data["episodes"] for data in about["data"]),
+        "training_windows": about["training_windows"],
+        "validation_windows": about["validation_windows"],
+        "parameters": {part: _parameters(checkpoint, part) for part in PARTS},
+        "command": about["command"],
+        "revision": about["revision"],
+    }
+
+
+def _loss(checkpoint: Checkpoint) -> float:
+    return float(checkpoint.provenance["metrics"]["validation_loss"])
+
+
+def _parameters(checkpoint: Checkpoint, part: str) -> int:
+    return sum(value.numel() for name, value in checkpoint.tensors.items() if name.startswith(f"{part}."))
+
+
+def _public(record: Mapping[str, Any], checkpoint: Checkpoint) -> dict[str, Any]:
+    """A record without the path of the reproduction on the machine that trained: its `output` is HOME/train/NAME."""
+    home = Path(checkpoint.config["output"]).parent.parent
+    text = json.dumps(record)
+    found: dict[str, Any] = json.loads(text.replace(f"{home}/", f"{PUBLIC_HOME}/") if home.name else text)
+    return found
+
+
+def _write(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint as `save_checkpoint` does, with public paths in its header."""
+    header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
+    for name in ("config", "provenance"):
+        header[name] = json.dumps(_public(getattr(checkpoint, name), checkpoint))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(save(dict(checkpoint.tensors), metadata=header))
+
+
+def main() -> None:
+    """Ship the methods that the command line names, by default the three baselines."""
+    if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
+        raise SystemExit("usage: python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]")
+    try:
+        for method in sys.argv[2:] or BASELINES:
+            found = ship(Path(sys.argv[1]), method, shipped_folder())
+            print(
+                f"{method}: training seed {found['training_seed']}, best step {found['best_step']} of "
+                f"{found['steps']}, validation losses by seed {found['validation_losses']}"
+            )
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+
+
+if __name__ == "__main__":
+    main()

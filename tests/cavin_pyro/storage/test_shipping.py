@@ -1,0 +1,106 @@
+"""From the trainings of a reproduction to shipped checkpoints and the facts of their model cards."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from safetensors.torch import save
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.parts import build_model
+from cavin_pyro.storage import shipping
+from cavin_pyro.storage.checkpoint import load_checkpoint
+from cavin_pyro.storage.shipping import main, ship
+
+LOSSES = {0: -3.0, 1: -7.5, 2: -5.0}  # by training seed
+
+
+@pytest.fixture
+def home(tmp_path: Path, small: SimpleNamespace) -> Path:
+    """A reproduction whose trainings of SeCTAR have ended."""
+    home = tmp_path / "run"
+    for seed, loss in LOSSES.items():
+        folder = home / "train" / f"sectar-{seed}"
+        folder.mkdir(parents=True)
+        torch.manual_seed(seed)
+        path = folder / "checkpoint.safetensors"
+        small.save_baseline(path, "single_latent", seed=seed, output=str(folder), data=f"{home}/data")
+        content = load_checkpoint(path)
+        provenance = {
+            "step": 10 + seed,
+            "metrics": {"validation_loss": loss},
+            "data": [{"transitions": 60, "episodes": 12}],
+            "training_windows": 40,
+            "validation_windows": 4,
+            "command": f"python -m cavin_pyro.train data={home}/data seed={seed} output={folder}",
+            "revision": "12ab",
+        }
+        header = {"format": "cavin_pyro checkpoint", "version": "1"}
+        header |= {"config": json.dumps(content.config), "provenance": json.dumps(provenance)}
+        path.write_bytes(save(content.tensors, metadata=header))
+        (folder / "metrics.json").write_text(json.dumps({"steps": 20}))
+    return home
+
+
+def test_the_training_with_the_lowest_validation_loss_is_shipped_with_its_facts(home: Path, tmp_path: Path) -> None:
+    found = ship(home, "sectar", tmp_path / "shipped")
+    assert json.loads((tmp_path / "shipped" / "sectar.json").read_text()) == found
+    parameters = found.pop("parameters")
+    assert found == {
+        "training_seed": 1,
+        "steps": 20,
+        "best_step": 11,
+        "validation_loss": -7.5,
+        "transitions": 60,
+        "episodes": 12,
+        "training_windows": 40,
+        "validation_windows": 4,
+        "command": "python -m cavin_pyro.train data=runs/reproduce/data seed=1 output=runs/reproduce/train/sectar-1",
+        "revision": "12ab",
+        "validation_losses": {"0": -3.0, "1": -7.5, "2": -5.0},
+    }
+    shipped = load_checkpoint(tmp_path / "shipped" / "sectar.safetensors")
+    model = build_model(shipped.config)
+    assert parameters["model"] == sum(one.numel() for one in model.state_dict().values()) > 0
+    assert set(parameters) == {"model", "guide", "pointnet"}
+
+
+def test_a_shipped_file_has_the_weights_as_they_were_and_no_path_of_the_machine(home: Path, tmp_path: Path) -> None:
+    ship(home, "sectar", tmp_path / "shipped")
+    path = tmp_path / "shipped" / "sectar.safetensors"
+    before, after = (load_checkpoint(one) for one in (home / "train/sectar-1/checkpoint.safetensors", path))
+    assert before.tensors.keys() == after.tensors.keys()
+    assert all(torch.equal(before.tensors[name], after.tensors[name]) for name in after.tensors)
+    assert str(home).encode() not in path.read_bytes()
+    assert after.config == {**before.config, "output": "runs/reproduce/train/sectar-1", "data": "runs/reproduce/data"}
+
+
+def test_what_is_missing_or_unfinished_is_not_shipped(home: Path, tmp_path: Path) -> None:
+    shipped = tmp_path / "shipped"
+    with pytest.raises(UserError, match="holds no training of mpc"):
+        ship(home, "mpc", shipped)
+    with pytest.raises(UserError, match="^unknown method 'best': choose from cavin, .*sectar, cvae_mpc, mpc$"):
+        ship(home, "best", shipped)
+    (home / "train" / "sectar-2" / "metrics.json").unlink()
+    with pytest.raises(UserError, match="sectar-2 has not finished"):
+        ship(home, "sectar", shipped)
+    assert not shipped.exists()
+
+
+def test_the_command_ships_the_methods_that_it_is_given(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shipping, "shipped_folder", lambda: tmp_path / "shipped")
+    monkeypatch.setattr(sys, "argv", ["shipping", str(home), "sectar"])
+    main()
+    assert capsys.readouterr().out.startswith("sectar: training seed 1, best step 11 of 20, validation losses by seed")
+    monkeypatch.setattr(sys, "argv", ["shipping", str(home)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("error: ") and (tmp_path / "shipped" / "sectar.safetensors").exists()
