@@ -5,6 +5,7 @@ search candidates), `extensions` (our additions), `baselines` (the planners that
 (which run the inner functions).
 """
 
+from planning.baselines.cavin_without_effects import CavinWithoutEffectsPlanner
 from planning.baselines.cvae_mpc import CvaeMpcPlanner
 from planning.baselines.mpc import MpcPlanner
 from planning.baselines.proposals import PushBox
@@ -18,6 +19,7 @@ from planning.protocol import Outcome, Planner, PlanningModel, RewardFunction
 __all__ = [
     "MOTION_HORIZONS",
     "CavinPlanner",
+    "CavinWithoutEffectsPlanner",
     "CvaeMpcPlanner",
     "MpcPlanner",
     "Outcome",

@@ -12,8 +12,8 @@ from models.state import State
 from planning.backends.chunking import chunked
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.idle_pushes import idle_last
-from planning.extensions.perturbed_rollouts import PerturbedRollouts, most_robust
-from planning.inputs import check_weight
+from planning.extensions.perturbed_rollouts import most_robust
+from planning.inputs import check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
 from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction
@@ -25,7 +25,6 @@ from planning.rollouts.segment import Objective, SegmentRollout, select_segment
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
-ROBUSTNESS = PerturbedRollouts()
 
 
 class CavinPlanner(SearchingPlanner):
@@ -39,6 +38,7 @@ class CavinPlanner(SearchingPlanner):
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
+    motion_samples: how many motions to sample at line 8; None takes N, and 1 leaves nothing to choose at line 10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
@@ -69,11 +69,10 @@ class CavinPlanner(SearchingPlanner):
         horizon: int = 30,
         motion_horizon: str = "first_segment",
         *,
+        motion_samples: int | None = None,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
         avoid_failures: bool = True,
-        robustness: PerturbedRollouts | None = ROBUSTNESS,
-        idle_distance: float = 0.01,
         **options: Any,
     ) -> None:
         super().__init__(model, reward, samples, horizon, **options)
@@ -81,15 +80,12 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        check_weight("idle_distance", idle_distance)
-        self.motion_optimizer = self.optimizer
-        if motion_optimizer is not None:
-            self.motion_optimizer = make_optimizer(motion_optimizer, samples=samples)
+        self.motion_samples = samples if motion_samples is None else motion_samples
+        check_positive("motion_samples", self.motion_samples)
+        self.motion_optimizer = make_optimizer(motion_optimizer or self.optimizer, samples=self.motion_samples)
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
         self.avoid_failures = avoid_failures
-        self.robustness = robustness
-        self.idle_distance = idle_distance
 
     @chunked
     @torch.inference_mode()
@@ -125,6 +121,7 @@ class CavinPlanner(SearchingPlanner):
             generators,
             optimizer=self.motion_optimizer,
             segments=self.motion_segments,
+            samples=self.motion_samples,
         )
 
         # Line 10: choose z* and its actions a*, which lead to the states closest to the subgoals.

@@ -11,14 +11,17 @@ from torch import Tensor
 from models.state import State
 from planning.backends.compiled import Compiled
 from planning.backends.eager import Backend, eager
+from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
-from planning.inputs import check_horizon, check_positive
+from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
 from planning.plan import Plan
 from planning.protocol import DynamicsModel, EpisodicReward, ModelRequirements, RewardFunction
 from planning.rollouts.candidates import Candidates, SearchProblem
 from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
 from planning.rollouts.segment import Objective, SearchSpace
+
+ROBUSTNESS = PerturbedRollouts()
 
 
 class SearchingPlanner:
@@ -41,18 +44,21 @@ class SearchingPlanner:
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
         warm_start: bool = True,
+        robustness: PerturbedRollouts | None = ROBUSTNESS,
+        idle_distance: float = 0.01,
         compile: bool = False,
     ) -> None:
-        """Raises ValueError for counts below 1, a horizon that T does not divide, unknown names, and no compiler."""
+        """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names, no compiler."""
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
+        check_weight("idle_distance", idle_distance)
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward = model, reward
         self.reward_at, self.stride_limits = reward_at, stride_limits
         self.backend: Backend = Compiled() if compile else eager
         self.reparameterized = warm_start or compile
         self.cumulative_reward()  # refuses bad options now, not in the first plan
-        self.warm_start = warm_start
+        self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
 
@@ -82,12 +88,13 @@ class SearchingPlanner:
         *,
         optimizer: Optimizer | None = None,
         segments: int | None = None,
+        samples: int | None = None,
         warm_start: Tensor | None = None,
         best_only: bool = False,
     ) -> Candidates:
         """All candidates `[B, N]` that the optimizer evaluates, by default `self.optimizer`.
 
-        segments: by default K. warm_start, best_only: see `planning.rollouts.candidates.SearchProblem`.
+        segments, samples: by default K and N. warm_start, best_only: see `planning.rollouts.candidates.SearchProblem`.
         Raises ValueError if codes must be reparameterised and their prior cannot be.
         """
         problem = SearchProblem(
@@ -101,7 +108,7 @@ class SearchingPlanner:
             best_only,
             self.backend,
         )
-        return search(optimizer or self.optimizer, problem, self.samples)
+        return search(optimizer or self.optimizer, problem, self.samples if samples is None else samples)
 
     def search_by_reward(
         self, space: SearchSpace, state: State, generators: Sequence[torch.Generator], previous: Plan | None

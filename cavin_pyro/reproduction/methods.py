@@ -7,6 +7,8 @@ from dataclasses import dataclass
 # The paper's way of planning, for the baselines as `planner=paper` has it for CAVIN.
 WITHOUT_ADDITIONS = (
     "planner.warm_start=false",
+    "planner.robustness=null",
+    "planner.idle_distance=0.0",
     "pushes_per_plan=null",
     "margin=0",
     "matmul_precision=float32",

@@ -9,10 +9,12 @@ import torch
 
 from models.state import State
 from planning.backends.chunking import chunked
+from planning.extensions.idle_pushes import idle_last
+from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
 from planning.plan import Plan
 from planning.protocol import DynamicsModel, RewardFunction
-from planning.rollouts.ranking import best_of
-from planning.rollouts.segment import SearchSpace
+from planning.rollouts.ranking import best_of, prefer
+from planning.rollouts.segment import SearchSpace, actions_of
 from planning.searching import SearchingPlanner, summary
 
 
@@ -23,6 +25,13 @@ class PushSearch(SearchingPlanner):
     published 0.01 and 0.15; None in the paper. For the other options see `CavinPlanner`.
 
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
+
+    Our additions, as in `CavinPlanner`: `warm_start`, `robustness` and `idle_distance`. There is no subgoal to come
+    close to, so perturbed rollouts of the executed segment only tell how often it fails. The chosen sequence has the
+    highest return minus `failure_cost / RETURN_WEIGHT` times the share of failed rollouts. By default that is 200 times
+    the share: a failure earns -100 where a sequence that reaches the goal promised +100. So the score of a sequence
+    that promises success is about its expected return. Sequences that reach the goal come first: the rollouts of others
+    may have stopped early, so their returns do not compare, and pushes that do nothing never fail.
     """
 
     has_codes: ClassVar[bool] = False  # the space searches motion codes
@@ -40,9 +49,16 @@ class PushSearch(SearchingPlanner):
         candidates = self.search_by_reward(self.space, state, generators, previous)
         # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
-        best = best_of(torch.where(finite, candidates.returns, -torch.inf), "returns of push sequences")
+        scores = torch.where(finite, candidates.returns, -torch.inf)
+        best = best_of(scores, "returns of push sequences")
+        if self.robustness is not None:
+            scores = prefer(scores, candidates.score_state.succeeded)
+            pushes, cost = candidates.at(0, actions_of), -RETURN_WEIGHT * scores
+            what = state, None, scores, pushes, cost, generators
+            best = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
         chosen = candidates.take(best.unsqueeze(-1))
-        actions, codes = chosen.actions[:, 0], chosen.codes[:, 0]
+        actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
+        actions, path = idle_last(actions, path, state, self.segment_length, self.idle_distance)
         no_codes = codes.new_empty(len(codes), 0, 0)
         return Plan(
             actions=actions[:, : self.segment_length],
@@ -50,6 +66,6 @@ class PushSearch(SearchingPlanner):
             effect_codes=no_codes,
             motion_codes=codes if self.has_codes else no_codes,
             subgoals=state.map(lambda field: field[:, None][:, :0]),
-            predicted_centers=chosen.path[:, 0],
+            predicted_centers=path,
             **summary(candidates, best),
         )

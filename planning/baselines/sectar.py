@@ -6,13 +6,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from models.state import State
 from planning.backends.chunking import chunked
 from planning.cavin import EffectSpace
+from planning.extensions.idle_pushes import idle_last
+from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, PerturbedRollouts, sequential_halving
 from planning.inputs import NoFiniteCandidateError
 from planning.plan import Plan
 from planning.protocol import ModelRequirements, RewardFunction, SingleLatentModel
+from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
 from planning.rollouts.ranking import best_of
 from planning.searching import SearchingPlanner, summary
@@ -21,8 +25,15 @@ from planning.searching import SearchingPlanner, summary
 class SectarPlanner(SearchingPlanner):
     """Effect codes ranked by reward, as in `CavinPlanner`; g generates the pushes from the chosen code alone.
 
-    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). f only predicts the states
-    after the pushes, for pictures.
+    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). Without our additions, f
+    only predicts the states after the pushes, for pictures.
+
+    Our additions, as in `CavinPlanner`: `warm_start`, `robustness` and `idle_distance`. An effect has one motion here,
+    so perturbed rollouts compare effect plans: of those that reach the goal, the `robustness.candidates` with the
+    highest return. Their cost is the distance of the pushes' outcome to the plan's own first subgoal and `failure_cost`
+    for failures, as in `CavinPlanner`, minus `RETURN_WEIGHT` times the return. Without the return the pushes that do
+    least would win, since they come closest to their own subgoals. For the same reason, where no plan reaches the goal,
+    the one with the highest return is chosen, as without this addition.
 
     model: p(c | s), h, g without motion codes, f. For the options see `CavinPlanner`. Raises ValueError for counts
     below 1, a horizon that T does not divide, and unknown names.
@@ -44,6 +55,10 @@ class SectarPlanner(SearchingPlanner):
         # Lines 5 to 7: choose the codes c* and their subgoals.
         effects = self.search_by_reward(self.space, state, generators, previous)
         best = best_of(effects.returns, "returns of effect plans")
+        if self.robustness is not None:
+            best = torch.where(
+                effects.score_state.succeeded.any(-1), self._most_robust(self.robustness, effects, generators), best
+            )
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
         # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
@@ -55,12 +70,32 @@ class SectarPlanner(SearchingPlanner):
             raise NoFiniteCandidateError(
                 broken[0], "the pushes of the chosen effect are not finite; check the model's weights"
             )
+        pushes, centers = idle_last(actions[:, 0], path[:, 0], state, self.segment_length, self.idle_distance)
         return Plan(
-            actions=actions[:, 0],
-            planned_actions=actions[:, 0],
+            actions=pushes,
+            planned_actions=pushes,
             effect_codes=effect_codes,
             motion_codes=effect_codes.new_empty(len(actions), 0, 0),
             subgoals=chosen.states.map(lambda field: field[:, 0]),
-            predicted_centers=path[:, 0],
+            predicted_centers=centers,
             **summary(effects, best),
         )
+
+    def _most_robust(
+        self, robustness: PerturbedRollouts, effects: Candidates, generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """Number of the successful effect plan `[B]` int64 whose first segment costs least on average."""
+        state = effects.problem.state
+        returns = torch.where(effects.score_state.succeeded, effects.returns, -torch.inf)
+        best = returns.topk(min(robustness.candidates, effects.count), -1)
+        first = effects.take(best.indices)
+        actions = self._actions(state.expand_plans(1), first.at(0, lambda segment: segment.rollout.code))
+        scores = torch.where(torch.isfinite(actions).all(-1).all(-1), best.values, -torch.inf)
+        subgoals = State(
+            first.at(0, lambda segment: segment.rollout.states.centers),
+            first.at(0, lambda segment: segment.rollout.states.features),
+            first.plans.mask,
+        )
+        what = state, subgoals, scores, actions, -RETURN_WEIGHT * scores, generators
+        chosen = sequential_halving(robustness, self.model, self.reward, *what, backend=self.backend)
+        return best.indices.gather(1, chosen.unsqueeze(-1)).squeeze(1)

@@ -1,4 +1,4 @@
-"""Robust motions by perturbed rollouts (our addition to Algorithm 1, line 10)."""
+"""Robust motions by perturbed rollouts (our addition to Algorithm 1, line 10, and to the baselines)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from models.state import State
+from planning import records
 from planning.backends.eager import Backend, eager
 from planning.inputs import check_positive, check_weight
-from planning.protocol import PlanningModel, RewardFunction
+from planning.protocol import DynamicsModel, RewardFunction
 from planning.rollouts import ranking, returns
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
@@ -19,6 +20,9 @@ from planning.rollouts.sampling import noise_each
 from planning.rollouts.segment import actions_of
 
 QUARTER = 4  # one in four candidates continues in the next round, with four times as many rollouts
+# Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
+# metres, is then worth 200: a failure earns -100 where a plan that reaches the goal promised +100.
+RETURN_WEIGHT = 0.0015
 
 
 @dataclass(frozen=True)
@@ -29,16 +33,18 @@ class PerturbedRollouts:
     and just misses it on the table. A perturbed start reveals such pushes. The error of f also grows with the distance
     that an object moves: a long push past a forbidden place fails more often than a short one.
 
-    Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts: after each round the best quarter
+    Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best quarter
     continues, with four times as many rollouts each.
 
-    candidates: motions with perturbed rollouts, the best by line 10. rollouts: of each candidate in the first round.
+    candidates: motions with perturbed rollouts, the best by line 10, or by their return in the baselines.
+    rollouts: of each candidate in the first round.
     rounds: of equally many rollouts in total, for fewer and fewer candidates; 1 gives every candidate the same number.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
     outcome_noise: standard deviation, in x and in y, of an object's centre after a push, per metre of its predicted
         move. The perturbed centres decide whether a rollout fails; its distance to the subgoal is that of f's
         prediction.
-    failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal.
+    failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal. Where returns
+        count, one unit of return weighs 0.0015 square metres.
 
     Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
     """
@@ -64,7 +70,7 @@ def most_robust(
     motions: Candidates,
     scores: Tensor,
     later_cost: Tensor,
-    model: PlanningModel,
+    model: DynamicsModel,
     reward: RewardFunction,
     subgoals: State,
     feature_weight: float,
@@ -77,23 +83,24 @@ def most_robust(
 
 def sequential_halving(
     robustness: PerturbedRollouts,
-    model: PlanningModel,
+    model: DynamicsModel,
     reward: RewardFunction,
     state: State,
-    goal: State,
+    goal: State | None,
     scores: Tensor,
     actions: Tensor,
     later: Tensor,
     generators: Sequence[torch.Generator],
     *,
-    feature_weight: float,
+    feature_weight: float = 0.0,
     backend: Backend = eager,
 ) -> Tensor:
     """Number of the motion with the lowest cost on average, `[B]` int64.
 
-    state: `[B]`, where all motions begin. goal: `[B, 1]`, the first subgoal. scores: `[B, N]`, the higher the better.
-    actions: `[B, N, T, 4]`, the segment that will be executed. later: `[B, N]` square metres, the cost of the segments
-    after it. A motion whose score or whose cost is not finite loses.
+    state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
+    without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, T, 4]`, the
+    segment that will be executed. later: `[B, N]` square metres, the cost of the segments after it. A motion whose
+    score or whose cost is not finite loses.
     """
     best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
     numbers, count, done = best.indices, robustness.rollouts, 0
@@ -111,7 +118,7 @@ def sequential_halving(
             model,
             reward,
             state,
-            goal,
+            goal if goal is None or goal.batch_shape[-1] == 1 else records.take(goal, numbers),
             actions.take_along_dim(numbers[..., None, None], dim=1),
             count,
             generators,
@@ -127,10 +134,10 @@ def sequential_halving(
 
 def perturbed_rollouts(
     robustness: PerturbedRollouts,
-    model: PlanningModel,
+    model: DynamicsModel,
     reward: RewardFunction,
     state: State,
-    goal: State,
+    goal: State | None,
     actions: Tensor,
     count: int,
     generators: Sequence[torch.Generator],
@@ -140,8 +147,11 @@ def perturbed_rollouts(
 ) -> tuple[Tensor, Tensor]:
     """Rollouts of `actions: [B, R, T, 4]` by f from `state: [B]`, each perturbed `count` times.
 
-    Returns the square metres to the `goal: [B, 1]` and whether a rollout fails, `[B, R, count]` each.
+    Returns the square metres to the `goal: [B, 1]` or `[B, R]` (0 without a goal) and whether a rollout fails,
+    `[B, R, count]` each.
     """
+    if goal is not None and goal.batch_shape[-1] > 1:
+        goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
     pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
     pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
     errors = None
@@ -153,10 +163,10 @@ def perturbed_rollouts(
 
 
 def _rollout_costs(
-    model: PlanningModel,
+    model: DynamicsModel,
     reward: RewardFunction,
     state: State,
-    goal: State,
+    goal: State | None,
     pushes: Tensor,
     errors: Tensor | None,
     feature_weight: float,
@@ -167,6 +177,8 @@ def _rollout_costs(
     here, path = predict_states(model, state.expand_plans(1), pushes)
     possible = path if errors is None else outcomes(before, path, errors)
     progress = returns.advance(returns.start(before), reward, before, possible, mask)
+    if goal is None:
+        return progress.returns.new_zeros(pushes.shape[:2]), progress.failed
     return ranking.squared_distance(here, goal, feature_weight=feature_weight), progress.failed
 
 

@@ -13,7 +13,8 @@ BAD_OPTIONS = [
     (
         "plan",
         "planner=best",
-        "unknown planner 'best': choose from cavin, cavin_evolution, cvae_mpc, mpc, paper, random, sectar",
+        "unknown planner 'best': choose from cavin, cavin_evolution, cavin_one_motion, cavin_without_effects, "
+        "cvae_mpc, mpc, paper, random, sectar",
     ),
     (
         "plan",
@@ -141,6 +142,7 @@ BAD_OPTIONS = [
     ("plan", "planner=random planner.optimizer=cem", "unknown override 'planner.optimizer': the chosen planner has no"),
     ("plan", "planner.optimizer=cem planner.samples=3", "4 iterations need at least as many samples, not 3"),
     ("plan", "planner.feature_weight=-1", "feature_weight must be zero or a positive number, not -1"),
+    ("plan", "planner.motion_samples=0", "motion_samples must be at least 1, not 0"),
     ("plan", "planner.idle_distance=-1", "idle_distance must be zero or a positive number, not -1"),
     ("plan", "planner.warm_start=3", "planner.warm_start must be true or false, not 3"),
     ("plan", "planner.compile=3", "planner.compile must be true or false, not 3"),

@@ -27,6 +27,7 @@ from tests.compiler import needs_a_compiler
 FITTING = {
     "cavin": "cascaded",
     "cavin_evolution": "cascaded",
+    "cavin_without_effects": "cascaded",
     "sectar": "single_latent",
     "cvae_mpc": "flat",
     "mpc": "dynamics",
@@ -106,6 +107,9 @@ def test_every_planner_plans_with_every_optimizer(
         ("cavin", "planner.optimizer.replacement=false"),
         ("cavin", "planner.motion_optimizer=cem"),
         ("cavin", "planner.warm_start=false"),
+        ("cavin", "planner.motion_samples=1"),
+        ("cavin_without_effects", "planner.robustness=null"),
+        ("mpc", "planner.robustness=null"),
         ("cavin", "matmul_precision=float32"),
         ("cavin_evolution", "planner.optimizer.generations=1"),
         ("mpc", "planner.stride_limits=[0.01,0.15]"),

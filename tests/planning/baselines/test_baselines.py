@@ -18,6 +18,7 @@ EFFECTS = [[-0.75, 0.5, -2.0], [0.5, 0.25, 1.0]]
 RETURNS = [-2.0 - 1.0 + 99.0, -4.0, -2.0 + 99.0]
 WITHOUT_REPLACEMENT = [-102.0, -4.0, -101.0]
 NO_REPLACEMENT: dict[str, Any] = {"optimizer": Shooting(replacement=False)}
+PLAIN: dict[str, Any] = {"warm_start": False, "robustness": None, "idle_distance": 0.0}  # the paper's
 BOX = PushBox((0.3, -0.55), (0.8, 0.55), 0.1)
 
 
@@ -26,7 +27,7 @@ def sectar(toy: SimpleNamespace, effects: Sequence[Sequence[float]], **options: 
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
             return super().actions(state, effect_code, 0.125 * torch.eye(16)[0].expand_as(effect_code))
 
-    planner = SectarPlanner(Single(effects, []), toy.Line(), samples=3, horizon=4, warm_start=False, **options)
+    planner = SectarPlanner(Single(effects, []), toy.Line(), samples=3, horizon=4, **PLAIN, **options)
     return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
 
 
@@ -38,7 +39,7 @@ def cvae_mpc(toy: SimpleNamespace, motions: Sequence[Sequence[float]], **options
         def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
             return super().actions(state, torch.zeros_like(motion_code), motion_code)
 
-    planner = CvaeMpcPlanner(Flat([], motions), toy.Line(), samples=3, horizon=4, warm_start=False, **options)
+    planner = CvaeMpcPlanner(Flat([], motions), toy.Line(), samples=3, horizon=4, **PLAIN, **options)
     return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
 
 
@@ -107,7 +108,7 @@ def test_pushes_that_are_not_finite_never_win_even_if_the_dynamics_ignore_it(toy
 
 def test_mpc_agrees_with_brute_force(toy: SimpleNamespace) -> None:
     model, reward, start = toy.PointMass(), toy.GoalDisc((0.3, 0.05), forbidden_below=-0.05, dense=True), (0.0, 0.0)
-    planner = MpcPlanner(model, reward, samples=50, horizon=6, warm_start=False, **NO_REPLACEMENT)
+    planner = MpcPlanner(model, reward, samples=50, horizon=6, **PLAIN, **NO_REPLACEMENT)
     plan = planner.plan(toy.scenes([[start]]), toy.generators(4))
     source = toy.generators(4)[0]
     draws = [torch.randn(50, 12, generator=source) for _ in range(2)]  # a segment at a time

@@ -114,6 +114,41 @@ def test_the_best_quarter_continues_with_more_rollouts(toy: SimpleNamespace) -> 
     assert often == [[32, 32], [8, 8], [2, 2]]
 
 
+def test_each_candidate_may_have_its_own_goal(toy: SimpleNamespace) -> None:
+    state, model = scenes(2)._replace(features=torch.ones(2, 2, 4)), toy.PointMass()
+    actions = torch.rand(2, SAMPLES, 3, 4, generator=torch.Generator().manual_seed(0))
+    scores, later = torch.rand(2, SAMPLES, generator=torch.Generator().manual_seed(1)), torch.zeros(2, SAMPLES)
+    options = PerturbedRollouts(candidates=32)
+
+    def chosen(goal: State) -> list[int]:
+        given = options, model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later
+        return sequential_halving(*given, toy.generators(0, 1)).tolist()
+
+    shared = state.map(lambda field: field.unsqueeze(1))
+    own = shared.map(lambda field: field.expand(-1, SAMPLES, *field.shape[2:]).clone())
+    assert chosen(own) == chosen(shared)
+    # One candidate of each scene ends exactly at its own goal, and all others a metre away from theirs.
+    lucky = scores.topk(32).indices[:, 20]
+    moves = 0.1 * actions[..., 2:].sum(-2)  # what f predicts
+    own.centers[..., :2] = moves.unsqueeze(-2) + 1.0
+    own.centers[[0, 1], lucky, :, :2] -= 1.0
+    assert chosen(own) == lucky.tolist()
+
+
+def test_without_a_goal_failures_and_the_later_cost_decide(toy: SimpleNamespace) -> None:
+    state, model = scenes(1)._replace(features=torch.ones(1, 2, 4)), toy.PointMass()
+    actions = torch.zeros(1, 3, 1, 4)
+    actions[0, :, 0, 3] = torch.tensor([-1.0, 0.0, 0.0])  # the first one fails
+    later = torch.tensor([[-0.2, 0.0, -0.05]])
+
+    def chosen(cost: float) -> int:
+        options = PerturbedRollouts(candidates=3, failure_cost=cost)
+        given = options, model, toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=-0.01), state, None, -later, actions
+        return int(sequential_halving(*given, later, toy.generators(0)))
+
+    assert [chosen(cost) for cost in (0.0, 0.1, 0.3)] == [0, 0, 2]
+
+
 def test_the_last_candidate_gets_no_more_rollouts(toy: SimpleNamespace) -> None:
     rolled_out = []
 
