@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -49,10 +49,13 @@ def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
         for one in evaluations(scale, config.methods, config.planners)
         if training_folder(home, one.cell.method, one.training_seed) in folders
     ]
-    with _whole_progress([*first, *learning], scale, own, home, config.workers) as bar:
-        for stages in ([first[0]], [first[1]], learning):  # each group needs the one before it
+    # Each group needs the one before it.
+    groups = [] if config.models else [[first[0]], [first[1]], learning]
+    models = _models(config, home, own)
+    with _whole_progress([stage for group in groups for stage in group], scale, own, home, config.workers) as bar:
+        for stages in groups:
             run_stages(stages, config.workers, bar.update_stages)
-        found = _evaluate(scale, own, home, config.workers, bar)
+        found = _evaluate(scale, own, home, models, config.workers, bar)
     rows = [episode_row(one, row) for one in own for row in found[one]]
     write_table(home / TABLE, rows)
     return rows
@@ -76,10 +79,10 @@ def chosen_scale(config: DictConfig) -> Scale:
 def as_typed(config: DictConfig) -> str:
     """The command that makes the same table, for the page of results."""
     default, words = ReproduceConfig(), [f"scale={config.scale}"]
-    for name in ("methods", "planners", "episodes", "bottom_episodes"):
+    for name in ("methods", "planners", "episodes", "bottom_episodes", "models"):
         if config[name] != getattr(default, name):
             value = config[name]
-            words.append(f"{name}={value if isinstance(value, int) else '[' + ','.join(value) + ']'}")
+            words.append(f"{name}={value if isinstance(value, int | str) else '[' + ','.join(value) + ']'}")
     return shlex.join(["python", "-m", "cavin_pyro.reproduce", *words])
 
 
@@ -95,13 +98,36 @@ def of_shard(stages: list[Stage], shard: str) -> list[Stage]:
     return stages[int(number) - 1 :: int(count)]
 
 
+def _models(config: DictConfig, home: Path, own: Sequence[Evaluation]) -> dict[Evaluation, Path]:
+    """The checkpoint of every evaluation: of the folder `models`, which must have it, or of this run's trainings.
+
+    Raises:
+        UserError: the folder `models` lacks one.
+    """
+    found = {}
+    for one in own:
+        method, seed = one.cell.method, one.training_seed
+        if config.models:
+            found[one] = Path(config.models) / f"{method}-{seed}.safetensors"
+            if not found[one].is_file():
+                raise UserError(f"models={config.models} holds no {found[one].name}: choose other methods, or train it")
+        else:
+            found[one] = training_folder(home, method, seed) / "checkpoint.safetensors"
+    return found
+
+
 def evaluation_folder(home: Path, evaluation: Evaluation) -> Path:
     """Where the episodes of a cell and a training lie."""
     return home / "evaluate" / evaluation.name
 
 
 def _evaluate(
-    scale: Scale, own: Sequence[Evaluation], home: Path, workers: int, bar: _Bar
+    scale: Scale,
+    own: Sequence[Evaluation],
+    home: Path,
+    models: Mapping[Evaluation, Path],
+    workers: int,
+    bar: _Bar,
 ) -> dict[Evaluation, list[Row]]:
     """The episodes of all evaluations, one queue for all, so that no worker waits for the end of a cell.
 
@@ -110,7 +136,7 @@ def _evaluate(
     rows = {one: begin(_made(evaluation_folder(home, one))) for one in own}
     missing = [
         ((seed - one.seed) // ROUND, place, one, config, seed)
-        for place, (one, config) in enumerate(_configurations(scale, own, home))
+        for place, (one, config) in enumerate(_configurations(scale, own, home, models))
         for seed in missing_seeds(config, rows[one])
     ]
     missing.sort(key=lambda job: (job[0], job[1], job[-1]))
@@ -122,7 +148,9 @@ def _evaluate(
     return {one: [found[seed] for seed in sorted(found)][: one.episodes] for one, found in rows.items()}
 
 
-def _configurations(scale: Scale, own: Sequence[Evaluation], home: Path) -> Iterator[tuple[Evaluation, DictConfig]]:
+def _configurations(
+    scale: Scale, own: Sequence[Evaluation], home: Path, models: Mapping[Evaluation, Path]
+) -> Iterator[tuple[Evaluation, DictConfig]]:
     """The options of every evaluation, composed once for each method, planner and task, because that takes time."""
     composed: dict[tuple[str, str, str], DictConfig] = {}
     for one in own:
@@ -134,7 +162,7 @@ def _configurations(scale: Scale, own: Sequence[Evaluation], home: Path) -> Iter
         config = composed[key].copy()
         config.reward, config.objects = cell.reward, cell.objects
         config.seed, config.episodes = one.seed, one.episodes
-        config.checkpoint = str(training_folder(home, cell.method, one.training_seed) / "checkpoint.safetensors")
+        config.checkpoint = str(models[one])
         config.output = str(evaluation_folder(home, one))
         _write_once(evaluation_folder(home, one) / "config.yaml", config)
         yield one, config

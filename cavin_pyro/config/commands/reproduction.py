@@ -39,6 +39,12 @@ class ReproduceConfig:
     bottom_episodes: int | None = option(
         None, "per cell of the bottom row and of the variants; by default the scale's", minimum=1, group="run"
     )
+    models: str | None = option(
+        None,
+        "folder of trained models, METHOD-SEED.safetensors, such as checkpoints/reproduction; nothing is collected or "
+        "trained then",
+        group="run",
+    )
     output: str | None = option(
         None, "folder for everything, where an unfinished run is resumed; by default one in runs/reproduce", group="run"
     )

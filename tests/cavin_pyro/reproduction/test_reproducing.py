@@ -50,6 +50,16 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
         "output=whole",
         "bottom_episodes=2",
     ]
+    models = tmp_path / "models"
+    models.mkdir()
+    shutil.copy(home / "train" / "mpc-0" / "checkpoint.safetensors", models / "mpc-0.safetensors")
+    trained = shell.run_command("reproduce", *WHOLE[:-1], "models=models", "output=trained", folder=tmp_path)
+    assert trained.status == 0, trained.errors
+    assert not (tmp_path / "trained" / "data").exists() and not (tmp_path / "trained" / "train").exists()
+    assert contents(tmp_path / "trained") == made
+    lacking = shell.run_command("reproduce", "scale=minimal", "models=models", "output=lacking", folder=tmp_path)
+    expected = "models=models holds no cavin-0.safetensors: choose other methods, or train it"
+    assert lacking.status == 2 and expected in lacking.complaints[0]
     other = shell.run_command("reproduce", "scale=smoke", "output=whole", folder=tmp_path)
     assert other.status == 2 and "holds a run with" in other.complaints[0]
 
