@@ -18,17 +18,19 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.reproduction.merging import IGNORED, merge_tables
     from cavin_pyro.reproduction.pipeline import as_typed, run_pipeline
     from cavin_pyro.reproduction.results import write_results
+    from cavin_pyro.reproduction.table import read_table
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.provenance import append_provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
     check_same_run(Path(config.output), config, ignore=IGNORED)
+    rows = read_table(Path(config.table)) if config.table else []
     home = output_folder(config.output)
     write_config(home, config)
     append_provenance(home / "provenance.json")
     if config.merge:
         rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
-    else:
+    elif not config.table:
         rows = run_pipeline(config, home)
     for path in write_results(home, rows, as_typed(config)):
         print(path)

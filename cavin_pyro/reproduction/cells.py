@@ -10,7 +10,12 @@ from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS, Scale
 FIGURES = ("paper", "ours")  # kinds of planners that have a figure of their own
 PLANNERS = (*FIGURES, "variants")
 # Between one method of the paper's figure and another: what each step of the way brings.
-VARIANTS = (("cavin", "first_segment"),)
+VARIANTS = (
+    ("cavin", "first_segment"),
+    ("cavin", "one_motion"),
+    ("cavin", "without_effects"),
+    ("sectar", "perturbed_rollouts"),
+)
 SCENES_PER_TRAINING = 1000  # so that more episodes per cell can join those of an earlier run
 
 

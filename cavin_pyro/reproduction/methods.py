@@ -38,6 +38,8 @@ METHODS: dict[str, Method] = {
                 "paper": ("planner=paper",),
                 "ours": ("planner=cavin",),
                 "first_segment": ("planner=paper", "planner.motion_horizon=first_segment"),
+                "one_motion": ("planner=paper", "planner.motion_samples=1"),
+                "without_effects": ("planner=cavin_without_effects", *WITHOUT_ADDITIONS),
             },
         ),
         Method(
@@ -48,6 +50,10 @@ METHODS: dict[str, Method] = {
             {
                 "paper": ("planner=sectar", *WITHOUT_ADDITIONS),
                 "ours": ("planner=sectar",),
+                "perturbed_rollouts": (
+                    "planner=sectar",
+                    *(one for one in WITHOUT_ADDITIONS if not one.startswith("planner.robustness")),
+                ),
             },
         ),
         Method(

@@ -78,6 +78,8 @@ def chosen_scale(config: DictConfig) -> Scale:
 
 def as_typed(config: DictConfig) -> str:
     """The command that makes the same table, for the page of results."""
+    if config.table:
+        return shlex.join(["python", "-m", "cavin_pyro.reproduce", f"table={config.table}"])
     default, words = ReproduceConfig(), [f"scale={config.scale}"]
     for name in ("methods", "planners", "episodes", "bottom_episodes", "models"):
         if config[name] != getattr(default, name):

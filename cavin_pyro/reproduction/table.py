@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow
 from pyarrow import parquet
 
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.reproduction.cells import Evaluation
 from cavin_pyro.storage.files import atomic_write
 
@@ -67,8 +68,16 @@ def write_table(path: Path, rows: Iterable[Row]) -> None:
 
 
 def read_table(path: Path) -> list[Row]:
-    """The rows of a table, in their order."""
-    return list(parquet.read_table(path, schema=SCHEMA).to_pylist())
+    """The rows of a table, in their order.
+
+    Raises:
+        UserError: the file cannot be read, or holds something else.
+    """
+    try:
+        return list(parquet.read_table(path, schema=SCHEMA).to_pylist())
+    except (OSError, pyarrow.ArrowException) as error:
+        why = str(error).splitlines()[0]
+        raise UserError(f"{path} is no table of episodes ({why}): give an episodes.parquet of reproduce") from error
 
 
 def as_text(value: Any) -> str:

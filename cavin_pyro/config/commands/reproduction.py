@@ -52,4 +52,7 @@ class ReproduceConfig:
     shard: str = option(
         "1/1", "i/n: the i-th of every n trainings and their episodes, so that n machines share the work", group="run"
     )
+    table: str | None = option(
+        None, "a table of episodes, episodes.parquet, to draw and count; nothing is run then", group="run"
+    )
     merge: list[str] = option([], "folders of finished shards, [a,b], whose tables are joined", group="run")

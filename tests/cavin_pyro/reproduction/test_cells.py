@@ -65,8 +65,8 @@ def test_variants_have_a_planner_each_and_differ_from_the_papers() -> None:
     assert set(VARIANTS) == {
         (method.name, planner) for method in METHODS.values() for planner in method.planners if planner not in FIGURES
     }
-    found = list(cells(SCALES["paper"], ["cavin"], ["variants"]))
-    assert {one.planner for one in found} == {"first_segment"} and len(found) == 3
+    found = list(cells(SCALES["paper"], ["sectar"], ["variants"]))
+    assert {one.planner for one in found} == {"perturbed_rollouts"} and len(found) == 3
     for method, planner in VARIANTS:
         own, paper = (compose("evaluate", *METHODS[method].planners[name], "output=-") for name in (planner, "paper"))
         assert own.planner != paper.planner

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -88,3 +89,15 @@ def test_figures_and_page_follow_from_the_table_and_have_the_same_bytes(tmp_path
     assert "| clearing | sparse | 1 | 100.0 % (20.7 to 100.0), n = 1 |" in page and "    the command" in page
     statistics = json.loads((tmp_path / "one" / "statistics.json").read_text())
     assert set(statistics) == {"rates", "tests", "interquartile_means"}
+
+
+def test_figures_and_page_come_from_a_table_alone(shell: SimpleNamespace, tmp_path: Path) -> None:
+    write_table(tmp_path / "some.parquet", played())
+    drawn = shell.run_command("reproduce", "table=some.parquet", "output=drawn", folder=tmp_path)
+    assert drawn.status == 0, drawn.errors
+    assert "python -m cavin_pyro.reproduce table=some.parquet" in (tmp_path / "drawn" / "results.md").read_text()
+    (tmp_path / "some.parquet").write_bytes(b"no table")
+    refused = shell.run_command("reproduce", "table=some.parquet", "output=other", folder=tmp_path)
+    assert refused.status == 2 and "some.parquet is no table of episodes" in refused.complaints[0]
+    absent = shell.run_command("reproduce", "table=absent.parquet", "output=other", folder=tmp_path)
+    assert absent.status == 2 and "absent.parquet is no table of episodes" in absent.complaints[0]
