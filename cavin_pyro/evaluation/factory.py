@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -120,8 +121,13 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
         )
 
 
-def make_planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, PointNet]:
+def make_planner(
+    config: DictConfig, reward: RewardFunction, *, wrap: Callable[[Model], Any] | None = None
+) -> tuple[Planner, PointNet]:
     """Build the planner with the checkpoint's model, and the checkpoint's PointNet.
+
+    Args:
+        wrap: makes of the model what the planner gets in its place, to observe its calls.
 
     Raises:
         UserError: a checkpoint that cannot be used, or a planner that refuses its options.
@@ -145,11 +151,13 @@ def make_planner(config: DictConfig, reward: RewardFunction) -> tuple[Planner, P
     _check_planner(options, model, path)
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
-    return construct(options, model=model, reward=reward, **optimizers), pointnet
+    return construct(options, model=wrap(model) if wrap else model, reward=reward, **optimizers), pointnet
 
 
-def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
-    """Build an environment and a planner, and run episodes with them.
+def make_runner(
+    config: DictConfig, *, render: bool = False, wrap: Callable[[Model], Any] | None = None
+) -> EpisodeRunner:
+    """Build an environment and a planner, and run episodes with them; for `wrap` see `make_planner`.
 
     Raises:
         UserError: as `check_options`, `make_environment` and `make_planner`, or a layout without room for the objects.
@@ -161,7 +169,7 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     try:
         with user_input():
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
-        planner, pointnet = make_planner(config, reward)
+        planner, pointnet = make_planner(config, reward, wrap=wrap)
         if config.pushes_per_plan is not None:
             whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -9,11 +10,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from cavin_pyro.config.composition import compose
 from cavin_pyro.data.collection import CollectionConfig, collect
+from cavin_pyro.evaluation.factory import make_environment
 from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
 from cavin_pyro.reproduction.stages import preparation
+from envs.workspace import push_endpoints
 
 ROOT = Path(__file__).parents[2]
 
@@ -127,3 +132,43 @@ def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> N
     assert [row[1] for row in rows] == ["code 32", "code 16", "code 64", "no codes"]
     assert all(float(row[2]) for row in rows) and all(row[-2].endswith(" of 3") for row in rows)
     assert run("tuning", str(home), *options, *fast) == printed
+
+
+def test_the_simulator_takes_the_place_of_f() -> None:
+    small = ["planner.samples=8", "planner.horizon=3", "maximum_steps=4"]
+    lines = run("oracle", "--episodes", "1", "--objects", "2", "--candidates", "2", "--seed", "5", *small).splitlines()
+    assert lines[0] == "crossing, 2 objects, scenes 5 to 5"
+    assert [line.split()[:2] for line in lines[2:]] == [
+        [where, criterion] for where in ("f", "simulator") for criterion in ("published", "strict")
+    ]
+    assert all(re.search(r"[01]/1 ", line) for line in lines[2:])
+
+
+def test_the_oracle_foretells_pushes_without_touching_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")  # as for a script; it takes it off
+    specification = importlib.util.spec_from_file_location("oracle", ROOT / "benchmarks" / "oracle.py")
+    assert specification is not None and specification.loader is not None
+    oracle = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(oracle)
+    config = compose("evaluate", "planner=paper", "objects=3")
+    env, alone = make_environment(config), make_environment(config)
+    mirror = oracle.Oracle(config, env, 2)
+    for one in (env, alone, mirror):
+        one.reset(seed=7)
+    targets = env.scene.ground_truth().positions[:, :2]
+    low, high = np.array([(-1.0, -1.0), (1.0, 1.0)])
+    box = np.array([push_endpoints(np.array([*corner, 0.0, 0.0]))[0] for corner in (low, high)])
+    for target in targets[:2]:
+        start = 2.0 * (target - (0.08, 0.0) - box[0]) / (box[1] - box[0]) - 1.0
+        action = np.array([*start, 0.9, 0.1], dtype=np.float32)
+        before = env.scene.ground_truth()
+        foretold = mirror.outcome(action[None])
+        assert not np.allclose(foretold, mirror.outcome(np.zeros((0, 4), dtype=np.float32)), atol=0.01)
+        after = env.scene.ground_truth()
+        assert np.array_equal(before.positions, after.positions)
+        assert np.array_equal(before.orientations, after.orientations)
+        observed, untouched = env.step(action)[0], alone.step(action)[0]
+        assert all(np.array_equal(observed[name], untouched[name]) for name in observed)
+        assert np.allclose(observed["centers"], foretold, atol=0.005)
+    for one in (env, alone, mirror.twin):
+        one.close()
