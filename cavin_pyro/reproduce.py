@@ -15,6 +15,7 @@ def main(config: DictConfig) -> None:
     """
     from pathlib import Path
 
+    from cavin_pyro.reproduction.episodes.picture import draw_chosen_episodes
     from cavin_pyro.reproduction.merging import IGNORED, merge_tables
     from cavin_pyro.reproduction.pipeline import as_typed, run_pipeline
     from cavin_pyro.reproduction.results import write_results
@@ -34,6 +35,10 @@ def main(config: DictConfig) -> None:
         rows = run_pipeline(config, home)
     for path in write_results(home, rows, as_typed(config)):
         print(path)
+    if config.pictures is not None:
+        folders = [Path(folder) for folder in config.merge] or [home]
+        for path in draw_chosen_episodes(home, folders, rows, config.pictures):
+            print(path)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from cavin_pyro.reproduction.table import TABLE, read_table, write_table
 from cavin_pyro.storage.run_directory import check_same_run
 
 EXTENDED = ("planners", "episodes", "bottom_episodes")  # options that may change when a run goes on
-IGNORED = ("output", "workers", "shard", "merge", *EXTENDED)
+IGNORED = ("output", "workers", "shard", "merge", "pictures", *EXTENDED)
 
 
 def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> list[dict[str, Any]]:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.reproduction.cells import FIGURES, VARIANTS
+from cavin_pyro.reproduction.episodes.failures import failures, failures_section
+from cavin_pyro.reproduction.episodes.failures_figure import draw_failures
 from cavin_pyro.reproduction.figure import TITLES, draw_figure
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
@@ -24,17 +26,20 @@ def write_results(home: Path, rows: Sequence[Row], command: str) -> list[Path]:
         command: the line that makes them anew, for the page.
     """
     measured = rates(rows)
-    compared, means = paired_tests(rows), interquartile_means(rows)
-    write_json(home / STATISTICS, {"rates": measured, "tests": compared, "interquartile_means": means})
+    compared, means, counted = paired_tests(rows), interquartile_means(rows), failures(rows)
+    statistics = {"rates": measured, "tests": compared, "interquartile_means": means, "failures": counted}
+    write_json(home / STATISTICS, statistics)
     planners = [name for name in FIGURES if any(row["planner"] == name for row in rows)]
     figures = [(planner, criterion) for planner in planners for criterion in CRITERIA]
     for planner, criterion in figures:
         draw_figure(home / f"figure-{planner}-{criterion}.png", measured, planner=planner, criterion=criterion)
+        draw_failures(home / f"failures-{planner}-{criterion}.png", counted, planner=planner, criterion=criterion)
     sections = [_section(planner, criterion, measured, compared) for planner, criterion in figures]
-    lines = [*_head(rows, command), *sections, *_variants(measured, compared)]
+    lines = [*_head(rows, command), *sections, *_variants(measured, compared), *failures_section(counted, figures)]
     with atomic_write(home / PAGE) as temporary:
         temporary.write_text("\n".join(lines), encoding="utf-8")
-    return [home / PAGE, home / STATISTICS, *(home / f"figure-{one}-{other}.png" for one, other in figures)]
+    pictures = [home / f"{kind}-{one}-{other}.png" for kind in ("figure", "failures") for one, other in figures]
+    return [home / PAGE, home / STATISTICS, *pictures]
 
 
 def _head(rows: Sequence[Row], command: str) -> list[str]:

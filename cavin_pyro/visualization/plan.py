@@ -6,6 +6,7 @@ It is the paper's qualitative figure, with the end of the episode as the last pa
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -41,8 +42,7 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     """
     if not episode.plan_records:
         raise ValueError("the episode holds no plan to draw: run it first")
-    chosen = np.linspace(0, len(episode.plan_records) - 1, min(PANELS, len(episode.plan_records))).round().astype(int)
-    plan_records = [episode.plan_records[index] for index in chosen]
+    plan_records = spread_plans(episode)
     panels = len(plan_records) + 1
     columns = {2: 2, 4: 2}.get(panels, 3)
     rows = -(-panels // columns)
@@ -51,13 +51,11 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     scale = return_scale(np.concatenate([record.plan.candidate_returns[0].numpy() for record in plan_records]))
     for panel, record in zip(axes.flat, plan_records, strict=False):
         draw_plan_record(panel, record, task, camera, scale, episode.reached(record))
-    _draw_end(axes.flat[panels - 1], episode, task, camera)
+    draw_end(axes.flat[panels - 1], episode, task, camera)
     for panel in axes.flat[panels:]:
         panel.set_axis_off()
     if scale is not None:
-        bar = figure.colorbar(ScalarMappable(scale, RETURNS), ax=axes, fraction=0.02, pad=0.01, aspect=30)
-        bar.set_label("return of a candidate", fontsize=9)
-        bar.ax.tick_params(labelsize=8)
+        draw_return_scale(figure, scale, ax=axes, fraction=0.02, pad=0.01, aspect=30)
     figure.suptitle(
         f"{task.name}, seed {episode.seed}: {episode.outcome} after {counted(len(episode.transitions))}", fontsize=12
     )
@@ -65,6 +63,13 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     entries = len(handles) if columns == 3 else -(-len(handles) // 2)
     figure.legend(handles=handles, loc="outside lower center", ncols=entries, fontsize=9, frameon=False)
     save_figure(path, figure)
+
+
+def spread_plans(episode: Episode) -> list[PlanRecord]:
+    """At most `PANELS` plans of an episode, evenly spread, the first and the last among them."""
+    count = len(episode.plan_records)
+    chosen = np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)
+    return [episode.plan_records[index] for index in chosen]
 
 
 def draw_plan_record(
@@ -96,6 +101,13 @@ def return_scale(returns: NDArray[np.float32]) -> Normalize | None:
     return Normalize(low, high if high > low else low + 1.0)
 
 
+def draw_return_scale(figure: Figure, scale: Normalize, **place: Any) -> None:
+    """Draw the colours of the candidates' returns; `place`: as of `Figure.colorbar`."""
+    bar = figure.colorbar(ScalarMappable(scale, RETURNS), **place)
+    bar.set_label("return of a candidate", fontsize=9)
+    bar.ax.tick_params(labelsize=8)
+
+
 def _error(record: PlanRecord, reached: NDArray[np.float32] | None) -> str:
     """The error of f after the last executed push: the largest distance over the objects, for a title."""
     predicted = record.plan.predicted_centers[0].numpy()
@@ -106,7 +118,7 @@ def _error(record: PlanRecord, reached: NDArray[np.float32] | None) -> str:
     return f", prediction {100 * off.max():.1f} cm off" if len(off) and np.isfinite(off).all() else ""
 
 
-def _draw_end(panel: Axes, episode: Episode, task: Task, camera: Camera | None) -> None:
+def draw_end(panel: Axes, episode: Episode, task: Task, camera: Camera | None) -> None:
     """Draw the last observation and the objects' paths, with the outcome as the title."""
     first, last = episode.plan_records[0], episode.plan_records[-1]
     view = _draw_ground(panel, task, camera, episode.photograph, episode.clouds, last.mask)

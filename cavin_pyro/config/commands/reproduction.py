@@ -56,3 +56,10 @@ class ReproduceConfig:
         None, "a table of episodes, episodes.parquet, to draw and count; nothing is run then", group="run"
     )
     merge: list[str] = option([], "folders of finished shards, [a,b], whose tables are joined", group="run")
+    pictures: str | None = option(
+        None,
+        "also run the first three successes and failures of CAVIN in each task again, by this criterion, and draw them "
+        "step by step; a finished run is only drawn",
+        choices="cavin_pyro.reproduction.table.CRITERIA",
+        group="run",
+    )
