@@ -172,3 +172,17 @@ def test_the_oracle_foretells_pushes_without_touching_the_episode(monkeypatch: p
         assert np.allclose(observed["centers"], foretold, atol=0.005)
     for one in (env, alone, mirror.twin):
         one.close()
+
+
+def test_samples_are_set_against_success_and_a_finished_setting_is_not_run_again(tmp_path: Path) -> None:
+    few = ["planner.horizon=6", "maximum_steps=2", "--methods", "cavin", "--planners", "paper", "--episodes", "1"]
+    few += ["--workers", "1", "--output", str(tmp_path)]
+    run("samples", *few, "--samples", "8")
+    log = (tmp_path / "cavin-paper-8" / "episodes.jsonl").read_bytes()  # with times
+    assert json.loads(log)["seed"] == 73000
+    run("samples", *few, "--samples", "8", "16")
+    assert (tmp_path / "cavin-paper-8" / "episodes.jsonl").read_bytes() == log
+    rows = [line.split(" | ") for line in (tmp_path / "samples.md").read_text().splitlines()[-2:]]
+    assert [row[:3] for row in rows] == [["| CAVIN", "paper", "8"], ["| CAVIN", "paper", "16"]]
+    assert sum("*" in row[4] for row in rows) == 1  # neither succeeds in two pushes: the faster one
+    assert (tmp_path / "samples.png").read_bytes().startswith(b"\x89PNG")

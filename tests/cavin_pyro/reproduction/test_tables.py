@@ -84,11 +84,13 @@ def test_figures_and_page_follow_from_the_table_and_have_the_same_bytes(tmp_path
         written.append([(path.name, path.read_bytes()) for path in write_results(home, played(), "the command")])
     assert written[0] == written[1]
     names = {name for name, _ in written[0]}
-    assert names == {"results.md", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png"}
+    pictures = {f"{kind}-paper-{one}.png" for kind in ("figure", "failures") for one in ("strict", "published")}
+    assert names == {"results.md", "statistics.json", *pictures}
     page = (tmp_path / "one" / "results.md").read_text()
     assert "| clearing | sparse | 1 | 100.0 % (20.7 to 100.0), n = 1 |" in page and "    the command" in page
+    assert "| clearing | MPC | 1 | 0.0 % | 0.0 % | 0.0 % | 0.0 % | 100.0 % | 50.0 % | 0.0 % |" in page
     statistics = json.loads((tmp_path / "one" / "statistics.json").read_text())
-    assert set(statistics) == {"rates", "tests", "interquartile_means"}
+    assert set(statistics) == {"rates", "tests", "interquartile_means", "failures"}
 
 
 def test_figures_and_page_come_from_a_table_alone(shell: SimpleNamespace, tmp_path: Path) -> None:
