@@ -13,7 +13,8 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
+# A file there would hide `planning`. Workers run this line again, with the path that is left.
+sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs

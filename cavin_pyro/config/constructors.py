@@ -41,7 +41,7 @@ def constructor_options(target: str) -> dict[str, inspect.Parameter]:
     """
     try:
         found = get_object(target)
-    except Exception:
+    except Exception:  # a user's module may raise anything; building the part says it in one line
         return {}
     makers = (
         [vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)]

@@ -122,7 +122,7 @@ def _meanings(target: str | None) -> Mapping[str, str]:
         return {}
     try:
         found = get_object(target)
-    except Exception:
+    except Exception:  # a user's module may raise anything; building the part says it in one line
         return {}
     texts = [vars(one).get("__doc__") or "" for one in getattr(found, "__mro__", [found])]
     meanings: dict[str, str] = {}

@@ -49,7 +49,8 @@ METHODS: dict[str, Method] = {
             ("model=single_latent", "guide=single_latent"),
             {
                 "paper": ("planner=sectar", *WITHOUT_ADDITIONS),
-                "ours": ("planner=sectar",),
+                # More samples than the others' 1,024, so that it spends as many model evaluations as CAVIN.
+                "ours": ("planner=sectar", "planner.samples=1408"),
                 "perturbed_rollouts": (
                     "planner=sectar",
                     *(one for one in WITHOUT_ADDITIONS if not one.startswith("planner.robustness")),

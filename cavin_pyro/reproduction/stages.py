@@ -19,7 +19,7 @@ from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import Scale
 
 COLLECTING_SECONDS = 0.03  # per transition and core, for the time left
-PRETRAINING_SECONDS = 60.0
+PRETRAINING_SECONDS = 300.0
 POLLING_SECONDS = 2.0
 
 

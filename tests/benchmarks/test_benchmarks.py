@@ -125,7 +125,7 @@ def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> N
     home = tmp_path / "home"
     for stage in preparation(SCALES["minimal"], home, workers=1):
         stage.run()
-    options = ("--methods", "cvae_mpc", "mpc", "--steps", "2", "--episodes", "1", "--workers", "1")
+    options = ("--methods", "cvae_mpc", "mpc", "--steps", "2", "--episodes", "1")
     fast = ("--training", *TINY_TRAINING[1:], "--planning", "planner.samples=8", "planner.horizon=6", "maximum_steps=1")
     printed = run("tuning", str(home), *options, *fast)
     rows = [line.split(" | ") for line in printed.splitlines()[2:]]
