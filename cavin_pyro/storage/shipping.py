@@ -1,4 +1,7 @@
-"""Ship checkpoints out of a reproduction: `python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]`."""
+"""Ship checkpoints out of a reproduction: `python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]`.
+
+With `--models` instead of methods: all of its trainings, for `reproduce models=checkpoints/reproduction`.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +37,7 @@ def ship(home: Path, method: str, to: Path) -> dict[str, Any]:
     """
     if method not in CHECKPOINTS:
         raise UserError(f"unknown method {method!r}: choose from {', '.join(CHECKPOINTS)}")
-    folders = sorted((home / "train").glob(f"{method}-*"))
-    if not folders:
-        raise UserError(f"{home} holds no training of {method} (train/{method}-SEED)")
-    if unfinished := [folder for folder in folders if not (folder / "metrics.json").exists()]:
-        raise UserError(f"{unfinished[0]} has not finished: rerun reproduce to resume it")
+    folders = _trainings(home, method)
     trained = {folder: load_checkpoint(folder / "checkpoint.safetensors") for folder in folders}
     best = min(folders, key=lambda folder: _loss(trained[folder]))
     chosen = trained[best]
@@ -48,6 +47,29 @@ def ship(home: Path, method: str, to: Path) -> dict[str, Any]:
     found["validation_losses"] = {str(one.config["seed"]): _loss(one) for one in trained.values()}
     write_json(to / f"{method}.json", found)
     return found
+
+
+def ship_models(home: Path, to: Path) -> list[Path]:
+    """Copy every training of a reproduction to `to/METHOD-SEED.safetensors`; returns the paths.
+
+    Raises:
+        UserError: as `ship`.
+    """
+    to.mkdir(parents=True, exist_ok=True)
+    shipped = []
+    for folder in _trainings(home, ""):
+        shipped.append(to / f"{folder.name}.safetensors")
+        _write(shipped[-1], load_checkpoint(folder / "checkpoint.safetensors"))
+    return shipped
+
+
+def _trainings(home: Path, method: str) -> list[Path]:
+    folders = sorted((home / "train").glob(f"{method}-*" if method else "*-*"))
+    if not folders:
+        raise UserError(f"{home} holds no training of {method or 'any method'} (train/{method or 'METHOD'}-SEED)")
+    if unfinished := [folder for folder in folders if not (folder / "metrics.json").exists()]:
+        raise UserError(f"{unfinished[0]} has not finished: rerun reproduce to resume it")
+    return folders
 
 
 def facts(checkpoint: Checkpoint, *, steps: int) -> dict[str, Any]:
@@ -96,8 +118,11 @@ def _write(path: Path, checkpoint: Checkpoint) -> None:
 def main() -> None:
     """Ship the methods that the command line names, by default the three baselines."""
     if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
-        raise SystemExit("usage: python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]")
+        raise SystemExit("usage: python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ... | --models]")
     try:
+        if sys.argv[2:] == ["--models"]:
+            print(*ship_models(Path(sys.argv[1]), shipped_folder() / "reproduction"), sep="\n")
+            return
         for method in sys.argv[2:] or BASELINES:
             found = ship(Path(sys.argv[1]), method, shipped_folder())
             print(

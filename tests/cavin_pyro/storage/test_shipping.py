@@ -15,7 +15,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_model
 from cavin_pyro.storage import shipping
 from cavin_pyro.storage.checkpoint import load_checkpoint
-from cavin_pyro.storage.shipping import main, ship
+from cavin_pyro.storage.shipping import main, ship, ship_models
 
 LOSSES = {0: -3.0, 1: -7.5, 2: -5.0}  # by training seed
 
@@ -104,3 +104,15 @@ def test_the_command_ships_the_methods_that_it_is_given(
         main()
     assert ended.value.code == 2
     assert capsys.readouterr().err.startswith("error: ") and (tmp_path / "shipped" / "sectar.safetensors").exists()
+
+
+def test_all_trainings_are_shipped_by_method_and_seed(home: Path, tmp_path: Path) -> None:
+    shipped = ship_models(home, tmp_path / "models")
+    assert [path.name for path in shipped] == [f"sectar-{seed}.safetensors" for seed in LOSSES]
+    for path in shipped:
+        trained = load_checkpoint(home / "train" / path.stem / "checkpoint.safetensors")
+        assert all(torch.equal(value, trained.tensors[name]) for name, value in load_checkpoint(path).tensors.items())
+        assert str(home).encode() not in path.read_bytes()
+    (home / "train" / "sectar-1" / "metrics.json").unlink()
+    with pytest.raises(UserError, match="sectar-1 has not finished: rerun reproduce to resume it"):
+        ship_models(home, tmp_path / "models")
