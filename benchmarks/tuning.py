@@ -48,6 +48,7 @@ VARIANTS = (
     Variant("sectar", "code 32", ()),
     Variant("sectar", "code 16", ("model.effect_dimension=16",)),
     Variant("sectar", "code 64", ("model.effect_dimension=64",)),
+    Variant("sectar", "action weight 0.01", ("model.action_weight=0.01",)),
     Variant("sectar", "action weight 0.1", ("model.action_weight=0.1",)),
     Variant("sectar", "action weight 10", ("model.action_weight=10",)),
     Variant("sectar", "guide reads actions", ("guide.reads_actions=true",)),
