@@ -1,9 +1,9 @@
 """Options of the paper's baselines, tried with the same care: `python benchmarks/tuning.py HOME [--steps 4000]`.
 
 HOME is a folder of `python -m cavin_pyro.reproduce` whose `data/` and `pretrain/` are finished. Each variant differs
-from its method's paper version in one option, is trained on the same data with the same steps and seed, and plans as in
-the paper (no additions) in the same scenes, seeds from 20000 on. The table goes to HOME/tuning/table.md. Finished parts
-are not done again.
+from the paper's version of its method in one option, is trained on the same data with the same steps and seed, and
+plans as in the paper (no additions) in the same scenes, seeds from 20000 on. The table goes to HOME/tuning/table.md.
+Finished parts are not done again.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class Variant(NamedTuple):
 
 VARIANTS = (
     Variant("cavin", "codes 16 and 16", ()),
-    Variant("sectar", "code 32", ()),
-    Variant("sectar", "code 16", ("model.effect_dimension=16",)),
-    Variant("sectar", "code 64", ("model.effect_dimension=64",)),
+    Variant("sectar", "code 32", ("model.action_weight=1",)),
+    Variant("sectar", "code 16", ("model.effect_dimension=16", "model.action_weight=1")),
+    Variant("sectar", "code 64", ("model.effect_dimension=64", "model.action_weight=1")),
     Variant("sectar", "action weight 0.01", ("model.action_weight=0.01",)),
     Variant("sectar", "action weight 0.1", ("model.action_weight=0.1",)),
     Variant("sectar", "action weight 10", ("model.action_weight=10",)),
-    Variant("sectar", "guide reads actions", ("guide.reads_actions=true",)),
-    Variant("cvae_mpc", "code 32", ()),
+    Variant("sectar", "guide reads actions", ("guide.reads_actions=true", "model.action_weight=1")),
+    Variant("cvae_mpc", "code 32", ("model.motion_dimension=32",)),
     Variant("cvae_mpc", "code 16", ("model.motion_dimension=16",)),
     Variant("cvae_mpc", "code 64", ("model.motion_dimension=64",)),
     Variant("mpc", "no codes", ()),

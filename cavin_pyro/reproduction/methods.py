@@ -46,7 +46,8 @@ METHODS: dict[str, Method] = {
             "sectar",
             "SeCTAR",
             "#0072B2",
-            ("model=single_latent", "guide=single_latent"),
+            # Chosen by benchmarks/tuning.py, docs/measurements/reproduction.md.
+            ("model=single_latent", "guide=single_latent", "model.action_weight=0.1"),
             {
                 "paper": ("planner=sectar", *WITHOUT_ADDITIONS),
                 # More samples than the others' 1,024, so that it spends as many model evaluations as CAVIN.
@@ -61,7 +62,8 @@ METHODS: dict[str, Method] = {
             "cvae_mpc",
             "CVAE-MPC",
             "#009E73",
-            ("model=flat", "guide=flat"),
+            # Chosen as SeCTAR's; the paper has 32.
+            ("model=flat", "guide=flat", "model.motion_dimension=16"),
             {"paper": ("planner=cvae_mpc", *WITHOUT_ADDITIONS), "ours": ("planner=cvae_mpc",)},
         ),
         Method(
