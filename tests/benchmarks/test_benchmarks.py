@@ -186,3 +186,17 @@ def test_samples_are_set_against_success_and_a_finished_setting_is_not_run_again
     assert [row[:3] for row in rows] == [["| CAVIN", "paper", "8"], ["| CAVIN", "paper", "16"]]
     assert sum("*" in row[4] for row in rows) == 1  # neither succeeds in two pushes: the faster one
     assert (tmp_path / "samples.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.soak
+def test_rows_of_networks_are_counted_for_every_planner_of_a_method() -> None:
+    rows = [line.strip("| ").split(" | ") for line in run("model_evaluations", "--methods", "cavin").splitlines()[2:]]
+    counted = {row[1]: [int(count.replace(",", "")) for count in row[2:]] for row in rows}
+    assert counted["`paper`"] == [
+        10240,
+        10240,
+        30720,
+        51200,
+    ]  # N samples, K = 10 segments, T = 3
+    assert counted["`one_motion`"] == [10240, 10, 30, 10280]
+    assert counted["`without_effects`"][0] == 0
