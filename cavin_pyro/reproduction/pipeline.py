@@ -23,7 +23,7 @@ from cavin_pyro.reproduction.scales import SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
 from cavin_pyro.reproduction.table import TABLE, episode_row, write_table
 
-ROUND = 10  # episodes of one evaluation before the next one's turn
+ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
 
 
