@@ -57,8 +57,8 @@ def _draw_rewards(axes: Axes, rates: Rates) -> None:
                     x = place + (number - (len(METHODS) - 1) / 2) * BAR_WIDTH
                     axes.bar(x, 100 * rate["rate"], BAR_WIDTH * 0.9, color=method.color)
                     axes.errorbar(x, 100 * rate["rate"], _whiskers([rate]), color="black", capsize=2, linewidth=0.8)
-                    axes.annotate(f"n={rate['episodes']}", (x, 1), rotation=90, fontsize=6, ha="center", va="bottom")
     axes.set_xticks(range(len(kinds)), [f"{kind} reward" for kind in kinds])
+    axes.set_xlabel(_episodes([rate for rate in rates if rate["objects"] == TOP_ROW_OBJECTS]), fontsize=8)
     axes.set_ylim(0, 104)
 
 
@@ -80,7 +80,15 @@ def _draw_objects(axes: Axes, rates: Rates) -> None:
                 linewidth=1.2,
             )
     axes.set_xticks(sorted({rate["objects"] for rate in rates}))
-    axes.set_xlabel("objects")
+    of_line = [rate for rate in rates if rate["reward"] == "sparse"]
+    others = _episodes([rate for rate in of_line if rate["objects"] != TOP_ROW_OBJECTS])
+    axes.set_xlabel(f"objects ({others}, but with {TOP_ROW_OBJECTS} as above)" if others else "objects", fontsize=8)
+
+
+def _episodes(rates: Rates) -> str:
+    """How many episodes a bar or a point has."""
+    counts = sorted({rate["episodes"] for rate in rates})
+    return " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) + " episodes each" if counts else ""
 
 
 def _whiskers(rates: Rates) -> list[list[float]]:
