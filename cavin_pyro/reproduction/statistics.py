@@ -12,7 +12,7 @@ from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.cells import FIGURES
 from cavin_pyro.reproduction.table import CRITERIA, Row
 
-RESAMPLES = 2000
+RESAMPLES = 10_000
 CELL = ("method", "planner", "task", "reward", "objects")
 OURS = "cavin"
 
@@ -55,17 +55,19 @@ def rates(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def hierarchical_interval(success: Sequence[bool], groups: Sequence[int], seed: int = 0) -> tuple[float, float]:
-    """95 % interval of a mean by the bootstrap over groups, and over the episodes in each of them."""
+    """95 % interval of a rate by the bootstrap over groups, and over the episodes in each of them.
+
+    Episodes of a group, sampled with replacement, succeed as often as a binomial variable says.
+    """
     generator = np.random.default_rng(seed)
     values = [
-        np.array([one for one, group in zip(success, groups, strict=True) if group == name], float)
+        np.array([one for one, group in zip(success, groups, strict=True) if group == name])
         for name in sorted(set(groups))
     ]
-    means = np.empty(RESAMPLES)
-    for number in range(RESAMPLES):
-        chosen = generator.integers(len(values), size=len(values))
-        means[number] = np.mean([generator.choice(values[one], len(values[one])).mean() for one in chosen])
-    low, high = np.quantile(means, (0.025, 0.975))
+    counts, means = np.array([len(one) for one in values]), np.array([one.mean() for one in values])
+    chosen = generator.integers(len(values), size=(RESAMPLES, len(values)))
+    rates = (generator.binomial(counts[chosen], means[chosen]) / counts[chosen]).mean(1)
+    low, high = np.quantile(rates, (0.025, 0.975))
     return float(low), float(high)
 
 
