@@ -22,8 +22,8 @@ class Line:
 
     @property
     def command(self) -> str | None:
-        """`plan` of `python -m cavin_pyro.plan`; None for other lines."""
-        is_ours = self.tokens[:2] == ("python", "-m") and self.tokens[2].startswith("cavin_pyro.")
+        """`plan` of `python -m cavin_pyro.plan`; None for other lines, also for modules of a subpackage."""
+        is_ours = self.tokens[:2] == ("python", "-m") and re.fullmatch(r"cavin_pyro\.\w+", self.tokens[2])
         return self.tokens[2].removeprefix("cavin_pyro.") if is_ours else None
 
     @property
