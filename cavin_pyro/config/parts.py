@@ -12,6 +12,7 @@ from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from cavin_pyro.config.constructors import OWN_PACKAGES
 from cavin_pyro.config.errors import UserError, at_least
 from guides.guide import Guide
 from models.model import Model
@@ -37,6 +38,10 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
     except (InstantiationException, TypeError) as error:
         cause = error.__cause__ or error
         raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
+    except (MemoryError, OverflowError, RuntimeError) as error:  # of torch: a layer larger than the memory
+        if str(config["_target_"]).partition(".")[0] not in OWN_PACKAGES:
+            raise
+        raise UserError(f"{config['_target_']} cannot be built: {' '.join(str(error).split())}") from error
 
 
 def check_sizes(section: str, config: Config) -> None:
@@ -109,7 +114,7 @@ def class_of(config: Config) -> Any:
     """The class of a part, None if there is no such class."""
     try:
         return hydra.utils.get_class(config["_target_"])
-    except (KeyError, HydraException, ImportError, ValueError):
+    except (KeyError, HydraException, ImportError, ValueError, TypeError, AttributeError):
         return None  # `construct` has a better message
 
 

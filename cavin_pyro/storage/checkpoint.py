@@ -1,12 +1,11 @@
 """Checkpoints: one safetensors file with the weights, and in its header the configuration and the provenance.
 
 Weights and configuration are one file, so they stay together. Nothing in it can run code: the header is JSON, and the
-classes that it names must come from this program's packages, or from a module that the user names in `trust`.
+classes that it names must be defined in this program's packages, or in a module that the user names in `trust`.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import sysconfig
 from collections.abc import Mapping, Sequence
@@ -14,18 +13,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from cavin_pyro.config.commands.episodes import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.digests import check_manifest, tensors_digest
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.renamed import renamed
+from cavin_pyro.storage.trust import check_numbers, check_targets
 
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
-OWN_MODULES = ("models", "guides")
 BUILT_SECTIONS = ("model", "prior", "scales", "guide")  # of the configuration, from which parts are built
 
 
@@ -45,7 +46,7 @@ class Checkpoint:
         """Copy one part's weights into a module.
 
         Raises:
-            UserError: the weights are of another architecture.
+            UserError: the weights are of another architecture or type.
         """
         prefix = f"{part}."
         weights = {name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)}
@@ -57,6 +58,10 @@ class Checkpoint:
                 raise UserError(
                     f"checkpoint {where} is of another architecture: {part}.{name} has shape {shapes[0]} in the file "
                     f"and {shapes[1]} in {type(module).__name__}: use the configuration that it was trained with"
+                )
+            if have.dtype != want.dtype:
+                raise UserError(
+                    f"checkpoint {where} is damaged: {part}.{name} holds {_plain(have.dtype)}, not {_plain(want.dtype)}"
                 )
         module.load_state_dict(weights)
 
@@ -70,10 +75,15 @@ def save_checkpoint(
         for part, module in parts.items()
         for name, value in module.state_dict().items()
     }
-    header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
-    header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
     with atomic_write(path) as temporary:
-        temporary.write_bytes(save(tensors, metadata=header))  # `save_file` would hide the error of a full disk
+        temporary.write_bytes(checkpoint_bytes(tensors, config, provenance))
+
+
+def checkpoint_bytes(tensors: Mapping[str, Tensor], config: Mapping[str, Any], provenance: Mapping[str, Any]) -> bytes:
+    """A checkpoint's file; the header has a digest of the weights as well."""
+    header = {"format": FORMAT, "version": str(FORMAT_VERSION), "sha256": tensors_digest(tensors)}
+    header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
+    return save(dict(tensors), metadata=header)  # `save_file` would hide the error of a full disk
 
 
 def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
@@ -83,11 +93,13 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         trust: further modules whose classes the checkpoint may name.
 
     Raises:
-        UserError: missing, truncated or foreign file, another version, old names, or a class of an untrusted module.
+        UserError: missing, truncated, damaged or foreign file, another version, old names, or a class of an untrusted
+            module.
     """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
+    check_manifest(path, shipped_folder())
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
@@ -102,16 +114,21 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         )
     try:
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
     if not isinstance(config, dict) or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
         raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
+    if not isinstance(provenance, dict):
+        raise UserError(f"checkpoint {path} has a damaged header (its provenance has no entries)")
+    _check_weights(tensors, header.get("sha256"), path)
     if old := renamed(config):
         raise UserError(
             f"checkpoint {path} has old names: {', '.join(old)}: "
             f"rewrite it with python -m cavin_pyro.storage.renamed {path}"
         )
-    _check_targets([config.get(section) for section in BUILT_SECTIONS], path, trust)
+    built = {section: config[section] for section in BUILT_SECTIONS if section in config}
+    check_targets(built, path, trust)
+    check_numbers(built, path, max((size for value in tensors.values() for size in value.shape), default=0))
     return Checkpoint(config, provenance, tensors)
 
 
@@ -149,27 +166,14 @@ def default_checkpoint() -> Path:
     return find_checkpoint(DEFAULT_CHECKPOINT)
 
 
-def _check_targets(config: Any, path: Path, trust: Sequence[str]) -> None:
-    if isinstance(config, dict):
-        target = config.get("_target_")
-        top = str(target).split(".")[0]
-        if target is not None and top not in trust and not _is_own_class(str(target)):
-            raise UserError(
-                f"checkpoint {path} asks to run {target}, which is not part of this program: "
-                f"if you trust that module, pass trust=[{top}]"
-            )
-        config = list(config.values())
-    for entry in config if isinstance(config, list) else ():
-        _check_targets(entry, path, trust)
+def _check_weights(tensors: Mapping[str, Tensor], digest: str | None, path: Path) -> None:
+    """Check weights against the header's digest, which older checkpoints lack, and that they are numbers."""
+    if digest is not None and digest != tensors_digest(tensors):
+        raise UserError(f"checkpoint {path} is damaged: its weights are not those that were saved (SHA-256)")
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise UserError(f"checkpoint {path} is damaged: {name} holds values that are not finite")
 
 
-def _is_own_class(target: str) -> bool:
-    """Whether a dotted name is a class of this program; imports of its modules do not count."""
-    module, _, name = target.rpartition(".")
-    if module.split(".")[0] not in OWN_MODULES:
-        return False
-    try:
-        found = getattr(importlib.import_module(module), name, None)
-    except ImportError:
-        return False
-    return isinstance(found, type) and found.__module__.split(".")[0] in OWN_MODULES
+def _plain(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")

@@ -52,7 +52,7 @@ def _find(section: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, _Pla
         name = f"{prefix}{key}"
         if isinstance(value, dict):
             yield from _find(value, f"{name}.")
-        elif key == "_target_" and value in CLASSES:
+        elif key == "_target_" and isinstance(value, str) and value in CLASSES:
             yield value, CLASSES[value], (section, key), (key, CLASSES[value])
         elif name in OPTIONS:
             yield name, OPTIONS[name], (section, key), (OPTIONS[name].rpartition(".")[2], value)

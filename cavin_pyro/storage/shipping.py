@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import save
-
 from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.checkpoint import FORMAT, FORMAT_VERSION, Checkpoint, load_checkpoint, shipped_folder
+from cavin_pyro.storage.checkpoint import Checkpoint, checkpoint_bytes, load_checkpoint, shipped_folder
+from cavin_pyro.storage.digests import update_manifest
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 
 BASELINES = ("sectar", "cvae_mpc", "mpc")
@@ -108,11 +107,9 @@ def _public(record: Mapping[str, Any], checkpoint: Checkpoint) -> dict[str, Any]
 
 def _write(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint as `save_checkpoint` does, with public paths in its header."""
-    header = {"format": FORMAT, "version": str(FORMAT_VERSION)}
-    for name in ("config", "provenance"):
-        header[name] = json.dumps(_public(getattr(checkpoint, name), checkpoint))
+    config, provenance = (_public(getattr(checkpoint, name), checkpoint) for name in ("config", "provenance"))
     with atomic_write(path) as temporary:
-        temporary.write_bytes(save(dict(checkpoint.tensors), metadata=header))
+        temporary.write_bytes(checkpoint_bytes(checkpoint.tensors, config, provenance))
 
 
 def main() -> None:
@@ -122,6 +119,7 @@ def main() -> None:
     try:
         if sys.argv[2:] == ["--models"]:
             print(*ship_models(Path(sys.argv[1]), shipped_folder() / "reproduction"), sep="\n")
+            update_manifest(shipped_folder())
             return
         for method in sys.argv[2:] or BASELINES:
             found = ship(Path(sys.argv[1]), method, shipped_folder())
@@ -129,6 +127,7 @@ def main() -> None:
                 f"{method}: training seed {found['training_seed']}, best step {found['best_step']} of "
                 f"{found['steps']}, validation losses by seed {found['validation_losses']}"
             )
+            update_manifest(shipped_folder())
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
