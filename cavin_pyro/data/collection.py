@@ -255,7 +255,7 @@ def repair(config: CollectionConfig, folder: Path) -> int:
     metadata, repaired = _begin(config, folder), 0
     for number in range(metadata["shards"]):
         try:
-            read_shard(shard_path(folder, number))
+            read_shard(shard_path(folder, number), metadata=metadata)
         except UserError as error:
             print(f"collecting again: {error}", flush=True)
             arrays, _ = _collect_shard((replace(config), number))

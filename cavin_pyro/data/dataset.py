@@ -15,20 +15,24 @@ checksums find a shard that was damaged later. Letters: E episodes, S pushes, M 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.declaration import check_file, check_values
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 from cavin_pyro.storage.run_directory import with_current_keys
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
 RENAMED = {"hold": "intent_length", "perturbed": "perturbation_rate"}  # options of a collection, by their former names
+
+MOST_LOST = 1000  # files; each that is missing is named when the rest is used
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -61,16 +65,25 @@ def _shard_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         return file.id.get_file_image()
 
 
-def read_shard(path: Path, names: tuple[str, ...] | None = None) -> Arrays:
-    """Read one shard, or some of its arrays.
+def read_shard(
+    path: Path, names: tuple[str, ...] | None = None, *, metadata: Mapping[str, Any] | None = None
+) -> Arrays:
+    """Read one shard, or some of its arrays; types, shapes and ranges are checked (`cavin_pyro.data.declaration`).
+
+    Args:
+        metadata: of the dataset, with which the numbers of episodes and of pushes must agree.
 
     Raises:
         UserError: the file is missing, truncated, damaged or not a shard; it is named.
     """
+    configuration = (metadata or {}).get("configuration", {})
     try:
         with h5py.File(path, "r") as file:
-            return {name: file[name][()] for name in (names or sorted(file))}
-    except (OSError, KeyError, RuntimeError) as error:
+            check_file(file, steps=configuration.get("steps"), episodes=configuration.get("episodes_per_shard"))
+            arrays = {name: file[name][()] for name in (names or sorted(file))}
+        check_values(arrays)
+        return arrays
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
         raise UserError(
             f"shard {path} is missing or corrupt ({str(error).splitlines()[0]}): "
             "delete it and collect again to rebuild it, or pass skip_corrupt=true to use the rest"
@@ -109,7 +122,27 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
         )
-    return {**metadata, "configuration": with_current_names(metadata["configuration"])}
+    metadata["configuration"] = with_current_names(metadata["configuration"])
+    _check_counts(path, metadata)
+    return metadata
+
+
+def _check_counts(path: Path, metadata: Mapping[str, Any]) -> None:
+    """Check that a dataset's counts agree with one another and with the files that are there."""
+    configuration = metadata["configuration"]
+    steps, each = configuration.get("steps"), configuration.get("episodes_per_shard", 1)
+    if not all(type(size) is int and size >= 1 for size in (steps, each)):
+        raise UserError(f"{path} is damaged: steps and episodes_per_shard must be whole numbers; collect it again")
+    shards, episodes, transitions = (metadata[name] for name in ("shards", "episodes", "transitions"))
+    wrong = "episodes_per_shard" in configuration and episodes != shards * each
+    if wrong or not 0 <= transitions <= episodes * steps:
+        raise UserError(
+            f"{path} is damaged: {shards} files have not {episodes} episodes with {transitions} pushes; "
+            "collect the dataset again"
+        )
+    there = sum(1 for _ in path.parent.glob("episodes-*.h5"))
+    if shards > there + MOST_LOST:
+        raise UserError(f"{path} counts {shards} files of episodes, but {there} are there: collect the dataset again")
 
 
 def with_current_names(configuration: Mapping[str, Any]) -> dict[str, Any]:
@@ -130,6 +163,38 @@ def content_fingerprint(folder: Path) -> str:
         raise UserError(f"shard {path} cannot be read ({error.strerror}): collect it again") from error
 
 
+def check_distinct(folders: Sequence[Path]) -> None:
+    """Check that no dataset is given twice, so that no episode counts twice and none is in training and validation.
+
+    Raises:
+        UserError: two begin with the same shard.
+    """
+    known: dict[str, Path] = {}
+    for folder in folders:
+        read_metadata(folder)  # tells whether there is a dataset at all
+        path = shard_path(folder, 0)
+        fingerprint = content_fingerprint(folder) if path.exists() else str(folder.resolve())
+        if fingerprint in known:
+            raise UserError(f"data names the same episodes twice, {known[fingerprint]} and {folder}: name them once")
+        known[fingerprint] = folder
+
+
+def check_new(folder: Path, number: int, episodes: NDArray[np.int64], seen: set[int]) -> None:
+    """Check that the numbers of a shard's episodes are new in its dataset, and add them to `seen`.
+
+    Raises:
+        UserError: an earlier shard has one of them.
+    """
+    repeated = sorted(seen & set(episodes.tolist()))
+    if repeated or len(set(episodes.tolist())) < len(episodes):
+        which = f" {repeated[0]}" if repeated else "s"
+        raise UserError(
+            f"shard {shard_path(folder, number)} repeats episode{which}: "
+            "delete it and collect again with repair=true to rebuild it"
+        )
+    seen |= set(episodes.tolist())
+
+
 def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
     """Yield (number, arrays) of a dataset's shards in order.
 
@@ -142,7 +207,7 @@ def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool =
     metadata, whole = read_metadata(folder), 0
     for number in range(metadata["shards"]):
         try:
-            arrays = read_shard(shard_path(folder, number), names)
+            arrays = read_shard(shard_path(folder, number), names, metadata=metadata)
         except UserError as error:
             if not skip_corrupt:
                 raise

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_shard
+from cavin_pyro.data.dataset import check_distinct, read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.held_out import find_held_out
 from models.networks.pointnet import PointNet
 
@@ -45,12 +45,14 @@ def shard_features(folder: Path, number: int, pointnet: PointNet, fingerprint: s
         UserError: the shard is corrupt.
     """
     path = folder / f"features-{fingerprint}" / f"episodes-{number:05d}.h5"
+    metadata = read_metadata(folder)
     if path.exists():
         try:
-            return read_shard(path)["features"]
+            return read_shard(path, ("features",), metadata=metadata)["features"]
         except UserError:
             path.unlink()  # a derived file: damaged ones are made again
-    features = cloud_features(pointnet, read_shard(shard_path(folder, number), ("clouds",))["clouds"])
+    shard = read_shard(shard_path(folder, number), ("clouds",), metadata=metadata)
+    features = cloud_features(pointnet, shard["clouds"])
     try:
         path.parent.mkdir(exist_ok=True)
         write_shard(path, {"features": features})
@@ -72,15 +74,18 @@ def sample_clouds(
     """
     held_out = find_held_out(held_out_objects, folders, option="held_out_objects")
     shards = [
-        (folder, number, excluded)
+        (folder, number, excluded, metadata)
         for folder, excluded in zip(folders, held_out, strict=True)
-        for number in range(read_metadata(folder)["shards"])
+        for metadata in [read_metadata(folder)]
+        for number in range(metadata["shards"])
     ]
     chosen = generator.permutation(len(shards))[: max(1, min(len(shards), 100))]
     each = -(-count // len(chosen))
     sampled = []
-    for folder, number, excluded in [shards[index] for index in sorted(chosen)]:
-        arrays = read_shard(shard_path(folder, number), ("clouds", "visible", "length", *excluded.required_arrays))
+    check_distinct(folders)
+    names = ("clouds", "visible", "length")
+    for folder, number, excluded, metadata in [shards[index] for index in sorted(chosen)]:
+        arrays = read_shard(shard_path(folder, number), (*names, *excluded.required_arrays), metadata=metadata)
         steps = np.arange(arrays["visible"].shape[1])
         real = arrays["visible"] & (steps[None, :, None] <= arrays["length"][:, None, None])
         if excluded.numbers:

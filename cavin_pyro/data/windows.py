@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
+from cavin_pyro.data.dataset import Arrays, check_distinct, check_new, iterate_shards, read_metadata
 from cavin_pyro.data.features import pointnet_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.storage.progress import progress_bar
@@ -100,18 +100,24 @@ def load_windows(
             "datasets with episodes of different length cannot be joined: "
             + ", ".join(f"{folder} has steps={steps}" for folder, steps in lengths.items())
         )
+    check_distinct(folders)
     names: tuple[str, ...] = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")
     total = sum(read_metadata(folder)["shards"] for folder in folders)
     held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     with progress_bar("reading", total=total, unit="file") as bar:
         for folder, held_out in zip(folders, held_out_of, strict=True):
-            needed = (*names, *held_out.required_arrays)
+            needed, seen = (*names, *held_out.required_arrays), set[int]()
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
+                check_new(folder, number, arrays["episode"], seen)
                 arrays["features"] = shard_features(folder, number, pointnet, fingerprint)
                 shards.append(held_out.filter_episodes(arrays))
                 bar.update()
-    episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in (*names, "features")}
-    return _find_windows(episodes, config, segment_length, seed, " and ".join(str(folder) for folder in folders))
+    where = " and ".join(str(folder) for folder in folders)
+    try:
+        episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in (*names, "features")}
+    except ValueError as error:
+        raise UserError(f"{where}: files with different numbers of objects cannot be joined ({error})") from error
+    return _find_windows(episodes, config, segment_length, seed, where)
 
 
 def _find_windows(episodes: Arrays, config: WindowConfig, segment_length: int, seed: int, folder: str) -> WindowTable:

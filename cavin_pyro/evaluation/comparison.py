@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.rows import violation
 from cavin_pyro.storage.run_directory import flat_options, stored_options
 
 SAME_SCENES = (
@@ -77,6 +78,9 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
         ) from error
     except (ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
+    if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):
+        why = "no list of episodes" if not isinstance(rows, list) else wrong
+        raise UserError(f"compare={folder} holds damaged results ({why}): evaluate it again")
     mine = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(mine) | set(theirs)):
         if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):

@@ -7,7 +7,6 @@ import math
 import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,10 +14,10 @@ from omegaconf import DictConfig
 
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
+from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 
-Row = dict[str, Any]
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
 
@@ -40,11 +39,15 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
             bar.update()
             successes = sum(one["outcome"] == "success" for one in rows.values())
             bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
-    return [rows[seed] for seed in sorted(rows)][: config.episodes]
+    return [rows[seed] for seed in range(config.seed, config.seed + config.episodes)]
 
 
 def begin(folder: Path) -> dict[int, Row]:
-    """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file."""
+    """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file.
+
+    Raises:
+        UserError: as `finished_episodes`.
+    """
     path = folder / EPISODES_FILE
     rows = finished_episodes(path)
     with atomic_write(path) as temporary:
@@ -83,19 +86,6 @@ def episode_row(episode: Episode) -> Row:
         "subgoal_distance": float(np.mean(reached)) if reached else None,
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }
-
-
-def finished_episodes(path: Path) -> dict[int, Row]:
-    """The rows of a file of episodes by their seeds, without lines that were cut off; none if there is no file."""
-    rows: dict[int, Row] = {}
-    if path.exists():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                row = json.loads(line)
-            except ValueError:
-                continue
-            rows[row["seed"]] = row
-    return rows
 
 
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process

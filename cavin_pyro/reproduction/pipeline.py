@@ -147,7 +147,7 @@ def _evaluate(
         rows[one][row["seed"]] = row
         append(evaluation_folder(home, one), row)
         bar.update(scale.episode_seconds / workers)
-    return {one: [found[seed] for seed in sorted(found)][: one.episodes] for one, found in rows.items()}
+    return {one: [found[one.seed + place] for place in range(one.episodes)] for one, found in rows.items()}
 
 
 def _configurations(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,12 +14,13 @@ from typing import Any
 from cavin_pyro.config.errors import UserError
 
 PARTIAL = ".partial"  # in the names of files that are being written
+OURS = ".cavin-"  # in the names of those that `atomic_write` makes, which alone are cleared away
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` at the end, or delete it on an error."""
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{PARTIAL}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}{OURS}{uuid.uuid4().hex[:8]}{PARTIAL}{path.suffix}")
     try:
         yield temporary
         with open(temporary, "rb") as written:
@@ -64,10 +66,16 @@ def output_folder(path: str | Path) -> Path:
         probe = folder / f".probe.{uuid.uuid4().hex[:8]}"
         probe.touch()
         probe.unlink()
-        for abandoned in folder.glob(f".*{PARTIAL}*"):
+        for abandoned in filter(_is_ours, folder.glob(f".*{OURS}*{PARTIAL}*")):
             abandoned.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(
             f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
         ) from error
     return folder
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether `atomic_write` made a file: users' own partial downloads may lie in the same folder."""
+    name = re.fullmatch(rf"\..+{re.escape(OURS)}[0-9a-f]{{8}}{re.escape(PARTIAL)}(\.[^.]+)?", path.name)
+    return name is not None and path.is_file() and not path.is_symlink()

@@ -77,7 +77,7 @@ def test_a_truncated_shard_is_named(share: float, own_pushes: Path) -> None:
 
 
 def test_a_shard_that_lacks_an_array_is_named(tmp_path: Path) -> None:
-    write_shard(tmp_path / "a.h5", {"centers": np.zeros(3)})
+    write_shard(tmp_path / "a.h5", {"centers": np.zeros((2, 4, 5, 3), np.float32)})
     with pytest.raises(UserError, match=r"a\.h5 is missing or corrupt \(.*clouds"):
         read_shard(tmp_path / "a.h5", ("centers", "clouds"))
 

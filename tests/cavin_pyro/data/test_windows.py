@@ -275,7 +275,7 @@ def test_intact_shards_of_a_damaged_dataset_are_used_with_skip_corrupt(
 
 def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
     arrays = episodes(60)
-    arrays["shape"] = np.random.default_rng(0).integers(3, size=(60, OBJECTS))
+    arrays["shape"] = np.random.default_rng(0).integers(3, size=(60, OBJECTS), dtype=np.int8)
     arrays["scale"] = np.ones((60, OBJECTS), np.float32)
     arrays["scale"][:20, 1] = 0.0  # padding, whatever its shape says
     there = arrays["scale"] > 0
@@ -299,7 +299,7 @@ def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
 
 def test_a_dataset_without_any_held_out_object_counts_in_full(tmp_path: Path) -> None:
     arrays, other = episodes(60), episodes(5)
-    arrays["shape"] = np.repeat(np.arange(60) % 2, OBJECTS).reshape(60, OBJECTS)
+    arrays["shape"] = np.repeat(np.arange(60, dtype=np.int8) % 2, OBJECTS).reshape(60, OBJECTS)
     arrays["scale"] = np.ones((60, OBJECTS), np.float32)
     first, second = write(tmp_path / "first", arrays), write(tmp_path / "second", other)
     write_metadata(second, {"configuration": {"steps": STEPS}, "shards": 1, "episodes": 5, "transitions": 0})

@@ -75,6 +75,21 @@ def test_an_output_folder_is_made_and_cleared_of_what_a_kill_left(tmp_path: Path
     assert {path.name for path in folder.iterdir()} == {"results.csv", "plan.png", ".hidden"}
 
 
+def test_partial_files_of_others_stay(tmp_path: Path) -> None:
+    names = (
+        ".video.mp4.partial",
+        ".film.0123abcd.partial.mkv",
+        ".notes.cavin-old.partial",
+        "a.partial",
+        ".b.partial.c",
+    )
+    for name in names:
+        (tmp_path / name).write_text("a user's")
+    (tmp_path / ".sawyer.cavin-0123abcd.partial").mkdir()
+    output_folder(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {*names, ".sawyer.cavin-0123abcd.partial"}
+
+
 def test_an_output_folder_below_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for place in ("file", "file/below"):

@@ -1,0 +1,101 @@
+"""The arrays of a shard, each declared once: type, shape and range, which are checked whenever a shard is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+
+FARTHEST = 100.0  # metres; the table ends before 1
+MOST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, "F": 4096}  # of each dimension
+
+
+@dataclass(frozen=True)
+class Declared:
+    """An array: its type, its dimensions (E episodes, S pushes, S+1 states, M objects, P points), and its range."""
+
+    dtype: str
+    dimensions: tuple[str | int, ...]
+    low: float = -FARTHEST
+    high: float = FARTHEST
+
+
+OBJECTS, PUSHES, STATES = ("E", "M"), ("E", "S"), ("E", "S+1", "M")
+ARRAYS = {
+    "centers": Declared("float32", (*STATES, 3)),
+    "clouds": Declared("float16", (*STATES, "P", 3)),
+    "visible": Declared("bool", STATES),
+    "mask": Declared("bool", OBJECTS),
+    "actions": Declared("float32", (*PUSHES, 4), -1.0, 1.0),
+    "moved": Declared("float32", (*PUSHES, "M"), 0.0),
+    **{name: Declared("bool", PUSHES) for name in ("unsafe", "ineffective", "fallen")},
+    "length": Declared("int64", ("E",), 0),
+    "target": Declared("int8", PUSHES, -1),
+    "angle": Declared("float32", PUSHES),
+    "shape": Declared("int8", OBJECTS, -1, 127),
+    "scale": Declared("float32", OBJECTS, 0.0),
+    "mass": Declared("float32", OBJECTS, 0.0),
+    "friction": Declared("float32", OBJECTS, 0.0),
+    "episode": Declared("int64", ("E",), 0, float("inf")),
+    "features": Declared("float32", (*STATES, "F"), -2.0, 2.0),
+}
+
+
+def check_file(file: h5py.File, *, steps: int | None, episodes: int | None) -> None:
+    """Check types and shapes of all declared arrays of a file, before any is read.
+
+    Args:
+        steps: S. episodes: E. None if they are not known; the arrays must agree with one another then.
+
+    Raises:
+        ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
+    """
+    sizes = {name: size for name, size in (("E", episodes), ("S", steps)) if size is not None}
+    for name in sorted(file, key=lambda one: list(ARRAYS).index(one) if one in ARRAYS else -1):
+        array = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+        if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external:
+            raise ValueError(f"{name} is no array in this file")
+        if name in ARRAYS:
+            _check_shape(name, array, sizes)
+
+
+def _check_shape(name: str, array: h5py.Dataset, sizes: dict[str, int]) -> None:
+    declared = ARRAYS[name]
+    if array.dtype != np.dtype(declared.dtype):
+        raise ValueError(f"{name} has type {array.dtype}, not {declared.dtype}")
+    if len(array.shape) == len(declared.dimensions):
+        for dimension, size in zip(declared.dimensions, array.shape, strict=True):
+            if dimension == "S+1":
+                sizes.setdefault("S", size - 1)
+            elif isinstance(dimension, str):
+                sizes.setdefault(dimension, size)
+    wanted = [_size(dimension, sizes) for dimension in declared.dimensions]
+    if list(array.shape) != wanted or any(size > MOST[one] for one, size in sizes.items()):
+        raise ValueError(f"{name} has shape {list(array.shape)}, not {wanted}")
+
+
+def _size(dimension: str | int, sizes: Mapping[str, int]) -> Any:
+    if dimension == "S+1" and "S" in sizes:
+        return sizes["S"] + 1
+    return sizes.get(dimension, dimension) if isinstance(dimension, str) else dimension
+
+
+def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Check that the values of declared arrays are finite and within their ranges.
+
+    Raises:
+        ValueError: some are not.
+    """
+    for name, array in arrays.items():
+        declared = ARRAYS.get(name)
+        if declared is None or array.dtype == np.bool_ or array.size == 0:
+            continue
+        low, high = array.min(), array.max()  # NaN if any is
+        if not (declared.low <= low and high <= declared.high):
+            raise ValueError(f"{name} has values outside of {declared.low:g} to {declared.high:g}: {low:g} to {high:g}")

@@ -1,0 +1,86 @@
+"""Finished episodes on disk: one line of JSON each, checked whenever they are read."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.rollout import OUTCOMES
+
+Row = dict[str, Any]
+
+
+def _count(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _outcome(value: Any) -> bool:
+    return value in OUTCOMES
+
+
+ALWAYS: dict[str, Callable[[Any], bool]] = {
+    "seed": _count,
+    "outcome": _outcome,
+    "steps": _count,
+    "return": _number,
+    "unsafe": _count,
+    "ineffective": _count,
+    "subgoal_distance": lambda value: value is None or _number(value),
+    "planning_ms": lambda value: isinstance(value, list) and all(_number(one) for one in value),
+}
+LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not write
+    "strict_outcome": _outcome,
+    "strict_steps": _count,
+    "strict_return": _number,
+    "plans": _count,
+    "hopeful_plans": _count,
+}
+
+
+def violation(row: Any) -> str | None:
+    """What makes a value no row of an episode; None if it is one."""
+    if not isinstance(row, Mapping):
+        return "it is no section"
+    if unknown := sorted(set(row) - {*ALWAYS, *LATER}):
+        return f"{unknown[0]!r} is unknown"
+    if missing := [name for name in ALWAYS if name not in row]:
+        return f"{missing[0]!r} is missing"
+    for name, value in row.items():
+        if not {**ALWAYS, **LATER}[name](value):
+            return f"{name} cannot be {json.dumps(value)[:40]}"
+    return None
+
+
+def finished_episodes(path: Path) -> dict[int, Row]:
+    """The rows of a file of episodes by their seeds, without lines that were cut off; none if there is no file.
+
+    Raises:
+        UserError: a line is JSON but no episode, or another episode has its seed; or the file cannot be read.
+    """
+    rows: dict[int, Row] = {}
+    if not path.exists():
+        return rows
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except ValueError as error:
+        raise UserError(f"{path} is damaged ({error}): move it away to run its episodes again") from error
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            continue  # cut off by a kill: its episode is run again
+        wrong = violation(row)
+        if wrong is None and rows.get(row["seed"], row) != row:
+            wrong = f"an earlier line has another episode with seed {row['seed']}"
+        if wrong is not None:
+            raise UserError(f"{path}, line {number} is no episode ({wrong}): delete that line to run it again")
+        rows[row["seed"]] = row
+    return rows
