@@ -16,6 +16,7 @@ class Guide(Program):
     """
 
     fits: ClassVar[tuple[str, ...]] = ()
+    amortized: ClassVar[bool] = True  # whether it infers any window; False: only those that it has parameters for
 
     def __init__(self, model: Model) -> None:
         """Raises `ValueError` for an incompatible model."""

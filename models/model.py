@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar
 
+import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
@@ -90,4 +91,9 @@ class Model(Program):
         if generate:
             generate_transitions(self.dynamics, self.encoder, self.scales, window.first, actions)
         else:
+            if actions is not window.actions and not torch.equal(actions, window.actions):
+                raise ValueError(
+                    "f reads the window's actions unless it generates, so the site actions cannot be conditioned or "
+                    "intervened on: put them into the window, or pass generate=True"
+                )
             observe_transitions(self.dynamics, self.scales, window, encoded)

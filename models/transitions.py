@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pyro
+import torch
 from torch import Tensor
 
 from models.likelihoods import Scales
@@ -57,5 +58,10 @@ def generate_transitions(
         samples.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
         state = samples[-1]._replace(features=unit(features))
     steps = stack_steps(samples)
-    pyro.deterministic("next_centers", steps.centers, event_dim=3)
-    pyro.deterministic("next_features", steps.features, event_dim=3)
+    for name, made in (("next_centers", steps.centers), ("next_features", steps.features)):
+        recorded = pyro.deterministic(name, made, event_dim=3)
+        if recorded is not made and not torch.equal(recorded, made):
+            raise ValueError(
+                f"{name} only records what generation has sampled, so it cannot be conditioned or intervened on: "
+                f"use {name}_1, ..., {name}_{len(samples)}"
+            )

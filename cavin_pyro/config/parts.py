@@ -11,6 +11,7 @@ import yaml
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from pyro.infer.autoguide import AutoGuide, AutoMessenger
 
 from cavin_pyro.config.constructors import OWN_PACKAGES
 from cavin_pyro.config.errors import UserError, at_least
@@ -99,10 +100,16 @@ def build_guide(config: Config, model: Model) -> Guide:
     """
     check_sizes("guide", config["guide"])
     target, kind = config["guide"].get("_target_"), class_of(config["guide"])
+    if isinstance(kind, type) and issubclass(kind, AutoGuide | AutoMessenger):
+        raise UserError(
+            f"guide {target} is an automatic guide: choose guide=auto_normal guide.autoguide._target_={target}"
+        )
     if isinstance(kind, type) and not issubclass(kind, Guide):
         raise UserError(f"guide {target} is no Pyro program: derive it from guides.guide.Guide")
     if kind is not None and model.name not in kind.fits:
-        choices = ", ".join(_guides_for(model.name)) or "none of ours"
+        choices = (
+            ", ".join(name for name, guide in _guide_presets().items() if model.name in guide.fits) or "none of ours"
+        )
         raise UserError(
             f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(kind.fits) or 'none'}): "
             f"choose guide= from {choices}"
@@ -118,13 +125,16 @@ def class_of(config: Config) -> Any:
         return None  # `construct` has a better message
 
 
-def _guides_for(model_name: str) -> list[str]:
-    """The choices of `guide=` that fit a model."""
-    names = []
+def amortized_guides(model_name: str) -> list[str]:
+    """The choices of `guide=` that fit a model and infer any window."""
+    return [name for name, guide in _guide_presets().items() if model_name in guide.fits and guide.amortized]
+
+
+def _guide_presets() -> dict[str, type[Guide]]:
+    """The classes of `guide=`."""
+    guides = {}
     presets = resources.files("cavin_pyro.config") / "presets" / "guide"
     for file in sorted(presets.iterdir(), key=lambda entry: entry.name):
         if file.name.endswith(".yaml"):
-            guide = class_of(yaml.safe_load(file.read_text(encoding="utf-8")))
-            if model_name in guide.fits:
-                names.append(file.name.removesuffix(".yaml"))
-    return names
+            guides[file.name.removesuffix(".yaml")] = class_of(yaml.safe_load(file.read_text(encoding="utf-8")))
+    return guides

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
-from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.data.dataset import content_fingerprint, read_metadata, with_current_names
 from cavin_pyro.data.windows import WindowTable, load_windows
@@ -90,6 +90,11 @@ def load_programs(checkpoint: Checkpoint, where: str | Path) -> tuple[Model, Gui
     guide = build_guide(checkpoint.config, model) if "guide" in checkpoint.config else None
     if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in checkpoint.tensors)):
         raise UserError(f"checkpoint {where} holds no guide: give one that train has written")
+    if not guide.amortized:
+        raise UserError(
+            f"checkpoint {where} has guide {type(guide).__name__}, with parameters for windows of its training alone: "
+            f"check infers others, so train with guide= one of {', '.join(amortized_guides(model.name))}"
+        )
     checkpoint.load_into("guide", guide, where)
     for program in (model, guide):
         program.requires_grad_(False).eval()

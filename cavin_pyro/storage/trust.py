@@ -12,6 +12,7 @@ from cavin_pyro.config.application import PACKAGES
 from cavin_pyro.config.errors import UserError
 
 OWN_MODULES = ("models", "guides")
+AUTOMATIC_GUIDES = "pyro.infer.autoguide"  # what guides/automatic.py holds; building one runs the model at most
 NEVER_SUGGESTED = {"cavin_pyro", *PACKAGES, *sys.stdlib_module_names}
 ANY = "models.model.Model"  # for sections that name no class
 LARGEST_SIZE = 4096  # of a number in a configuration that is not compared with the weights
@@ -60,7 +61,7 @@ def check_numbers(config: Any, path: Path, largest: int, place: str = "") -> Non
 
 
 def _check_target(target: Any, path: Path, trust: Sequence[str]) -> None:
-    if target is None or _is_class_of(str(target), OWN_MODULES):
+    if target is None or _is_class_of(str(target), (*OWN_MODULES, AUTOMATIC_GUIDES)):
         return
     top = str(target).split(".")[0]
     trusted = [module for module in trust if str(target).startswith(f"{module}.")]

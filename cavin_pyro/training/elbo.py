@@ -38,7 +38,9 @@ def window_terms(
         encoded: what the model's `encode` returns for this window; by default each program computes it.
 
     Returns:
-        `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`.
+        `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`. An
+        automatic guide of Pyro's has its density at auxiliary sites, each a term `kl_<site>` more: `[]` if one density
+        is that of all windows.
     """
     given = {} if encoded is None else {"encoded": encoded}
     with pyro.plate("particles", particles, dim=-2) if particles else nullcontext():
@@ -54,7 +56,10 @@ def window_terms(
             terms[f"nll_{name}"] = -site["log_prob"]
         else:
             terms[f"kl_{name}"] = guided.nodes[name]["log_prob"] - site["log_prob"]
-    return terms
+    auxiliary = {
+        name: site for name, site in guided.nodes.items() if site["type"] == "sample" and name not in joint.nodes
+    }
+    return terms | {f"kl_{name}": site["log_prob"] for name, site in auxiliary.items() if not site_is_subsample(site)}
 
 
 def substitute(program: Program, values: Mapping[str, Tensor]) -> Program:
@@ -81,7 +86,7 @@ def mean_terms(model: Program, guide: Program, window: Window, *, encoded: Tenso
     transitions = max(1, int(window.transition_mask.sum()))
     means = {}
     for name, value in elbo_terms(model, guide, window, encoded=encoded).items():
-        latent = name.partition("_")[2] in EFFECT_AND_MOTION_SITES
+        latent = name.startswith("kl_") or name.partition("_")[2] in EFFECT_AND_MOTION_SITES
         means[name] = value.item() / (sequences if latent else transitions)
     return means
 

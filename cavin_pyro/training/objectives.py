@@ -6,16 +6,26 @@ from collections.abc import Mapping
 from typing import Any
 
 from pyro import poutine
-from pyro.infer import ELBO, RenyiELBO
+from pyro.infer import (
+    ELBO,
+    JitTrace_ELBO,
+    JitTraceEnum_ELBO,
+    JitTraceGraph_ELBO,
+    JitTraceMeanField_ELBO,
+    RenyiELBO,
+    Trace_ELBO,
+)
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
 from cavin_pyro.training.counterfactual import counterfactual_loss
+from cavin_pyro.training.gradients import loss_with_gradients
 from guides.guide import Guide
 from models.model import Model
 from models.state import Window
 
 CODES = ("effect_code", "motion_code")
+COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanField_ELBO)
 
 
 class Objective:
@@ -56,18 +66,33 @@ class Objective:
             raise ValueError("objective.warm_up_steps and objective.counterfactual_weight must not be negative")
         if counterfactual_weight and elbo.num_particles != 1:
             raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
+        if counterfactual_weight and not hasattr(elbo, "differentiable_loss"):
+            raise ValueError(f"the counterfactual term takes objective.elbo Trace_ELBO, not {type(elbo).__name__}")
+        if isinstance(elbo, COMPILED):
+            raise ValueError(
+                f"objective.elbo {type(elbo).__name__} compiles with torch.jit.trace, which takes windows apart and "
+                "refuses the in-place layers of the networks: choose objective=trace_elbo"
+            )
         if isinstance(elbo, RenyiELBO) and (warm_up_steps or any(w != 1 for w in self.kl_weights.values())):
             raise ValueError(
                 "a Renyi bound has no KL terms to weight: leave objective.kl_weights and objective.warm_up_steps, "
                 "or choose objective=trace_elbo"
             )
 
-    def check(self, model: Model) -> None:
-        """Check that a model is compatible with this objective.
+    def check(self, model: Model, guide: Guide | None = None) -> None:
+        """Check that a model, and a guide, are compatible with this objective.
 
         Raises:
-            ValueError: it generates no actions, but there is a counterfactual term.
+            ValueError: the model generates no actions, but there is a counterfactual term; or the guide has parameters
+                for each window, but the bound is none that takes its auxiliary sites into account.
         """
+        if guide is not None and not guide.amortized:
+            weighted = self.warm_up_steps or any(weight != 1 for weight in self.kl_weights.values())
+            if type(self.elbo) is not Trace_ELBO or weighted:
+                raise ValueError(
+                    f"guide {type(guide).__name__} samples auxiliary sites, which this objective leaves out: "
+                    "choose objective=trace_elbo, without objective.kl_weights and objective.warm_up_steps"
+                )
         if self.counterfactual_weight and not model.codes:
             raise ValueError(
                 f"objective counterfactual needs a model that generates actions, and {type(model).__name__} does not: "
@@ -87,7 +112,7 @@ class Objective:
 
     def bind(self, model: Model, guide: Guide) -> BoundObjective:
         """The loss of one model and guide, as a module with the parameters of both."""
-        self.check(model)
+        self.check(model, guide)
         return BoundObjective(self, model, guide)
 
 
@@ -107,6 +132,8 @@ class BoundObjective(nn.Module):
         if any(weight != 1.0 for weight in weights.values()):
             model, guide = _Weighted(weights)(model), _Weighted(weights)(guide)
         bound: Any = objective.elbo
+        if not hasattr(bound, "differentiable_loss"):
+            return loss_with_gradients(bound, model, guide, window, list(self.parameters()))
         encoded = self.model.encode(window)  # once for both programs
         if not objective.counterfactual_weight:
             return bound.differentiable_loss(model, guide, window, encoded=encoded)

@@ -7,8 +7,9 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.errors import user_input
 from cavin_pyro.config.options import configured
-from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import find_checkpoint, save_checkpoint
 from cavin_pyro.storage.files import output_folder, write_json
@@ -17,7 +18,7 @@ from cavin_pyro.storage.run_directory import check_same_data, check_same_run, wr
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.factory import build_objective, data_folders
 from cavin_pyro.training.provenance import training_provenance
-from cavin_pyro.training.trainer import Trainer
+from cavin_pyro.training.trainer import Trainer, fixed_windows
 from envs.workspace import MAXIMUM_OBJECTS
 
 
@@ -47,8 +48,19 @@ def train(config: DictConfig) -> Trainer:
         seed=config.seed,
         skip_corrupt=config.skip_corrupt,
     )
-    check_compatibility(model, guide, windows.batch(windows.training[:2]))
-    print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
+    with user_input():
+        objective.check(model, guide)
+    if guide.amortized:
+        check_compatibility(model, guide, windows.batch(windows.training[:2]))
+        print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
+    else:
+        count = len(fixed_windows(windows, config.trainer.batch_size, config.seed))
+        others = ", ".join(amortized_guides(model.name))
+        print(
+            f"{count} of {len(windows.training)} training windows (trainer.batch_size), for validation too: guide "
+            f"{type(guide).__name__} has parameters for each window, which batches of other windows cannot train; "
+            f"guides that infer any window: {others}"
+        )
 
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("data", "output"))

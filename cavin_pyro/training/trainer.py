@@ -10,7 +10,7 @@ import csv
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,10 @@ class Trainer:
         self.model, self.guide, self.windows = model, guide, windows
         self.config = config = config or TrainerConfig()
         self.folder, self._save = folder, save
+        # A guide that infers no other windows is fitted to one batch, for good.
+        self._fixed = None if guide.amortized else fixed_windows(windows, config.batch_size, seed)
+        if self._fixed is not None:
+            guide(windows.batch(self._fixed))  # makes its parameters
         self._loss = objective.bind(model, guide)
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=config.learning_rate, fused=True)
         self._batches = torch.Generator().manual_seed(seed)
@@ -103,17 +107,19 @@ class Trainer:
 
     def _check_programs(self) -> None:
         """Let Pyro validate model and guide once, instead of in every step."""
-        with torch.random.fork_rng(devices=[]), torch.no_grad():
-            self._loss(self.windows.batch(self.windows.training[:2]), self.step)
+        with torch.random.fork_rng(devices=[]):  # with gradients, which TraceEnum_ELBO demands
+            self._loss(self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed), self.step)
 
     def _update(self) -> float:
         config = self.config
-        numbers = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
+        numbers = self._fixed
+        if numbers is None:
+            numbers = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
         window = self.windows.batch(numbers)
         for group in self._optimizer.param_groups:
             group["lr"] = config.rate(self.step)
         self._optimizer.zero_grad(set_to_none=True)
-        loss = self._loss(window, self.step) / config.batch_size
+        loss = self._loss(window, self.step) / len(numbers)
         if not math.isfinite(loss.item()):
             self._stop_at(first_nonfinite(elbo_terms(self.model, self.guide, window)) or "loss")
         loss.backward()
@@ -153,7 +159,8 @@ class Trainer:
         numbers = self.windows.validation
         chosen = numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))]
         totals: Row = {}
-        loss, parts = 0.0, chosen[: self.config.validation_windows].split(1024)
+        parts: Sequence[Tensor] = chosen[: self.config.validation_windows].split(1024)
+        loss, parts = 0.0, parts if self._fixed is None else [self._fixed]
         with torch.random.fork_rng(devices=[]), torch.no_grad(), pyro.validation_enabled(False):
             torch.manual_seed(0)
             for part in parts:
@@ -206,6 +213,13 @@ class Trainer:
         self.rows = [row for row in read_rows(self.folder / "metrics.csv") if row["step"] <= step]
         self._batches.set_state(tensors["batches"])
         torch.set_rng_state(tensors["random"])
+
+
+def fixed_windows(windows: WindowTable, count: int, seed: int) -> Tensor:
+    """Numbers of at most `count` training windows that count for all terms, the same ones for the same seed."""
+    counted = windows.training[windows.sequence_mask[windows.training]]
+    order = torch.randperm(len(counted), generator=torch.Generator().manual_seed(seed))
+    return counted[order[:count]]
 
 
 @contextmanager

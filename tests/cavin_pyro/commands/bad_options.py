@@ -40,12 +40,13 @@ BAD_OPTIONS = [
     ("plan", "env.ranges.target=[fork]", "unknown object 'fork' in env.ranges.target: choose from sugar_box"),
     ("plan", "env.ranges.names=mug", "env.ranges.names must be a list, not mug"),
     ("train", "model=nonsense", "unknown model 'nonsense': choose from cascaded"),
-    ("train", "guide=nonsense", "unknown guide 'nonsense': choose from cascaded"),
+    ("train", "guide=nonsense", "unknown guide 'nonsense': choose from auto_iaf, auto_low_rank, auto_normal, cascaded"),
     ("train", "prior=nonsense", "unknown prior 'nonsense': choose from conditional, flow, standard"),
     (
         "train",
         "objective=nonsense",
-        "unknown objective 'nonsense': choose from counterfactual, iwae, mean_field_elbo, trace_elbo",
+        "unknown objective 'nonsense': choose from counterfactual, iwae, mean_field_elbo, renyi, "
+        "trace_elbo, trace_enum_elbo, trace_graph_elbo",
     ),
     ("train", "trainer.schedule=linear", "unknown trainer.schedule 'linear': choose from constant, cosine"),
     ("evaluate", "task=juggling", f"choose from {', '.join(TASKS)}"),

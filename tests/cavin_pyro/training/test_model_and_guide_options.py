@@ -59,7 +59,10 @@ def test_codes_have_the_dimensions_of_the_paper(name: str) -> None:
     assert (model.name, found) == (name, CODES[name])
 
 
-@pytest.mark.parametrize("guide", preset_names("guide"))
+AUTOMATIC = [name for name in preset_names("guide") if name.startswith("auto_")]
+
+
+@pytest.mark.parametrize("guide", [name for name in preset_names("guide") if name not in AUTOMATIC])
 @pytest.mark.parametrize("name", TERMS)
 def test_a_model_and_guide_have_the_terms_of_the_model_or_are_refused(name: str, guide: str) -> None:
     config = configuration(f"model={name}", f"guide={guide}")
@@ -84,6 +87,25 @@ def test_a_model_and_guide_have_the_terms_of_the_model_or_are_refused(name: str,
     assert sum(value.item() for value in terms.values()) == pytest.approx(loss.item(), rel=1e-5)
     counts = {term: 13 if term in DYNAMICS else 4 for term in terms}
     assert means == pytest.approx({term: value.item() / counts[term] for term, value in terms.items()}, rel=1e-4)
+
+
+@pytest.mark.parametrize("guide", AUTOMATIC)
+def test_automatic_guides_are_built_by_option_and_refused_where_there_are_no_codes(guide: str) -> None:
+    config = configuration(f"guide={guide}")
+    built = build_guide(config, build_model(config))
+    assert type(built.automatic).__name__ == config.guide.autoguide._target_.rpartition(".")[2]
+    assert not built.amortized
+    with pytest.raises(UserError, match="does not fit model DynamicsModel .* choose guide= from none$"):
+        build_guide(config, build_model(configuration("model=dynamics", "guide=none")))
+
+
+def test_any_automatic_guide_can_be_named_and_one_in_the_wrong_place_says_where() -> None:
+    target = "pyro.infer.autoguide.AutoStructured"
+    model = build_model(configuration())
+    built = build_guide(configuration("guide=auto_normal", f"guide.autoguide._target_={target}"), model)
+    assert type(built.automatic).__name__ == "AutoStructured"
+    with pytest.raises(UserError, match=f"choose guide=auto_normal guide.autoguide._target_={target}"):
+        build_guide(configuration("guide=none", f"guide._target_={target}"), model)
 
 
 def guide_class(option: str) -> str:

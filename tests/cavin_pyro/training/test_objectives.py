@@ -6,7 +6,15 @@ import pyro
 import pytest
 import torch
 from pyro import poutine
-from pyro.infer import RenyiELBO, Trace_ELBO, TraceMeanField_ELBO
+from pyro.infer import (
+    JitTrace_ELBO,
+    RenyiELBO,
+    ReweightedWakeSleep,
+    Trace_ELBO,
+    TraceEnum_ELBO,
+    TraceGraph_ELBO,
+    TraceMeanField_ELBO,
+)
 from torch import Tensor, nn
 
 from cavin_pyro.training.counterfactual import counterfactual_loss
@@ -121,6 +129,39 @@ def particle_losses(programs: tuple, window: Window, particles: int) -> Tensor:
     return torch.stack(losses).view(particles, len(window.actions))
 
 
+@pytest.mark.parametrize("bound", [TraceGraph_ELBO, TraceEnum_ELBO])
+def test_other_estimators_of_the_bound_give_its_value_and_gradients(
+    programs: tuple, window: Window, bound: type[TraceGraph_ELBO]
+) -> None:
+    """All codes are reparameterised, none is discrete, so nothing is left for these to do in another way."""
+    options = {"strict_enumeration_warning": False} if bound is TraceEnum_ELBO else {}
+    objective = Objective(bound(max_plate_nesting=1, **options), kl_weights={"motion_code": 3.0})
+    loss = loss_at(objective, programs, window)
+    expected = loss_at(Objective(Trace_ELBO(max_plate_nesting=1), kl_weights={"motion_code": 3.0}), programs, window)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-9)
+    assert_same_gradients(loss, expected, programs)
+
+
+def test_pyros_own_renyi_bound_has_our_gradients(programs: tuple, window: Window) -> None:
+    options = {"num_particles": 4, "vectorize_particles": True, "max_plate_nesting": 1}
+    loss = loss_at(Objective(RenyiELBO(alpha=0.5, **options)), programs, window)
+    expected = loss_at(Objective(DifferentiableRenyiELBO(alpha=0.5, **options)), programs, window)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-9)
+    assert_same_gradients(loss, expected, programs)
+
+
+def test_a_bound_with_gradients_of_its_own_leaves_those_that_exist(programs: tuple, window: Window) -> None:
+    bound = ReweightedWakeSleep(num_particles=2, vectorize_particles=True, max_plate_nesting=1)
+    bias = programs[0].dynamics.change.head.bias
+    bias.grad = torch.ones_like(bias)
+    loss = loss_at(Objective(bound), programs, window)
+    assert torch.equal(bias.grad, torch.ones_like(bias))
+    assert any(bool(gradient.abs().max() > 0) for gradient in gradients(loss, programs))
+    with torch.no_grad():
+        assert loss_at(Objective(bound), programs, window).isfinite()
+    assert not list(pyro.get_param_store())
+
+
 @pytest.mark.parametrize("alpha", [0.0, 0.5])
 def test_the_renyi_bound_is_taken_window_by_window(programs: tuple, window: Window, alpha: float) -> None:
     bound = DifferentiableRenyiELBO(alpha=alpha, num_particles=3, vectorize_particles=True, max_plate_nesting=1)
@@ -189,6 +230,8 @@ def test_the_counterfactual_term_uses_the_codes_of_the_bound(programs: tuple, wi
         ({"elbo": Trace_ELBO(num_particles=2), "counterfactual_weight": 1.0}, "takes one particle, not 2"),
         ({"elbo": RenyiELBO(), "kl_weights": {"effect_code": 0.5}}, "has no KL terms to weight"),
         ({"elbo": RenyiELBO(), "warm_up_steps": 10}, "has no KL terms to weight"),
+        ({"elbo": JitTrace_ELBO()}, "JitTrace_ELBO compiles with torch.jit.trace, .* choose objective=trace_elbo"),
+        ({"elbo": TraceGraph_ELBO(), "counterfactual_weight": 1.0}, "takes objective.elbo Trace_ELBO"),
     ],
 )
 def test_an_invalid_objective_is_refused(options: dict, said: str) -> None:

@@ -1,0 +1,43 @@
+"""Bounds of Pyro that compute their gradients themselves, as a loss that torch can differentiate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pyro
+import torch
+from pyro.infer import TraceGraph_ELBO
+from torch import Tensor, nn
+
+from models.state import Window
+
+
+def loss_with_gradients(
+    elbo: Any, model: Any, guide: Any, window: Window, parameters: Sequence[nn.Parameter]
+) -> Tensor:
+    """A scalar with the value of `elbo.loss_and_grads` and its gradients, summed over the windows `[B]`.
+
+    `TraceGraph_ELBO`, `RenyiELBO` and `ReweightedWakeSleep` have no `differentiable_loss`. The last two look for
+    parameters in Pyro's store, so this opens an empty one for the call. Of several losses the first is the value.
+    `elbo` is one of Pyro's `ELBO`, whose base class declares neither method.
+    """
+    before = [parameter.grad for parameter in parameters]
+    local = isinstance(elbo, TraceGraph_ELBO)
+    with pyro.settings.context(module_local_params=local), pyro.get_param_store().scope():
+        if not torch.is_grad_enabled():
+            found = elbo.loss(model, guide, window)
+            return torch.as_tensor(found[0] if isinstance(found, tuple) else found)
+        for parameter in parameters:
+            parameter.grad = None
+        found = elbo.loss_and_grads(model, guide, window)
+    gradients = [parameter.grad for parameter in parameters]
+    for parameter, kept in zip(parameters, before, strict=True):
+        parameter.grad = kept
+    # Zero, with these gradients.
+    carrier = sum(
+        ((parameter - parameter.detach()) * gradient).sum()
+        for parameter, gradient in zip(parameters, gradients, strict=True)
+        if gradient is not None
+    )
+    return carrier + (found[0] if isinstance(found, tuple) else found)

@@ -1,0 +1,65 @@
+"""Pyro's automatic guides, for a fixed set of windows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from pyro import poutine
+from torch import Tensor, nn
+
+from guides.guide import Guide
+from models.model import Model
+from models.state import Window
+
+
+class AutomaticGuide(Guide):
+    """One of `pyro.infer.autoguide`: it reads the model's sites and has parameters for every window on its own.
+
+    The other guides compute q(c, z | window) with a network, so they infer any window. This one holds the posteriors of
+    the windows of its first call as numbers: it fits those windows and no others, and cannot be trained on batches.
+    `AutoNormal` and `AutoDelta` treat the windows apart; `AutoLowRankMultivariateNormal`, `AutoIAFNormal` and other
+    subclasses of `AutoContinuous` have one density over the codes of all windows.
+    """
+
+    fits = ("cascaded", "single_latent", "flat")
+    amortized = False
+
+    def __init__(self, model: Model, *, autoguide: Callable[[Model], nn.Module]) -> None:
+        """`autoguide`: a class of `pyro.infer.autoguide`, or one of your own that takes the model.
+
+        Raises `ValueError` for an incompatible model, or a class that is no module.
+        """
+        super().__init__(model)
+        self.automatic = autoguide(model)
+        if not isinstance(self.automatic, nn.Module):
+            raise ValueError(f"guide.autoguide makes a {type(self.automatic).__name__}, which is no torch module")
+        self.register_buffer("fixed_actions", None)
+
+    def fix(self, window: Window) -> None:
+        """Make the parameters for `window: [B]`. The first call of the guide does so too.
+
+        Raises `ValueError` if a window does not count (`sequence_mask`), because Pyro's automatic guides know no masks.
+        """
+        if not bool(window.sequence_mask.all()):
+            raise ValueError("an automatic guide takes windows that all count: see sequence_mask")
+        with torch.no_grad():
+            self.automatic(window)
+        self.fixed_actions = window.actions.clone()
+
+    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> Any:
+        """`window: [B]`, those of the first call. Raises `ValueError` for others."""
+        if self.fixed_actions is None:
+            self.fix(window)
+        elif not torch.equal(self.fixed_actions, window.actions):
+            raise ValueError(
+                f"this automatic guide has parameters for {len(self.fixed_actions)} windows, and these are others: "
+                "make one for each set of windows, or choose a guide that infers any window"
+            )
+        with poutine.block(hide_fn=_is_observed):  # `AutoMessenger` runs the model, whose observations are no guide's
+            return self.automatic(window)
+
+
+def _is_observed(site: Any) -> bool:
+    return site["type"] == "sample" and site["is_observed"]

@@ -1,0 +1,100 @@
+"""Pyro's automatic guides by option: posteriors of a fixed set of windows, as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+import torch
+from pyro.infer import Trace_ELBO
+from pyro.infer.autoguide import AutoDelta, AutoIAFNormal, AutoLowRankMultivariateNormal, AutoNormal, AutoStructured
+
+from cavin_pyro.training.elbo import elbo_terms, window_terms
+from guides.automatic import AutomaticGuide
+from models.cascaded import CascadedModel
+from models.dynamics_only import DynamicsModel
+from models.flat import FlatModel
+from models.model import Model
+from models.single_latent import SingleLatentModel
+from models.state import Window
+from tests.guides.pairs import make_model
+
+FAMILIES = [AutoNormal, AutoDelta, AutoLowRankMultivariateNormal, AutoIAFNormal, AutoStructured]
+
+
+@pytest.fixture
+def counted(random_window: Callable[..., Window]) -> Window:
+    """Windows that all count."""
+    window = random_window(batch=6)
+    return window._replace(sequence_mask=torch.ones(6, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("model", "family"),
+    [(CascadedModel, family) for family in FAMILIES] + [(SingleLatentModel, AutoNormal), (FlatModel, AutoIAFNormal)],
+)
+def test_its_terms_are_those_of_pyros_bound_and_it_learns(
+    model: type[Model], family: type[AutoNormal], counted: Window
+) -> None:
+    program = make_model(model)
+    guide = AutomaticGuide(program, autoguide=partial(family))
+    guide(counted)
+    loss = Trace_ELBO(max_plate_nesting=1)(program, guide)
+    torch.manual_seed(3)
+    expected = loss(counted).item()
+    torch.manual_seed(3)
+    terms = elbo_terms(program, guide, counted)
+    assert sum(term.item() for term in terms.values()) == pytest.approx(expected, rel=1e-5)
+    assert {name for name in terms if name.startswith("kl_")} >= {f"kl_{code}" for code in program.codes}
+    optimizer = torch.optim.Adam(guide.parameters(), lr=1e-2)
+    for _ in range(15):
+        optimizer.zero_grad()
+        loss(counted).backward()
+        optimizer.step()
+    torch.manual_seed(3)
+    assert loss(counted).item() < expected
+
+
+def test_it_has_parameters_for_each_window_and_none_for_others(counted: Window) -> None:
+    guide = AutomaticGuide(make_model(CascadedModel), autoguide=partial(AutoNormal))
+    guide(counted)
+    shapes = {tuple(parameter.shape) for parameter in guide.parameters()}
+    assert shapes == {(6, 5), (6, 4)}
+    for other in (counted.map(lambda field: field[:2]), counted.map(lambda field: field.flip(0))):
+        with pytest.raises(ValueError, match="has parameters for 6 windows, and these are others"):
+            guide(other)
+
+
+def test_windows_that_do_not_count_are_refused(random_window: Callable[..., Window]) -> None:
+    guide = AutomaticGuide(make_model(CascadedModel), autoguide=partial(AutoNormal))
+    with pytest.raises(ValueError, match="takes windows that all count"):
+        guide(random_window())
+
+
+def test_it_fits_models_with_codes() -> None:
+    with pytest.raises(ValueError, match="guide AutomaticGuide does not fit model DynamicsModel"):
+        AutomaticGuide(make_model(DynamicsModel), autoguide=partial(AutoNormal))
+    with pytest.raises(ValueError, match="which is no torch module"):
+        AutomaticGuide(make_model(CascadedModel), autoguide=lambda model: 3)
+
+
+def test_a_window_on_its_own_is_fitted_at_least_as_well_as_by_an_untrained_network(counted: Window) -> None:
+    """What the automatic guide is for: the best Gaussian of each window, which no network has to amortise."""
+    program = make_model(CascadedModel).requires_grad_(False)
+    guide = AutomaticGuide(program, autoguide=partial(AutoNormal, init_scale=1.0))
+    guide(counted)
+
+    def loss_per_window() -> torch.Tensor:
+        torch.manual_seed(0)
+        terms = window_terms(program, guide, counted, particles=20)
+        return torch.stack(list(terms.values())).sum(0).mean(0)
+
+    before = loss_per_window().detach()
+    optimizer = torch.optim.Adam(guide.parameters(), lr=5e-2)
+    for _ in range(20):
+        optimizer.zero_grad()
+        loss_per_window().sum().backward()
+        optimizer.step()
+    assert before.shape == (6,)
+    assert (loss_per_window() < before).all()
