@@ -12,7 +12,10 @@ def main(config: DictConfig) -> None:
     """Check a trained model and its guide on held-out windows, and write a report; resumes an interrupted run."""
     import pyro
 
+    from cavin_pyro.config.parts import check_sizes
     from cavin_pyro.criticism.checks.consistency import check_objects
+    from cavin_pyro.criticism.export import check_export, write_samples
+    from cavin_pyro.criticism.graph import program_graph
     from cavin_pyro.criticism.loading import load_context
     from cavin_pyro.criticism.report import write_report
     from cavin_pyro.criticism.sections import choose_sections, run_sections
@@ -22,17 +25,22 @@ def main(config: DictConfig) -> None:
 
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     names = choose_sections(config.sections, config.sizes)
+    export = check_export(config.export)
+    check_sizes("sizes.export", config.sizes.export)
     context, about = load_context(config)
     if "consistency" in names:  # before anything is written
         check_objects(context, config.sizes.consistency.objects)
     folder = output_folder(config.output)
-    check_same_run(folder, config, ignore=("output", "sections"))
+    check_same_run(folder, config, ignore=("output", "sections", "export"))
     write_config(folder, config)
+    if export:
+        write_samples(context, export, about, windows=config.sizes.export.windows, samples=config.sizes.export.samples)
+        print(f"written: {export}")
     # A section of an earlier run is reused if a new run would give the same result.
     data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
     fingerprint = " ".join([program_fingerprint(), about["weights"], *data])
     parts = run_sections(names, context, config.sizes, folder, fingerprint)
-    write_report(folder, about, parts)
+    write_report(folder, {**about, "graph": program_graph(context.model, context.validation)}, parts)
     for part in parts:
         print("\n  ".join([part["title"], *part["findings"]]))
     print(f"written: {folder / 'report.html'}")

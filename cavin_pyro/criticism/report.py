@@ -4,7 +4,8 @@ Keys of report.json:
 
     about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`,
                 `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
-                `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check)
+                `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check),
+                `graph` of the program (see `cavin_pyro.criticism.graph`)
     sections    by name: `title`, `findings` (sentences) and `values`, which the section's function documents
 
 Floats have six significant digits; non-finite numbers are null.

@@ -33,5 +33,10 @@ class CheckConfig:
     seed: int = seed_option(group="run")
     windows: int = option(1000, "held-out windows, and as many training windows", minimum=1, group="data")
     sections: Any = option(None, "sections of the report, [elbo,consistency]; by default all", group="run")
+    export: str | None = option(
+        None,
+        "file.nc for samples of prior, guide and predictions as ArviZ's DataTree; needs the extra .[export]",
+        group="run",
+    )
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
