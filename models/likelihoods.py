@@ -11,6 +11,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from models.isotropic_normal import IsotropicNormal
+from models.isotropic_student import IsotropicStudentT
 from models.state import State
 
 
@@ -22,14 +23,19 @@ class Scales:
     start: float | Tensor  # normalised
     motion: float | Tensor  # normalised
 
-    def centers(self, mean: State, mask: Tensor, *, event_dims: int = 1) -> TorchDistribution:
+    def centers(
+        self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
+    ) -> TorchDistribution:
         """Observed centers around `mean`: event `[M, 3]`, or `[T, M, 3]` for `event_dims=2`.
 
-        `mask: [..., M]`: objects that count; others (padding) do not contribute.
+        `mask: [..., M]`: objects that count; others (padding) do not contribute. `predicted: [..., M, 2]`, scales of
+        centres (metres) and features that the network of the mean predicts; only `PredictedScales` reads them.
         """
         return _masked_normal(mean.centers, self.center, mask, event_dims)
 
-    def features(self, mean: State, mask: Tensor, *, event_dims: int = 1) -> TorchDistribution:
+    def features(
+        self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
+    ) -> TorchDistribution:
         """Observed features around `mean`: event `[M, F]`, or `[T, M, F]` for `event_dims=2`."""
         return _masked_normal(mean.features, self.feature, mask, event_dims)
 
@@ -47,6 +53,32 @@ class LikelihoodScales(Scales):
     feature: float = 0.1  # of a vector of unit length
     start: float = 0.077  # normalised
     motion: float = 0.245  # normalised
+
+
+@dataclass(frozen=True)
+class PredictedScales(LikelihoodScales):
+    """Scales of f that depend on state and push, predicted by its network, with heavy tails; fixed ones for h and g.
+
+    f's likelihoods are Student's t around its means: most outcomes are nearly certain, and some objects topple or roll.
+    """
+
+    degrees_of_freedom: float = 3.0
+
+    def centers(
+        self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
+    ) -> TorchDistribution:
+        if predicted is None:
+            return super().centers(mean, mask, event_dims=event_dims)
+        student = IsotropicStudentT(self.degrees_of_freedom, mean.centers, predicted[..., 0])
+        return student.mask(mask).to_event(event_dims)
+
+    def features(
+        self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
+    ) -> TorchDistribution:
+        if predicted is None:
+            return super().features(mean, mask, event_dims=event_dims)
+        student = IsotropicStudentT(self.degrees_of_freedom, mean.features, predicted[..., 1])
+        return student.mask(mask).to_event(event_dims)
 
 
 class LearnedScales(Scales, nn.Module):

@@ -9,8 +9,8 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from models.likelihoods import LikelihoodScales, Scales
-from models.networks.dynamics import Dynamics
+from models.likelihoods import LikelihoodScales, PredictedScales, Scales
+from models.networks.dynamics import Dynamics, PushOutcome
 from models.networks.encoder import StateEncoder
 from models.program import Program
 from models.state import State, Window
@@ -55,8 +55,12 @@ class Model(Program):
         width: int = 64,
         maximum_objects: int = 5,
         scales: Scales | None = None,
+        dynamics: PushOutcome | None = None,
     ) -> None:
-        """T; numbers per object of a point-cloud feature; width of all layers; M at most; the likelihoods' scales."""
+        """T; numbers per object of a point-cloud feature; width of all layers; M at most; the likelihoods' scales; f.
+
+        Raises `ValueError` for scales that f must predict if it does not.
+        """
         super().__init__()
         self.segment_length = segment_length
         self.feature_dimension = feature_dimension
@@ -64,14 +68,18 @@ class Model(Program):
         self.maximum_objects = maximum_objects
         self.scales = scales or LikelihoodScales()
         self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects)
-        self.dynamics = Dynamics(feature_dimension=feature_dimension, width=width)
+        self.dynamics: PushOutcome = dynamics or Dynamics(feature_dimension=feature_dimension, width=width)
+        if isinstance(self.scales, PredictedScales) and not self.dynamics.predicts_scales:
+            raise ValueError("scales=predicted needs an f that predicts them: dynamics=contact")
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
-        return self.dynamics(state, self.encoder(state), action)
+        return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
     def encode(self, window: Window, generate: bool = False) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
+
+        The others are needed by f alone, if it reads them and the next states are observed.
 
         Raises `ValueError` for windows of another shape, more objects or features of another length.
         """
@@ -81,7 +89,8 @@ class Model(Program):
             raise ValueError(
                 f"window has {window.segment_length} pushes; this model was made for {self.segment_length}"
             )
-        return self.encoder(window.states.step(slice(0, 1) if generate else slice(0, -1)))
+        first_only = generate or not self.dynamics.reads_encoding
+        return self.encoder(window.states.step(slice(0, 1) if first_only else slice(0, -1)))
 
     def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
         """The sites of f, observed, or sampled from the first states (see `models/transitions.py`).

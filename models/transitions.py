@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pyro
 import torch
 from torch import Tensor
 
 from models.likelihoods import Scales
-from models.networks.dynamics import Dynamics
+from models.networks.dynamics import PushOutcome
 from models.networks.encoder import StateEncoder
 from models.networks.layers import unit
 from models.state import State, Window, stack_steps
@@ -25,7 +27,7 @@ def sample_subgoal(scales: Scales, mean: State, window: Window, generate: bool) 
     pyro.sample("subgoal_features", scales.features(mean, counted), obs=None if generate else last.features)
 
 
-def observe_transitions(dynamics: Dynamics, scales: Scales, window: Window, encoded: Tensor) -> None:
+def observe_transitions(dynamics: PushOutcome, scales: Scales, window: Window, encoded: Tensor) -> None:
     """s_t+1 ~ f(. | s_t, a_t) at the T observed transitions of `window: [B]`, all at once.
 
     Sites next_centers, event `[T, M, 3]`, and next_features, event `[T, M, F]`. They count the transitions
@@ -35,14 +37,14 @@ def observe_transitions(dynamics: Dynamics, scales: Scales, window: Window, enco
         encoded: `[B, T, M, 3 * width]`, features of the T states before each push.
     """
     before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
-    mean = dynamics(before, encoded, window.actions)
+    mean, predicted = _outcome(dynamics, before, encoded, window.actions)
     counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
-    pyro.sample("next_centers", scales.centers(mean, counted, event_dims=2), obs=after.centers)
-    pyro.sample("next_features", scales.features(mean, counted, event_dims=2), obs=after.features)
+    pyro.sample("next_centers", scales.centers(mean, counted, event_dims=2, **predicted), obs=after.centers)
+    pyro.sample("next_features", scales.features(mean, counted, event_dims=2, **predicted), obs=after.features)
 
 
 def generate_transitions(
-    dynamics: Dynamics, encoder: StateEncoder, scales: Scales, state: State, actions: Tensor
+    dynamics: PushOutcome, encoder: StateEncoder, scales: Scales, state: State, actions: Tensor
 ) -> None:
     """Sample s_t+1 ~ f(. | s_t, a_t) push by push from `state: [B]` under `actions: [..., B, T, 4]`.
 
@@ -52,9 +54,10 @@ def generate_transitions(
     """
     samples = []
     for step, action in enumerate(actions.unbind(-2), start=1):
-        mean = dynamics(state, encoder(state), action)
-        centers = pyro.sample(f"next_centers_{step}", scales.centers(mean, state.mask))
-        features = pyro.sample(f"next_features_{step}", scales.features(mean, state.mask))
+        encoded = encoder(state) if dynamics.reads_encoding else None
+        mean, predicted = _outcome(dynamics, state, encoded, action)
+        centers = pyro.sample(f"next_centers_{step}", scales.centers(mean, state.mask, **predicted))
+        features = pyro.sample(f"next_features_{step}", scales.features(mean, state.mask, **predicted))
         samples.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
         state = samples[-1]._replace(features=unit(features))
     steps = stack_steps(samples)
@@ -65,3 +68,11 @@ def generate_transitions(
                 f"{name} only records what generation has sampled, so it cannot be conditioned or intervened on: "
                 f"use {name}_1, ..., {name}_{len(samples)}"
             )
+
+
+def _outcome(
+    dynamics: PushOutcome, state: State, encoded: Tensor | None, action: Tensor
+) -> tuple[State, dict[str, Any]]:
+    """The mean of f, and `predicted` for `Scales` where f predicts scales."""
+    mean, predicted = dynamics.outcome(state, encoded, action)
+    return mean, {} if predicted is None else {"predicted": predicted}

@@ -14,7 +14,11 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import kind, shown
 
 OWN_PACKAGES = ("cavin_pyro", "models", "guides", "planning", "envs")
-GIVEN = {"prior": ("dimension", "feature_dimension", "effect_dimension")}  # which `build_model` gives, by group
+GIVEN = {  # which `build_model` gives, by group
+    "prior": ("dimension", "feature_dimension", "effect_dimension"),
+    "geometry": ("feature_dimension",),
+    "dynamics": ("feature_dimension", "width"),
+}
 PLAIN = (bool, int, float, str)
 CONTAINERS = (Sequence, Mapping, list, tuple, dict)
 

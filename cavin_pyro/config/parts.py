@@ -21,6 +21,7 @@ from models.model import Model
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "models.priors.standard.StandardPrior"
 FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
+PAPER_DYNAMICS = {"_target_": "models.networks.dynamics.Dynamics"}
 
 
 def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
@@ -57,7 +58,7 @@ def check_sizes(section: str, config: Config) -> None:
 
 
 def build_model(config: Config) -> Model:
-    """The model program with its priors and likelihood scales, from the sections `model`, `prior` and `scales`.
+    """The model program with its parts, from the sections `model`, `prior`, `scales` and `dynamics`.
 
     A model gets a prior for each of its codes, that is, for each of `effect_dimension` and `motion_dimension`
     that its section has: `model.prior` where that names a class, else the section `prior`.
@@ -81,9 +82,13 @@ def build_model(config: Config) -> Model:
             for name, kind in (("effect_prior", "effect"), ("motion_prior", "motion"))
             if f"{kind}_dimension" in sizes
         }
+        section = config.get("dynamics") or PAPER_DYNAMICS
+        check_sizes("dynamics", section)
+        dynamics = construct(section, feature_dimension=sizes["feature_dimension"], width=sizes["width"])
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
-    model = construct(sizes, **parts, scales=construct(config.get("scales") or FIXED_SCALES))
+    scales = construct(config.get("scales") or FIXED_SCALES)
+    model = construct(sizes, **parts, scales=scales, dynamics=dynamics)
     if not isinstance(model, Model):
         raise UserError(f"model {sizes['_target_']} is no model program: derive it from models.model.Model")
     chosen = own_prior.get("_target_") or config["prior"]["_target_"]

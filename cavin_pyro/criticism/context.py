@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from cavin_pyro.data.collection import CollectionConfig
 from guides.guide import Guide
 from models.model import Model
-from models.networks.pointnet import PointNet
+from models.networks.geometry import Geometry
 from models.state import Window
 
 
@@ -24,7 +24,7 @@ class CheckContext:
 
     model: Model
     guide: Guide
-    pointnet: PointNet
+    pointnet: Geometry
     training: Window
     validation: Window
     seed: int = 0

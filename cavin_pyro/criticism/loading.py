@@ -20,7 +20,7 @@ from cavin_pyro.data.dataset import content_fingerprint, read_metadata, with_cur
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.data.world import collecting_world
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
-from cavin_pyro.storage.pointnet import check_fit, pointnet_of
+from cavin_pyro.storage.geometry import check_fit, geometry_of
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import with_current_keys
 from cavin_pyro.training.factory import data_folders
@@ -49,7 +49,7 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
     path = find_checkpoint(config.checkpoint)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
-    pointnet = pointnet_of(checkpoint, path)
+    pointnet = geometry_of(checkpoint, path)
     check_fit(model, pointnet, MAXIMUM_OBJECTS)
     windows, segment_length, split = trained_windows(checkpoint, path)
     folders = data_folders(config.data)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cavin_pyro.data.collection import CollectionConfig, collect_episode, open_scene
 from cavin_pyro.data.features import cloud_features
-from models.networks.pointnet import PointNet
+from models.networks.geometry import Geometry
 from models.state import State
 
 SEED = 2**31  # added to a context's seed: datasets are collected with small ones, so no dataset has these episodes
@@ -27,7 +27,7 @@ class Recording(NamedTuple):
 
 
 def record(
-    pointnet: PointNet, world: CollectionConfig, *, episodes: int, steps: int, objects: int, seed: int
+    pointnet: Geometry, world: CollectionConfig, *, episodes: int, steps: int, objects: int, seed: int
 ) -> Recording:
     """Simulate `episodes` of up to `steps` pushes with at most `objects` objects, by the policy that collects data."""
     config = replace(world, seed=SEED + seed, steps=steps, maximum_objects=objects)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import check_distinct, read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.held_out import find_held_out
-from models.networks.pointnet import PointNet
+from models.networks.geometry import Geometry
 
 BATCH = 4096  # clouds
 
 
-def pointnet_fingerprint(pointnet: PointNet) -> str:
+def pointnet_fingerprint(pointnet: Geometry) -> str:
     """Twelve hexadecimal digits that change when any weight does."""
     digest = hashlib.sha256()
     for name, value in sorted(pointnet.state_dict().items()):
@@ -28,14 +28,14 @@ def pointnet_fingerprint(pointnet: PointNet) -> str:
 
 
 @torch.inference_mode()
-def cloud_features(pointnet: PointNet, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
+def cloud_features(pointnet: Geometry, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
     """Features [..., 64] of clouds [..., P, 3] metres from their centres."""
     flat = torch.from_numpy(np.ascontiguousarray(clouds)).flatten(0, -3)
     parts = [pointnet(batch.float()) for batch in flat.split(BATCH)]
     return torch.cat(parts).reshape(*clouds.shape[:-2], -1).numpy()
 
 
-def shard_features(folder: Path, number: int, pointnet: PointNet, fingerprint: str) -> NDArray[np.float32]:
+def shard_features(folder: Path, number: int, pointnet: Geometry, fingerprint: str) -> NDArray[np.float32]:
     """Features [E, S+1, M, 64] of one shard, read from beside it if this PointNet made them before.
 
     Args:

@@ -17,7 +17,7 @@ from cavin_pyro.data.dataset import Arrays, check_distinct, check_new, iterate_s
 from cavin_pyro.data.features import pointnet_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.storage.progress import progress_bar
-from models.networks.pointnet import PointNet
+from models.networks.geometry import Geometry
 from models.state import State, Window
 
 SEGMENT_LENGTH = 3  # T
@@ -77,7 +77,7 @@ class WindowTable:
 
 def load_windows(
     folders: Sequence[Path],
-    pointnet: PointNet,
+    pointnet: Geometry,
     config: WindowConfig | None = None,
     *,
     segment_length: int = SEGMENT_LENGTH,

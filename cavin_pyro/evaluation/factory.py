@@ -21,12 +21,12 @@ from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
-from cavin_pyro.storage.pointnet import pointnet_of
+from cavin_pyro.storage.geometry import geometry_of
 from envs.pushing import PushingEnv
 from envs.tasks import Task
 from envs.workspace import MAXIMUM_OBJECTS
 from models.model import Model
-from models.networks.pointnet import PointNet
+from models.networks.geometry import Geometry
 from models.priors.flow import FlowPrior
 from planning import Planner
 from planning.inputs import OptimizerError
@@ -44,7 +44,7 @@ class EpisodeRunner:
 
     env: PushingEnv
     planner: Planner
-    pointnet: PointNet
+    pointnet: Geometry
     pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
 
     @property
@@ -123,8 +123,8 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
 
 def make_planner(
     config: DictConfig, reward: RewardFunction, *, wrap: Callable[[Model], Any] | None = None
-) -> tuple[Planner, PointNet]:
-    """Build the planner with the checkpoint's model, and the checkpoint's PointNet.
+) -> tuple[Planner, Geometry]:
+    """Build the planner with the checkpoint's model, and the geometric features of the checkpoint.
 
     Args:
         wrap: makes of the model what the planner gets in its place, to observe its calls.
@@ -134,7 +134,7 @@ def make_planner(
     """
     path = find_checkpoint(config.checkpoint)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
-    pointnet = pointnet_of(checkpoint, path)
+    pointnet = geometry_of(checkpoint, path)
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):

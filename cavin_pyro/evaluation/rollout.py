@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
-from models.networks.pointnet import PointNet
+from models.networks.geometry import Geometry
 from models.state import State
 from planning import Plan, Planner
 
@@ -100,7 +100,7 @@ class Episode:
 
 
 @torch.inference_mode()
-def observed_state(observation: ObservationDict, pointnet: PointNet) -> State:
+def observed_state(observation: ObservationDict, pointnet: Geometry) -> State:
     """The planner's state, a batch of one, from an observation, without needless padding.
 
     Args:
@@ -135,7 +135,7 @@ class EpisodeCallback:
 def rollout(
     env: PushingEnv,
     planner: Planner,
-    pointnet: PointNet,
+    pointnet: Geometry,
     *,
     seed: int,
     pushes_per_plan: int | None = None,

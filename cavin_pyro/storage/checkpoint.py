@@ -27,7 +27,14 @@ from cavin_pyro.storage.trust import check_numbers, check_targets
 
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
-BUILT_SECTIONS = ("model", "prior", "scales", "guide")  # of the configuration, from which parts are built
+BUILT_SECTIONS = (
+    "model",
+    "geometry",
+    "dynamics",
+    "prior",
+    "scales",
+    "guide",
+)  # of the configuration, from which parts are built
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from cavin_pyro.storage.digests import update_manifest
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 
 BASELINES = ("sectar", "cvae_mpc", "mpc")
-PARTS = ("model", "guide", "pointnet")
+PARTS = ("model", "guide", "pointnet", "geometry")
 PUBLIC_HOME = "runs/reproduce"  # in shipped files, instead of the folder of the machine that trained
 
 
@@ -83,7 +83,7 @@ def facts(checkpoint: Checkpoint, *, steps: int) -> dict[str, Any]:
         "episodes": sum(data["episodes"] for data in about["data"]),
         "training_windows": about["training_windows"],
         "validation_windows": about["validation_windows"],
-        "parameters": {part: _parameters(checkpoint, part) for part in PARTS},
+        "parameters": {part: found for part in PARTS if (found := _parameters(checkpoint, part))},
         "command": about["command"],
         "revision": about["revision"],
     }

@@ -1,20 +1,18 @@
-"""Provenance of a trained model: the run, its data and its PointNet."""
+"""Provenance of a trained model: the run, its data and its geometric features."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cavin_pyro.data.dataset import content_fingerprint, read_metadata
 from cavin_pyro.data.windows import WindowTable
-from cavin_pyro.storage.checkpoint import load_checkpoint
 from cavin_pyro.storage.provenance import provenance
 
 
-def training_provenance(data: Sequence[Path], pointnet: Path, windows: WindowTable) -> dict[str, Any]:
-    """The provenance of a trained model: the run, its data and its PointNet."""
-    trained_before = load_checkpoint(pointnet).provenance
+def training_provenance(data: Sequence[Path], geometry: Mapping[str, Any], windows: WindowTable) -> dict[str, Any]:
+    """The provenance of a trained model: the run, its data and what `geometry` says of the geometric features."""
     names = ("transitions", "episodes", "configuration", "made_by")
     return {
         **provenance(),
@@ -22,7 +20,7 @@ def training_provenance(data: Sequence[Path], pointnet: Path, windows: WindowTab
             {**{name: read_metadata(folder)[name] for name in names}, "fingerprint": content_fingerprint(folder)}
             for folder in data
         ],
-        "pointnet": trained_before.get("pointnet", trained_before),
+        **geometry,
         "training_windows": len(windows.training),
         "validation_windows": len(windows.validation),
     }

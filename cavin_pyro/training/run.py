@@ -11,9 +11,9 @@ from cavin_pyro.config.errors import user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
 from cavin_pyro.data.windows import load_windows
-from cavin_pyro.storage.checkpoint import find_checkpoint, save_checkpoint
+from cavin_pyro.storage.checkpoint import save_checkpoint
 from cavin_pyro.storage.files import output_folder, write_json
-from cavin_pyro.storage.pointnet import check_fit, load_pointnet
+from cavin_pyro.storage.geometry import check_fit, chosen_geometry, part_name
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.factory import build_objective, data_folders
@@ -36,13 +36,12 @@ def train(config: DictConfig) -> Trainer:
     model = build_model(config)
     guide = build_guide(config, model)
     objective = build_objective(config, model)
-    source = find_checkpoint(config.pointnet)
-    pointnet = load_pointnet(source)
-    check_fit(model, pointnet, MAXIMUM_OBJECTS)
+    geometry, origin = chosen_geometry(config)
+    check_fit(model, geometry, MAXIMUM_OBJECTS)
     data = data_folders(config.data)
     windows = load_windows(
         data,
-        pointnet,
+        geometry,
         configured(WindowConfig, config.windows, "windows"),
         segment_length=config.model.segment_length,
         seed=config.seed,
@@ -64,10 +63,10 @@ def train(config: DictConfig) -> Trainer:
 
     folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("data", "output"))
-    record = training_provenance(data, source, windows)
+    record = training_provenance(data, origin, windows)
     check_same_data(folder, record["data"])
     stored_config = write_config(folder, config)
-    parts = {"model": model, "guide": guide, "pointnet": pointnet}
+    parts = {"model": model, "guide": guide, part_name(geometry): geometry}
     path = folder / "checkpoint.safetensors"
 
     def save(step: int, row: dict[str, float]) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor, nn
 
+from models.networks.geometry import Geometry
 from models.networks.layers import fully_connected, unit
 from models.state import State
 
@@ -61,8 +64,29 @@ class StateChange(nn.Module):
         return State(centers, features, state.mask.expand(centers.shape[:-1]))
 
 
-class Dynamics(nn.Module):
-    """f: mean of the state after one push."""
+class PushOutcome(nn.Module):
+    """Base class of f, the state after one push.
+
+    Attributes:
+        geometry: the class of geometric features that it can read, None for any. reads_encoding: whether it needs the
+            state encoder's features. predicts_scales: whether `outcome` has scales.
+    """
+
+    geometry: ClassVar[type[Geometry] | None] = None
+    reads_encoding: ClassVar[bool] = True
+    predicts_scales: ClassVar[bool] = False
+
+    def forward(self, state: State, encoded: Tensor | None, action: Tensor) -> State:
+        """The mean: `state: [...]`, its features `encoded: [..., M, 3 * width]`, `action: [..., 4]` -> `[...]`."""
+        return self.outcome(state, encoded, action)[0]
+
+    def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor | None]:
+        """The mean, and if `predicts_scales` the scales `[..., M, 2]` of its centres (metres) and features."""
+        raise NotImplementedError
+
+
+class Dynamics(PushOutcome):
+    """f as in the paper: the mean of the state after one push."""
 
     def __init__(
         self, *, feature_dimension: int = 64, width: int = 64, maximum_displacement: float = PUSH_RANGE
@@ -73,9 +97,10 @@ class Dynamics(nn.Module):
             maximum_displacement=maximum_displacement, feature_dimension=feature_dimension, width=width
         )
 
-    def forward(self, state: State, encoded: Tensor, action: Tensor) -> State:
-        """`encoded: [..., M, 3 * width]` features of `state`, `action: [..., 4]` -> `State [...]`."""
-        return self.change(state, self.trunk(encoded, action))
+    def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor | None]:
+        """The mean; it predicts no scales."""
+        assert encoded is not None
+        return self.change(state, self.trunk(encoded, action)), None
 
 
 class MetaDynamics(nn.Module):

@@ -5,17 +5,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from models.networks.geometry import Geometry
 from models.networks.layers import fully_connected, unit
 
 CLOUD_UNIT = 0.1  # metres; about the size of an object
 DECODED_POINTS = 64
 
 
-class PointNet(nn.Module):
+class PointNet(Geometry):
     """Layers 16-32-64 shared by all points, maximum over points, FC 64, unit length."""
 
     def __init__(self, feature_dimension: int = 64) -> None:
         super().__init__()
+        self.feature_dimension = feature_dimension
         self.points = nn.Sequential(fully_connected(3, 16), fully_connected(16, 32), fully_connected(32, 64))
         # Without ReLU, so that features can be anywhere on the sphere and never vanish.
         self.feature = nn.Linear(64, feature_dimension)

@@ -93,6 +93,8 @@ class TrainConfig:
             {"model": "cascaded"},
             {"guide": "cascaded"},
             {"prior": "standard"},
+            {"geometry": "pointnet"},
+            {"dynamics": "paper"},
             {"scales": "fixed"},
             {"objective": "trace_elbo"},
             "base",
@@ -106,13 +108,15 @@ class TrainConfig:
     )
     pointnet: str = option(
         DEFAULT_CHECKPOINT,
-        "checkpoint of the PointNet for features: a shipped one, or the path of one from pretrain",
+        "checkpoint of the PointNet for geometry=pointnet: a shipped one, or the path of one from pretrain",
         group="data",
     )
     skip_corrupt: bool = option(False, "skip corrupt files of the dataset instead of stopping", group="data")
     model: Any = None
     guide: Any = None
     prior: Any = None
+    geometry: Any = None
+    dynamics: Any = None
     scales: Any = None
     objective: Any = None
     trainer: TrainerConfig = field(default_factory=TrainerConfig)

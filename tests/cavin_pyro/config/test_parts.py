@@ -12,9 +12,11 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model, check_sizes, construct
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
-from cavin_pyro.storage.pointnet import check_fit, load_pointnet
+from cavin_pyro.storage.geometry import check_fit, load_pointnet
 from cavin_pyro.training.factory import build_objective
+from models.likelihoods import PredictedScales
 from models.model import Model
+from models.networks.outline import Outline
 from models.networks.pointnet import PointNet
 
 
@@ -131,3 +133,21 @@ def test_a_file_without_pointnet_is_refused(small: SimpleNamespace, tmp_path: Pa
     save_checkpoint(path, parts={"model": small.parts()["model"]}, config={}, provenance={})
     with pytest.raises(UserError, match=r"a\.safetensors holds no PointNet"):
         load_pointnet(path)
+
+
+def test_an_f_that_reads_outlines_needs_them(small: SimpleNamespace) -> None:
+    config = small.config() | {"dynamics": {"_target_": "models.networks.contact.ContactDynamics", "object_width": 8}}
+    model = build_model(config)
+    check_fit(model, Outline(), 5)
+    with pytest.raises(
+        UserError, match="ContactDynamics reads the features of Outline, not of PointNet: pass geometry=outline"
+    ):
+        check_fit(model, PointNet(), 5)
+
+
+def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> None:
+    config = small.config() | {"scales": {"_target_": "models.likelihoods.PredictedScales"}}
+    with pytest.raises(UserError, match="scales=predicted needs an f that predicts them: dynamics=contact"):
+        build_model(config)
+    contact = {"dynamics": {"_target_": "models.networks.contact.ContactDynamics"}}
+    assert isinstance(build_model(config | contact).scales, PredictedScales)

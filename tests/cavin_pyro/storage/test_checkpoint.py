@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.storage.checkpoint import default_checkpoint, load_checkpoint, save_checkpoint
-from cavin_pyro.storage.pointnet import load_pointnet
+from cavin_pyro.storage.geometry import load_pointnet
 from models.networks.pointnet import PointNet
 
 

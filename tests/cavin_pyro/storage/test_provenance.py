@@ -13,6 +13,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import save_checkpoint
+from cavin_pyro.storage.geometry import pointnet_provenance
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.provenance import training_provenance
 
@@ -37,12 +38,12 @@ def test_the_provenance_of_a_trained_model_names_its_data_and_pointnet(
     save_checkpoint(path, parts={"pointnet": parts["pointnet"]}, config={}, provenance={"command": "pretrain"})
     config = WindowConfig(minimum_move=0.005, validation_fraction=0.3)
     windows = load_windows([own_pushes], parts["pointnet"], config)
-    record = training_provenance([own_pushes], path, windows)
+    record = training_provenance([own_pushes], pointnet_provenance(path), windows)
     ((data),) = record["data"]
     assert (data["transitions"], data["episodes"], data["configuration"]["seed"]) == (72, 12, 3)
     assert record["pointnet"] == {"command": "pretrain"}
     assert record["training_windows"] == len(windows.training) > 0
     # A PointNet out of a whole checkpoint keeps its own record.
     save_checkpoint(path, parts={"pointnet": parts["pointnet"]}, config={}, provenance=record)
-    assert training_provenance([own_pushes], path, windows)["pointnet"] == {"command": "pretrain"}
+    assert training_provenance([own_pushes], pointnet_provenance(path), windows)["pointnet"] == {"command": "pretrain"}
     assert json.loads(json.dumps(record)) == record

@@ -8,7 +8,7 @@ import pytest
 
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.storage.checkpoint import default_checkpoint, load_checkpoint
-from cavin_pyro.storage.pointnet import pointnet_of
+from cavin_pyro.storage.geometry import pointnet_of
 
 SHIPPED = sorted(default_checkpoint().parent.glob("*.safetensors"))
 

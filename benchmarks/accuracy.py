@@ -1,0 +1,301 @@
+"""How far predictions are off, beside what nobody could predict: `python benchmarks/accuracy.py CHECKPOINT ...`.
+
+New episodes are collected by the heuristic (--episodes, --seed: of the collection), in the default world. For every
+object it prints the distance between the predicted and the observed centre, after one push, after three (f reads its
+own predictions), and for h with the code that the guide infers from the three pushes' outcome. Objects that moved more
+than a centimetre by the simulator stand apart from those that moved less than 2 mm, and among the latter those of which
+f says that they move more than 2 cm. By number of objects, by object, and by the kind of push:
+
+hit     the tool's path passes within half of the object's half-width (across the path) from its middle
+graze   within all of it and the tool's radius
+miss    farther off, or the push ends before the object
+
+The floor has two parts. Hidden: the distance between what happened and the mean of --redraws replays of the same push
+in a second world, from the same poses, with mass and friction drawn anew within their ranges. Camera: the distance
+between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pyro import poutine
+
+from cavin_pyro.criticism.loading import load_programs
+from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene
+from cavin_pyro.data.features import cloud_features
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
+from cavin_pyro.storage.geometry import geometry_of
+from cavin_pyro.storage.progress import progress_bar
+from envs.observation import Observation
+from envs.policy import HeuristicPushingPolicy
+from envs.randomness import collection_streams
+from envs.robots import STICK_RADIUS
+from envs.scene import Scene
+from envs.workspace import push_endpoints
+from models.state import State, Window, stack_steps
+
+T = 3  # pushes of a segment
+MOVED, STILL, PHANTOM = 0.01, 0.002, 0.02  # metres
+Table = dict[str, "Errors"]
+Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+@dataclass
+class Push:
+    """One push: what was seen, where the bodies were, and where the same push took them in worlds drawn anew."""
+
+    before: Observation
+    after: Observation
+    action: NDArray[np.float32]
+    start: NDArray[np.float64]  # [objects, 3] metres, bodies before and after
+    end: NDArray[np.float64]
+    replayed: dict[int, NDArray[np.float64]]  # [redraws, objects, 3] metres, after 1 and T pushes from here
+
+
+@dataclass
+class Episode:
+    """Names of the objects, and pushes."""
+
+    names: list[str]
+    pushes: list[Push]
+
+
+def poses(scene: Scene) -> Poses:
+    truth = scene.ground_truth()
+    return truth.positions.copy(), truth.orientations.copy()
+
+
+def put(scene: Scene, there: Poses) -> None:
+    """Put the bodies at rest at these poses."""
+    client = scene.world.client
+    for body, position, orientation in zip(scene.bodies, *there, strict=True):
+        client.resetBasePositionAndOrientation(body, position, orientation)
+        client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    scene.world.rest(scene.bodies)
+
+
+def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redraws: int) -> Episode:
+    """An episode as `collect` has it, until something falls, and its replays."""
+    generator, policy_generator = collection_streams(config.seed, number)
+    count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
+    seen = [scene.sample([clutter_area(generator)] * count, config.ranges, generator)]
+    policy = HeuristicPushingPolicy(
+        policy_generator, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
+    )
+    there, actions = [poses(scene)], []
+    for _ in range(config.steps):
+        action = policy.act(seen[-1]).astype(np.float32)
+        if scene.push(action).fallen:
+            break
+        actions.append(action)
+        there.append(poses(scene))
+        seen.append(scene.observe())
+    again = replays(scene, twin, config, there, actions, redraws, np.random.default_rng([config.seed, number]))
+    pushes = [
+        Push(seen[t], seen[t + 1], action, there[t][0], there[t + 1][0], again[t]) for t, action in enumerate(actions)
+    ]
+    return Episode([each.name for each in scene.objects], pushes)
+
+
+def replays(
+    scene: Scene,
+    twin: Scene,
+    config: CollectionConfig,
+    there: list[Poses],
+    actions: list[NDArray[np.float32]],
+    redraws: int,
+    generator: np.random.Generator,
+) -> list[dict[int, NDArray[np.float64]]]:
+    """For every push: positions [redraws, objects, 3] after 1 and, where there are as many, after T pushes."""
+    ends: list[dict[int, list[NDArray[np.float64]]]] = [defaultdict(list) for _ in actions]
+    for _ in range(redraws):
+        objects = []
+        for each in scene.objects:
+            mass = scene.object_set.asset(each.name).mass * generator.uniform(*config.ranges.mass)
+            objects.append(replace(each, mass=mass, friction=generator.uniform(*config.ranges.friction)))
+        twin.reset(objects, generator)
+        for t in range(len(actions)):
+            put(twin, there[t])
+            for ahead, action in enumerate(actions[t : t + T], start=1):
+                twin.push(action)
+                if ahead in (1, T):
+                    ends[t][ahead].append(poses(twin)[0])
+    return [{ahead: np.array(drawn) for ahead, drawn in each.items()} for each in ends]
+
+
+def kind(before: Observation, action: NDArray[np.float32], slot: int) -> str:
+    """hit, graze or miss."""
+    start, end = push_endpoints(action)
+    length = max(float(np.linalg.norm(end - start)), 1e-6)
+    forward = (end - start) / length
+    points = before.clouds[slot][:, :2] - start
+    along, across = points @ forward, points @ np.array([-forward[1], forward[0]])
+    if along.min() > length + STICK_RADIUS or along.max() < -STICK_RADIUS:
+        return "miss"
+    middle, half = abs(across.max() + across.min()) / 2, (across.max() - across.min()) / 2
+    if middle < half / 2:
+        return "hit"
+    return "graze" if middle < half + STICK_RADIUS else "miss"
+
+
+class Errors:
+    """Distances in metres of one predictor, by group."""
+
+    def __init__(self) -> None:
+        self.moved: dict[str, list[float]] = defaultdict(list)
+        self.still: list[float] = []
+        self.phantoms: list[bool] = []
+
+    def add(self, groups: Sequence[str], moved: float, error: float, claimed: float = 0.0) -> None:
+        if moved > MOVED:
+            for group in ("all", *groups):
+                self.moved[group].append(error)
+        elif moved < STILL:
+            self.still.append(error)
+            self.phantoms.append(claimed > PHANTOM)
+
+
+def segments(episodes: Sequence[Episode], ahead: int) -> Iterator[tuple[Episode, int, list[Push]]]:
+    """Every series of `ahead` pushes in which all objects are visible before and after."""
+    for episode in episodes:
+        for t in range(len(episode.pushes) - ahead + 1):
+            pushes, count = episode.pushes[t : t + ahead], len(episode.names)
+            if pushes[0].before.visible[:count].all() and pushes[-1].after.visible[:count].all():
+                yield episode, t, pushes
+
+
+def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[NDArray[np.float32]]]) -> Table:
+    """Errors of the floor and of predictions [M, 3] metres, one of each predictor for every one of `segments`."""
+    table: Table = defaultdict(Errors)
+    for number, (episode, _, pushes) in enumerate(segments(episodes, ahead)):
+        first, last = pushes[0], pushes[-1]
+        for slot, name in enumerate(episode.names):
+            body = last.end[slot] - first.start[slot]
+            moved = float(np.linalg.norm(body))
+            kinds = [kind(push.before, push.action, slot) for push in pushes]
+            best = min(kinds, key=("hit", "graze", "miss").index)
+            groups = (f"{len(episode.names)} objects", name, best)
+            before, seen = first.before.centers[slot], last.after.centers[slot]
+            hidden = first.replayed[ahead][:, slot].mean(0) - last.end[slot]
+            table["hidden"].add(groups, moved, float(np.linalg.norm(hidden)))
+            table["camera"].add(groups, moved, float(np.linalg.norm(seen - before - body)))
+            for who, all_of in predicted.items():
+                claimed = float(np.linalg.norm(all_of[number][slot] - before))
+                table[who].add(groups, moved, float(np.linalg.norm(all_of[number][slot] - seen)), claimed)
+    return table
+
+
+@torch.inference_mode()
+def predictions(path: str, episodes: Sequence[Episode]) -> dict[int, dict[str, list[NDArray[np.float32]]]]:
+    """Centres [M, 3] metres that a checkpoint predicts, by the number of pushes and the predictor."""
+    file = find_checkpoint(path)
+    checkpoint = load_checkpoint(file)
+    model, guide = load_programs(checkpoint, file)
+    geometry = geometry_of(checkpoint, file)
+
+    def state(seen: Observation) -> State:
+        clouds = seen.clouds - seen.centers[:, None]
+        features = torch.from_numpy(cloud_features(geometry, clouds[None]))
+        return State(torch.from_numpy(seen.centers)[None], features, torch.from_numpy(seen.mask)[None])
+
+    name, found = Path(path).stem if file.parent.name == "checkpoints" else file.parent.name, {}
+    for ahead in (1, T):
+        rolled, inferred = [], []
+        for _, _, pushes in segments(episodes, ahead):
+            here = first = state(pushes[0].before)
+            actions = torch.from_numpy(np.stack([push.action for push in pushes]))[None]
+            for action in actions.unbind(1):
+                here = model.next_state(here, action)
+            rolled.append(here.centers[0].numpy())
+            if ahead == T and "effect_code" in model.codes:
+                between = [first, *(state(push.after) for push in pushes)]
+                window = Window(
+                    stack_steps(between), actions, torch.ones(1, T, dtype=torch.bool), torch.ones(1, dtype=torch.bool)
+                )
+                code = poutine.trace(guide).get_trace(window).nodes["effect_code"]["fn"].mean
+                inferred.append(model.subgoal(first, code).centers[0].numpy())
+        found[ahead] = {f"{name}: f": rolled, **({f"{name}: h": inferred} if inferred else {})}
+    return found
+
+
+def show(table: Table, ahead: int) -> None:
+    """Print one horizon."""
+    print(f"\nafter {ahead} {'push' if ahead == 1 else 'pushes'}: centimetres, mean / median")
+    groups = sorted({group for errors in table.values() for group in errors.moved}, key=lambda one: (one != "all", one))
+    print(f"{'objects that moved':28s}" + "".join(f"{who:>26s}" for who in table))
+    for group in groups:
+        cells = [errors.moved.get(group, []) for errors in table.values()]
+        print(f"{group:20s} {len(cells[0]):6d} " + "".join(f"{_centimetres(cell):>26s}" for cell in cells))
+    stills = [errors.still for errors in table.values()]
+    print(f"{'still':20s} {len(stills[0]):6d} " + "".join(f"{_centimetres(cell):>26s}" for cell in stills))
+    shares = [f"{np.mean(errors.phantoms):.2%}" for errors in table.values()]
+    print(f"{'still, said to move':28s}" + "".join(f"{share:>26s}" for share in shares))
+
+
+def draw(tables: dict[int, Table], path: Path) -> None:
+    """Mean errors by group, a row per horizon, the floor behind them."""
+    figure, axes = plt.subplots(len(tables), 1, figsize=(12, 7), layout="constrained")
+    for ax, (ahead, table) in zip(axes, tables.items(), strict=True):
+        order = ["all", "hit", "graze", "miss"]
+        groups = [*order, *sorted(set(table["hidden"].moved) - set(order))]
+        places = np.arange(len(groups))
+        for number, who in enumerate(table):
+            means = [100 * float(np.mean(table[who].moved.get(group, [np.nan]))) for group in groups]
+            width = 0.8 / len(table)
+            ax.bar(places + (number - (len(table) - 1) / 2) * width, means, width, label=who, color=f"C{number}")
+        ax.set_xticks(places, [group.replace("_", " ") for group in groups], rotation=30, ha="right")
+        ax.set_ylabel("mean error of moved objects, cm")
+        ax.set_title(f"After {ahead} {'push' if ahead == 1 else 'pushes'}", loc="left")
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.legend(frameon=False, ncols=len(table))
+    figure.savefig(path, dpi=120)
+
+
+def _centimetres(values: Sequence[float]) -> str:
+    return f"{100 * float(np.mean(values)):.2f} / {100 * float(np.median(values)):.2f}" if len(values) else "-"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("checkpoints", nargs="*", default=["cavin"])
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=20000)
+    parser.add_argument("--redraws", type=int, default=8)
+    parser.add_argument("--picture", type=Path)
+    arguments = parser.parse_args()
+    config = CollectionConfig(seed=arguments.seed, perturbation_rate=0.3)
+    episodes = []
+    with (
+        closing(open_scene(config)) as scene,
+        closing(open_scene(config)) as twin,
+        progress_bar("pushing", total=arguments.episodes, unit="episode") as bar,
+    ):
+        for number in range(arguments.episodes):
+            episodes.append(play(scene, twin, config, number, arguments.redraws))
+            bar.update()
+    found = [predictions(path, episodes) for path in arguments.checkpoints or ["cavin"]]
+    tables = {
+        ahead: measure(episodes, ahead, {who: rows for one in found for who, rows in one[ahead].items()})
+        for ahead in (1, T)
+    }
+    for ahead, table in tables.items():
+        show(table, ahead)
+    if arguments.picture:
+        draw(tables, arguments.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Outlines of objects from above: geometric features without training, which turn with the object."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from models.networks.geometry import Geometry
+from models.networks.layers import unit
+
+HARMONICS = 8  # K; the outline of a box is off by about a millimetre
+DIRECTIONS = 32  # around the object, in which its extent is measured
+OUTLINES = 3
+HEIGHTS = 12
+OUTLINE_UNIT = 0.05  # metres; about the size of an object
+TOP = 0.01  # metres below the highest point
+SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of the points, for quantiles of their heights
+PER_OUTLINE = 2 * HARMONICS + 1
+FEATURES = OUTLINES * PER_OUTLINE + HEIGHTS + 1
+
+
+class Outline(Geometry):
+    """How far an object reaches in each direction (its support function), as a Fourier series, and its heights.
+
+    A cloud's support function h(angle) = max over points of x cos(angle) + y sin(angle) describes the convex outline
+    that a pushing tool meets. Three of them are taken: of all points, of the upper half, and of the top centimetre. A
+    lying can differs from a box only in the last two. The series of an outline that is turned by an angle is the same
+    series with coefficient k turned by k times that angle, so whoever reads an outline can turn it (`turned`).
+
+    The feature is a vector of unit length, whose last component is what 1 became by scaling (`outline_values`).
+    """
+
+    directions: Tensor  # [2, directions]
+    basis: Tensor  # [directions, 2 K + 1]
+
+    def __init__(self, feature_dimension: int = FEATURES) -> None:
+        """Raises `ValueError` for another number than 64: it is fixed by the description."""
+        if feature_dimension != FEATURES:
+            raise ValueError(f"outlines have {FEATURES} numbers per object, not {feature_dimension}")
+        super().__init__()
+        self.feature_dimension = feature_dimension
+        angles = torch.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
+        self.register_buffer("directions", torch.stack((angles.cos(), angles.sin())), persistent=False)
+        self.register_buffer("basis", series(angles) / DIRECTIONS)  # persistent: a digest then tells its options
+
+    def forward(self, clouds: Tensor) -> Tensor:
+        """`clouds: [..., P, 3]` metres from the object's centre, in any order -> `[..., 64]`."""
+        flat, height = clouds[..., :2], clouds[..., 2]
+        extent = flat @ self.directions  # [..., P, directions]
+        highest = height.amax(-1, keepdim=True)
+        layers = (torch.full_like(highest, -torch.inf), height.median(-1, keepdim=True).values, highest - TOP)
+        supports = [
+            extent.masked_fill((height < lowest).unsqueeze(-1), -torch.inf).amax(-2) @ self.basis for lowest in layers
+        ]
+        quantiles = height.quantile(height.new_tensor(SHARES), -1).movedim(0, -1)
+        top = (height >= highest - TOP).to(height.dtype).mean(-1, keepdim=True)
+        x, y = flat.unbind(-1)
+        spread = torch.stack((x.square(), y.square(), x * y, height.square()), -1).mean(-2)
+        values = torch.cat((*supports, quantiles), -1) / OUTLINE_UNIT
+        return unit(torch.cat((values, top, spread / OUTLINE_UNIT**2, torch.ones_like(top)), -1))
+
+
+def series(angles: Tensor) -> Tensor:
+    """The terms 1, cos, ..., cos K, -sin, ..., -sin K of `angles: [N]` -> `[N, 2 K + 1]`, without their weights."""
+    orders = torch.arange(HARMONICS + 1) * angles.unsqueeze(-1)
+    return torch.cat((orders.cos(), -orders[..., 1:].sin()), -1)
+
+
+def outline_values(features: Tensor) -> Tensor:
+    """`features: [..., 64]` -> `[..., 63]`: series of three outlines and heights, in units of 0.05 m."""
+    return features[..., :-1] / features[..., -1:].clamp_min(0.02)
+
+
+def outline_features(values: Tensor) -> Tensor:
+    """The inverse of `outline_values`."""
+    return unit(torch.cat((values, torch.ones_like(values[..., :1])), -1))
+
+
+def turned(outlines: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
+    """Outlines in axes that are turned by an angle.
+
+    `outlines: [..., L * (2 K + 1)]` series; `cosines, sines: [..., K]` of 1 to K times the angle of the new x axis.
+    """
+    parts = outlines.unflatten(-1, (-1, PER_OUTLINE))
+    mean, real, imaginary = parts.split((1, HARMONICS, HARMONICS), -1)
+    cosines, sines = cosines.unsqueeze(-2), sines.unsqueeze(-2)
+    new_real = real * cosines - imaginary * sines
+    mean = mean.expand(*new_real.shape[:-1], 1)
+    return torch.cat((mean, new_real, real * sines + imaginary * cosines), -1).flatten(-2)
+
+
+def multiples(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine `[...]` of an angle -> those of 1 to K times the angle, `[..., K]` each."""
+    cosines, sines = [cosine], [sine]
+    for _ in range(HARMONICS - 1):
+        cosines.append(cosines[-1] * cosine - sines[-1] * sine)
+        sines.append(sines[-1] * cosine + cosines[-2] * sine)
+    return torch.stack(cosines, -1), torch.stack(sines, -1)

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.robots import STICK_RADIUS
+from envs.workspace import push_endpoints
+from models.networks import contact
+from models.networks.contact import MAXIMUM_DISPLACEMENT, ContactDynamics, endpoints
+from models.networks.outline import Outline, outline_features
+from models.state import State
+
+
+def scene(*batch: int, objects: int = 3, real: int | None = None) -> State:
+    """Boxes somewhere on the table; padding is zero."""
+    clouds = (torch.rand(*batch, objects, 64, 3) - 0.5) * torch.tensor([0.08, 0.05, 0.03])
+    centers = torch.tensor([0.4, -0.2, 0.0]) + torch.rand(*batch, objects, 3) * torch.tensor([0.3, 0.4, 0.05])
+    mask = (torch.arange(objects) < (real or objects)).expand(*batch, objects)
+    centers, features = (field * mask.unsqueeze(-1) for field in (centers, Outline()(clouds)))
+    return State(centers, features, mask)
+
+
+def loud(**sizes: int) -> ContactDynamics:
+    """Untrained, but every object moves."""
+    torch.manual_seed(0)
+    f = ContactDynamics(**{"object_width": 16, "pair_width": 8, **sizes}).double()
+    torch.nn.init.normal_(f.head.weight, std=0.5)
+    return f
+
+
+def doubled(state: State) -> State:
+    return State(state.centers.double(), state.features.double(), state.mask)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(-1.5, 1.5), min_size=4, max_size=4))
+def test_pushes_start_and_stop_where_the_robot_starts_and_stops(action: list[float]) -> None:
+    start, motion = endpoints(torch.tensor(action, dtype=torch.float64))
+    expected = push_endpoints(np.array(action))
+    assert np.allclose(start, expected[0], atol=1e-7)
+    assert np.allclose(start + motion, expected[1], atol=1e-7)
+    assert contact.TOOL_RADIUS == STICK_RADIUS
+
+
+def test_where_the_tool_meets_a_disc_is_where_geometry_says() -> None:
+    radius, gap = 0.04, 0.06  # metres
+    angles = torch.linspace(0, 2 * np.pi, 257)[:-1]
+    disc = radius * torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
+    outline = ContactDynamics().double()
+    values = (Outline()(disc)[:-1] / Outline()(disc)[-1])[: contact.PER_OUTLINE].double()
+    along = torch.tensor([gap + radius + contact.TOOL_RADIUS], dtype=torch.float64)
+    found = outline._contact(along, torch.zeros(1).double(), values[None], torch.tensor([0.1]).double())[0]
+    enter, chord, rest, driven, normal_x, normal_y, *_ = found.tolist()
+    assert enter * contact.PUSH_UNIT == pytest.approx(gap, abs=1e-3)
+    assert chord * contact.DISPLACEMENT_UNIT == pytest.approx(2 * (radius + contact.TOOL_RADIUS), abs=2e-3)
+    assert rest == driven == pytest.approx((0.1 - gap) / contact.PUSH_UNIT, abs=0.02)
+    assert (normal_x, normal_y) == pytest.approx((-1.0, 0.0), abs=0.05)
+    beside = torch.tensor([radius + contact.TOOL_RADIUS + 0.01]).double()
+    missed = outline._contact(along, beside, values[None], torch.tensor([0.1]).double())[0]
+    assert missed[1] < 0
+    assert missed[3] == 0
+
+
+def test_reordering_objects_reorders_the_prediction() -> None:
+    f, state, action = loud(), doubled(scene(3, objects=4, real=3)), torch.rand(3, 4).double()
+    order = torch.tensor([2, 0, 3, 1])
+    predicted, scales = f.outcome(state, None, action)
+    shuffled, shuffled_scales = f.outcome(State(*(field[:, order] for field in state)), None, action)
+    for field, expected in zip(shuffled, predicted, strict=True):
+        assert torch.allclose(field, expected[:, order], atol=1e-10)
+    assert torch.allclose(shuffled_scales, scales[:, order], atol=1e-10)
+    assert not torch.allclose(predicted.centers, predicted.centers[:, order])
+
+
+def test_padding_neither_changes_nor_affects_real_objects() -> None:
+    f, state, action = loud(), doubled(scene(5, objects=4, real=2)), torch.rand(5, 4).double()
+    predicted = f(state, None, action)
+    assert torch.equal(predicted.centers[:, 2:], state.centers[:, 2:])
+    assert torch.equal(predicted.features[:, 2:], state.features[:, 2:])
+    alone = f(State(*(field[:, :2] for field in state)), None, action)
+    assert torch.allclose(predicted.centers[:, :2], alone.centers, atol=1e-10)
+    assert (alone.centers - state.centers[:, :2]).abs().max() > 1e-4
+
+
+def test_other_objects_matter() -> None:
+    f, state, action = loud(), doubled(scene(5, objects=3)), torch.rand(5, 4).double()
+    alone = f(State(*(field[:, :1] for field in state)), None, action)
+    assert not torch.allclose(f(state, None, action).centers[:, :1], alone.centers, atol=1e-6)
+
+
+@settings(max_examples=15, deadline=None)
+@given(batch=st.lists(st.integers(1, 3), min_size=1, max_size=3), objects=st.integers(1, 5))
+def test_leading_dimensions_of_states_and_pushes_broadcast(batch: list[int], objects: int) -> None:
+    f, state, actions = loud(), doubled(scene(*batch[:-1], 1, objects=objects)), torch.rand(*batch, 4).double()
+    predicted, scales = f.outcome(state, None, actions)
+    assert predicted.batch_shape == tuple(batch)
+    assert predicted.mask.shape == (*batch, objects)
+    assert scales.shape == (*batch, objects, 2)
+    expected = f(state.expand(batch), None, actions)
+    assert torch.allclose(predicted.centers, expected.centers, atol=1e-10)
+    assert torch.allclose(predicted.features, expected.features, atol=1e-10)
+
+
+def test_predictions_are_states_within_range() -> None:
+    f, state = loud(), doubled(scene(200))
+    torch.nn.init.normal_(f.head.weight, std=50.0)
+    predicted, scales = f.outcome(state, None, 2 * torch.rand(200, 4).double() - 1)
+    assert (predicted.centers - state.centers).norm(dim=-1).max() <= 3**0.5 * MAXIMUM_DISPLACEMENT
+    assert torch.allclose(predicted.features.norm(dim=-1), torch.ones(200, 3).double())
+    assert scales.min() > 0
+    assert scales.isfinite().all()
+
+
+def test_a_push_of_no_length_gives_numbers() -> None:
+    state = doubled(scene(1))
+    push = torch.zeros(1, 4, dtype=torch.float64, requires_grad=True)
+    predicted = loud()(state, None, push)
+    predicted.centers.sum().backward()
+    assert predicted.centers.isfinite().all()
+    assert push.grad is not None
+    assert push.grad.isfinite().all()
+
+
+def test_features_that_are_no_outlines_are_refused(random_state: Callable[..., State]) -> None:
+    with pytest.raises(ValueError, match="dynamics=contact reads outlines with 64 numbers, not 32"):
+        ContactDynamics(feature_dimension=32)
+    assert outline_features(torch.zeros(63))[-1] == 1
