@@ -27,23 +27,23 @@ def main(config: DictConfig) -> None:
     names = choose_sections(config.sections, config.sizes)
     export = check_export(config.export)
     check_sizes("sizes.export", config.sizes.export)
-    context, about = load_context(config)
-    if "consistency" in names:  # before anything is written
-        check_objects(context, config.sizes.consistency.objects)
-    folder = output_folder(config.output)
-    check_same_run(folder, config, ignore=("output", "sections", "export"))
-    write_config(folder, config)
-    if export:
-        write_samples(context, export, about, windows=config.sizes.export.windows, samples=config.sizes.export.samples)
-        print(f"written: {export}")
-    # A section of an earlier run is reused if a new run would give the same result.
-    data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
-    fingerprint = " ".join([program_fingerprint(), about["weights"], *data])
-    parts = run_sections(names, context, config.sizes, folder, fingerprint)
-    write_report(folder, {**about, "graph": program_graph(context.model, context.validation)}, parts)
-    for part in parts:
-        print("\n  ".join([part["title"], *part["findings"]]))
-    print(f"written: {folder / 'report.html'}")
+    with output_folder(config.output) as folder:
+        context, about = load_context(config)
+        if "consistency" in names:  # before anything is written
+            check_objects(context, config.sizes.consistency.objects)
+        check_same_run(folder, config, ignore=("output", "sections", "export"))
+        write_config(folder, config)
+        if export:
+            write_samples(context, export, about, windows=config.sizes.export.windows, samples=config.sizes.export.samples)
+            print(f"written: {export}")
+        # A section of an earlier run is reused if a new run would give the same result.
+        data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
+        fingerprint = " ".join([program_fingerprint(), about["weights"], *data])
+        parts = run_sections(names, context, config.sizes, folder, fingerprint)
+        write_report(folder, {**about, "graph": program_graph(context.model, context.validation)}, parts)
+        for part in parts:
+            print("\n  ".join([part["title"], *part["findings"]]))
+        print(f"written: {folder / 'report.html'}")
 
 
 if __name__ == "__main__":

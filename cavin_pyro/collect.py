@@ -33,14 +33,14 @@ def main(config: DictConfig) -> None:
         collecting_world(config.env),
         **{one.name: config[one.name] for one in fields(CollectionOptions)},
     )
-    folder = output_folder(config.output)
-    if config.repair:
-        print(f"{repair(collection, folder)} files collected again")
-    metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
-    summary = summarize_data(folder)
-    write_json(folder / "statistics.json", summary.figures())
-    draw_data(folder / "statistics.png", summary)
-    print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
+    with output_folder(config.output) as folder:
+        if config.repair:
+            print(f"{repair(collection, folder)} files collected again")
+        metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
+        summary = summarize_data(folder)
+        write_json(folder / "statistics.json", summary.figures())
+        draw_data(folder / "statistics.png", summary)
+        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
 
 
 if __name__ == "__main__":

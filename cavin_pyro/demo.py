@@ -17,17 +17,18 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.run_directory import write_config
     from cavin_pyro.visualization.rendering import render_episode
 
-    for task in config.tasks:
-        options = copy.deepcopy(config)
-        options.task = task
-        runner = make_runner(copy.deepcopy(options), render=True)
-        folder = output_folder(f"{config.output}/{task}")
-        write_config(folder, options)
-        row = render_episode(runner, folder, seed=config.seed, video=True)
-        runner.env.close()
-        print(f"{task}: {row['outcome']} after {row['steps']} pushes")
-        for what, name in (("picture", "plan.png"), ("from above", "plan-above.png"), ("video", "episode.mp4")):
-            print(f"  {what:<11}{folder / name}", flush=True)
+    with output_folder(config.output):
+        for task in config.tasks:
+            options = copy.deepcopy(config)
+            options.task = task
+            runner = make_runner(copy.deepcopy(options), render=True)
+            with output_folder(f"{config.output}/{task}") as folder:
+                write_config(folder, options)
+                row = render_episode(runner, folder, seed=config.seed, video=True)
+            runner.env.close()
+            print(f"{task}: {row['outcome']} after {row['steps']} pushes")
+            for what, name in (("picture", "plan.png"), ("from above", "plan-above.png"), ("video", "episode.mp4")):
+                print(f"  {what:<11}{folder / name}", flush=True)
 
 
 if __name__ == "__main__":

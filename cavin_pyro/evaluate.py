@@ -21,23 +21,23 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
-    runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
-    runner.env.close()
-    others = earlier_rows(Path(config.compare), config) if config.compare else []
-    folder = output_folder(config.output)
-    check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
-    write_config(folder, config)
-    results = summarize(evaluate(config, folder))
-    scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
-    text = table(results, f"{scene}, {planner_name(config)}")
-    if others:
-        comparison = compare(results["per_episode"], others)
-        results["comparison"] = record(comparison, Path(config.compare))
-        text += "\n" + sentences(comparison, Path(config.compare))
-    write_json(folder / "results.json", {**results, "provenance": provenance()})
-    with atomic_write(folder / "results.txt") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
-    print(f"{text}\nwritten: {folder / 'results.json'}")
+    with output_folder(config.output) as folder:
+        runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
+        runner.env.close()
+        others = earlier_rows(Path(config.compare), config) if config.compare else []
+        check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
+        write_config(folder, config)
+        results = summarize(evaluate(config, folder))
+        scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
+        text = table(results, f"{scene}, {planner_name(config)}")
+        if others:
+            comparison = compare(results["per_episode"], others)
+            results["comparison"] = record(comparison, Path(config.compare))
+            text += "\n" + sentences(comparison, Path(config.compare))
+        write_json(folder / "results.json", {**results, "provenance": provenance()})
+        with atomic_write(folder / "results.txt") as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+        print(f"{text}\nwritten: {folder / 'results.json'}")
 
 
 if __name__ == "__main__":

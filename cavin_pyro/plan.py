@@ -11,7 +11,6 @@ from cavin_pyro.config.application import command
 def main(config: DictConfig) -> None:
     """Run one closed-loop episode from segmented depth images, and write its table, pictures and video."""
     import copy
-    from pathlib import Path
 
     from cavin_pyro.evaluation.factory import announce_waiting, make_runner
     from cavin_pyro.storage.files import output_folder, write_json
@@ -20,17 +19,17 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.visualization.rendering import check_viewer, episode_files, render_episode
 
     check_viewer(config.viewer)
-    check_same_run(Path(config.output), config, ignore=("output", "video", "viewer"))
-    runner = make_runner(copy.deepcopy(config), render=True)
-    folder = output_folder(config.output)
-    write_config(folder, config)
-    announce_waiting(config)
-    row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
-    runner.env.close()
-    write_json(folder / "results.json", {**row, "provenance": provenance()})
-    print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
-    for name in episode_files(video=config.video, viewer=config.viewer):
-        print(f"  {folder / name}")
+    with output_folder(config.output) as folder:
+        check_same_run(folder, config, ignore=("output", "video", "viewer"))
+        runner = make_runner(copy.deepcopy(config), render=True)
+        write_config(folder, config)
+        announce_waiting(config)
+        row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
+        runner.env.close()
+        write_json(folder / "results.json", {**row, "provenance": provenance()})
+        print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
+        for name in episode_files(video=config.video, viewer=config.viewer):
+            print(f"  {folder / name}")
 
 
 if __name__ == "__main__":

@@ -25,31 +25,31 @@ def main(config: DictConfig) -> None:
 
     check_sizes("autoencoder", config.autoencoder)
     torch.manual_seed(config.seed)
-    autoencoder = construct(config.autoencoder)
-    clouds = sample_clouds(
-        data_folders(config.data),
-        count=config.clouds,
-        generator=np.random.default_rng(config.seed),
-        held_out_objects=config.held_out_objects,
-    )
-    folder = output_folder(config.output)
-    stored_config = write_config(folder, config)
-    losses = pretrain(
-        autoencoder,
-        clouds,
-        steps=config.steps,
-        batch_size=config.batch_size,
-        learning_rate=config.learning_rate,
-        seed=config.seed,
-        log=folder / "metrics.csv",
-    )
-    record = {**provenance(), "clouds": len(clouds), "losses": losses}
-    parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}
-    save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=stored_config, provenance=record)
-    write_json(folder / "metrics.json", record)
-    draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
-    print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")
-    print(f"written: {folder / 'pointnet.safetensors'}")
+    with output_folder(config.output) as folder:
+        autoencoder = construct(config.autoencoder)
+        clouds = sample_clouds(
+            data_folders(config.data),
+            count=config.clouds,
+            generator=np.random.default_rng(config.seed),
+            held_out_objects=config.held_out_objects,
+        )
+        stored_config = write_config(folder, config)
+        losses = pretrain(
+            autoencoder,
+            clouds,
+            steps=config.steps,
+            batch_size=config.batch_size,
+            learning_rate=config.learning_rate,
+            seed=config.seed,
+            log=folder / "metrics.csv",
+        )
+        record = {**provenance(), "clouds": len(clouds), "losses": losses}
+        parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}
+        save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=stored_config, provenance=record)
+        write_json(folder / "metrics.json", record)
+        draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
+        print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")
+        print(f"written: {folder / 'pointnet.safetensors'}")
 
 
 if __name__ == "__main__":

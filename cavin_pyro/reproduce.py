@@ -24,21 +24,21 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.provenance import append_provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
-    check_same_run(Path(config.output), config, ignore=IGNORED)
-    rows = read_table(Path(config.table)) if config.table else []
-    home = output_folder(config.output)
-    write_config(home, config)
-    append_provenance(home / "provenance.json")
-    if config.merge:
-        rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
-    elif not config.table:
-        rows = run_pipeline(config, home)
-    for path in write_results(home, rows, as_typed(config)):
-        print(path)
-    if config.pictures is not None:
-        folders = [Path(folder) for folder in config.merge] or [home]
-        for path in draw_chosen_episodes(home, folders, rows, config.pictures):
+    with output_folder(config.output) as home:
+        check_same_run(home, config, ignore=IGNORED)
+        rows = read_table(Path(config.table)) if config.table else []
+        write_config(home, config)
+        append_provenance(home / "provenance.json")
+        if config.merge:
+            rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
+        elif not config.table:
+            rows = run_pipeline(config, home)
+        for path in write_results(home, rows, as_typed(config)):
             print(path)
+        if config.pictures is not None:
+            folders = [Path(folder) for folder in config.merge] or [home]
+            for path in draw_chosen_episodes(home, folders, rows, config.pictures):
+                print(path)
 
 
 if __name__ == "__main__":

@@ -7,11 +7,12 @@ import os
 import re
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.lock import folder_lock
 
 PARTIAL = ".partial"  # in the names of files that are being written
 OURS = ".cavin-"  # in the names of those that `atomic_write` makes, which alone are cleared away
@@ -54,28 +55,47 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path} is damaged: it is not JSON ({error})") from error
 
 
-def output_folder(path: str | Path) -> Path:
-    """Create a folder for results, check that it is writable, and delete partial files that a killed run left.
+@contextmanager
+def output_folder(path: str | Path) -> Iterator[Path]:
+    """Hold a folder for results: it exists, is writable and is locked, and what a killed run left half-written is gone.
+
+    A folder that was made for this and is still empty at the end is deleted, so that a refused command leaves nothing.
 
     Raises:
-        UserError: the folder cannot be made or written to.
+        UserError: the folder cannot be made or written to, or another process writes into it.
     """
     folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".probe.{uuid.uuid4().hex[:8]}"
-        probe.touch()
-        probe.unlink()
-        for abandoned in filter(_is_ours, folder.glob(f".*{OURS}*{PARTIAL}*")):
-            abandoned.unlink(missing_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
-        ) from error
-    return folder
+    with ExitStack() as held:
+        try:
+            made = _make(folder)
+            held.callback(_delete_empty, made)
+            held.enter_context(folder_lock(folder))
+            probe = folder / f".probe.{uuid.uuid4().hex[:8]}"
+            probe.touch()
+            probe.unlink()
+            for abandoned in filter(_is_ours, folder.glob(f".*{OURS}*{PARTIAL}*")):
+                abandoned.unlink(missing_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
+            ) from error
+        yield folder
 
 
 def _is_ours(path: Path) -> bool:
     """Whether `atomic_write` made a file: users' own partial downloads may lie in the same folder."""
     name = re.fullmatch(rf"\..+{re.escape(OURS)}[0-9a-f]{{8}}{re.escape(PARTIAL)}(\.[^.]+)?", path.name)
     return name is not None and path.is_file() and not path.is_symlink()
+
+
+def _make(folder: Path) -> list[Path]:
+    """Make a folder; returns those that did not exist before, the deepest first."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _delete_empty(folders: list[Path]) -> None:
+    with suppress(OSError):  # the first that is not empty
+        for folder in folders:
+            folder.rmdir()

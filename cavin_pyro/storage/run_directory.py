@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
+from cavin_pyro.storage.lock import LOCK_NAME
 from envs.tasks import TASKS
 
 # It only decides `checkpoint`, which is compared; older versions did not know it.
@@ -38,7 +39,7 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         UserError: the earlier run had another configuration; the first option that differs is named.
     """
     path = folder / "config.yaml"
-    if not path.exists() or [one.name for one in folder.iterdir()] == ["config.yaml"]:
+    if not path.exists() or {one.name for one in folder.iterdir()} <= {"config.yaml", LOCK_NAME}:
         return  # a run that failed before its first result holds nothing to protect
     try:
         earlier = stored_options(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pyro
 import torch
 from omegaconf import DictConfig
@@ -32,6 +34,11 @@ def train(config: DictConfig) -> Trainer:
         UserError: a configuration or data that cannot be used, or a loss that is not finite.
     """
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
+    with output_folder(config.output) as folder:
+        return _train(config, folder)
+
+
+def _train(config: DictConfig, folder: Path) -> Trainer:
     torch.manual_seed(config.seed)
     model = build_model(config)
     guide = build_guide(config, model)
@@ -61,7 +68,6 @@ def train(config: DictConfig) -> Trainer:
             f"guides that infer any window: {others}"
         )
 
-    folder = output_folder(config.output)
     check_same_run(folder, config, ignore=("data", "output"))
     record = training_provenance(data, origin, windows)
     check_same_data(folder, record["data"])

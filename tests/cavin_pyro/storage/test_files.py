@@ -64,14 +64,15 @@ def test_json_that_cannot_be_read_is_named(content: bytes | None, tmp_path: Path
 
 
 def test_an_output_folder_is_made_and_cleared_of_what_a_kill_left(tmp_path: Path) -> None:
-    folder = output_folder(tmp_path / "deep" / "down")
-    (folder / "results.csv").write_text("whole")
-    (folder / ".hidden").write_text("somebody else's")
-    with atomic_write(folder / "plan.png") as temporary:
-        temporary.write_text("whole")
-        (folder / temporary.name.replace("plan", "killed")).write_text("half")
+    with output_folder(tmp_path / "deep" / "down") as folder:
+        (folder / "results.csv").write_text("whole")
+        (folder / ".hidden").write_text("somebody else's")
+        with atomic_write(folder / "plan.png") as temporary:
+            temporary.write_text("whole")
+            (folder / temporary.name.replace("plan", "killed")).write_text("half")
     assert len(list(folder.iterdir())) == 4
-    assert output_folder(str(folder)) == folder
+    with output_folder(str(folder)) as again:
+        assert again == folder
     assert {path.name for path in folder.iterdir()} == {"results.csv", "plan.png", ".hidden"}
 
 
@@ -93,5 +94,16 @@ def test_partial_files_of_others_stay(tmp_path: Path) -> None:
 def test_an_output_folder_below_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for place in ("file", "file/below"):
-        with pytest.raises(UserError, match=r"cannot be written .*: choose another with output=DIR"):
-            output_folder(tmp_path / place)
+        with (
+            pytest.raises(UserError, match=r"cannot be written .*: choose another with output=DIR"),
+            output_folder(tmp_path / place),
+        ):
+            pass
+
+
+def test_an_output_folder_in_which_nothing_was_written_is_deleted_if_it_was_made_for_it(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for place in ("empty", "deep/down"):
+        with pytest.raises(ZeroDivisionError), output_folder(tmp_path / place):
+            raise ZeroDivisionError
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
