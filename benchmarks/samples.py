@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -66,22 +67,30 @@ def configurations(arguments: argparse.Namespace) -> Iterator[tuple[Setting, Dic
 
 def run(settings: Mapping[Setting, DictConfig], workers: int) -> dict[Setting, list[Row]]:
     """The episodes of all settings, one queue for all; those that are on disk are not run again."""
-    rows = {}
+    with ExitStack() as held:
+        folders = {setting: held.enter_context(output_folder(config.output)) for setting, config in settings.items()}
+        return _run(settings, folders, workers)
+
+
+def _run(
+    settings: Mapping[Setting, DictConfig], folders: Mapping[Setting, Path], workers: int
+) -> dict[Setting, list[Row]]:
+    rows, jobs, owners = {}, [], []
     for setting, config in settings.items():
-        folder = output_folder(config.output)
-        check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
-        write_config(folder, config)
-        rows[setting] = begin(folder)
-    jobs, owners = [], []
-    for setting, config in settings.items():
+        check_same_run(folders[setting], config, ignore=("output", "episodes", "workers", "compare"))
+        write_config(folders[setting], config)
+        rows[setting] = begin(folders[setting])
         for seed in missing_seeds(config, rows[setting]):
             jobs.append((config, seed))
             owners.append(setting)
-    with progress_bar("evaluating", total=len(jobs), initial=0, unit="episode") as bar:
-        for number, row in run_jobs(jobs, workers):
+    with (
+        closing(run_jobs(jobs, workers)) as finished,
+        progress_bar("evaluating", total=len(jobs), initial=0, unit="episode") as bar,
+    ):
+        for number, row in finished:
             setting = owners[number]
             rows[setting][row["seed"]] = row
-            append(Path(settings[setting].output), row)
+            append(folders[setting], row)
             bar.update()
     return {
         setting: [rows[setting][seed] for seed in range(FIRST_SCENE, FIRST_SCENE + config.episodes)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,8 +98,11 @@ def evaluate(
             for seed in missing_seeds(config, rows[variant, task]):
                 jobs.append((config, seed))
                 owners.append((variant, task, folder))
-    with progress_bar("evaluating", total=len(jobs), unit="episode") as bar:
-        for number, row in run_jobs(jobs, workers):
+    with (
+        closing(run_jobs(jobs, workers)) as finished,
+        progress_bar("evaluating", total=len(jobs), unit="episode") as bar,
+    ):
+        for number, row in finished:
             variant, task, folder = owners[number]
             rows[variant, task][row["seed"]] = row
             append(folder, row)

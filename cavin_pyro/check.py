@@ -34,7 +34,9 @@ def main(config: DictConfig) -> None:
         check_same_run(folder, config, ignore=("output", "sections", "export"))
         write_config(folder, config)
         if export:
-            write_samples(context, export, about, windows=config.sizes.export.windows, samples=config.sizes.export.samples)
+            write_samples(
+                context, export, about, windows=config.sizes.export.windows, samples=config.sizes.export.samples
+            )
             print(f"written: {export}")
         # A section of an earlier run is reused if a new run would give the same result.
         data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]

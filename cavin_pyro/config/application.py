@@ -10,11 +10,16 @@ import argparse
 import errno
 import importlib.util
 import os
+import signal
 import sys
+import threading
+import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn, TypeVar
 
 import hydra
@@ -25,7 +30,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
 
 PACKAGES = ("models", "guides", "planning", "envs")
-BAD_INPUT = 2  # exit status
+REPEATING_SECONDS = 1.0
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
 
 T = TypeVar("T")
@@ -58,11 +63,15 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
 
 
 def guarded(action: Callable[[], T]) -> T:
-    """Run; bad input, a full or forbidden disk and an interruption end in one line instead of a traceback."""
+    """Run; bad input, a full or forbidden disk and an interruption end in one line instead of a traceback.
+
+    SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number.
+    """
     try:
-        return action()
+        with _interruptions():
+            return action()
     except UserError as error:
-        _stop(str(error), BAD_INPUT)
+        _stop(str(error), error.status)
     except OSError as error:
         if error.errno not in _DISK_ERRORS:
             raise
@@ -71,8 +80,42 @@ def guarded(action: Callable[[], T]) -> T:
             f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR",
             2,
         )
-    except KeyboardInterrupt:
-        _stop("interrupted; rerun the same command to resume, if it can", 130)
+    except KeyboardInterrupt as error:
+        number = error.number if isinstance(error, Interruption) else signal.SIGINT
+        by = "" if number == signal.SIGINT else f" by {number.name}"
+        _stop(f"interrupted{by}; rerun the same command to resume, if it can", 128 + number)
+
+
+class Interruption(KeyboardInterrupt):
+    """A signal that ends a command as Ctrl-C does."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@contextmanager
+def _interruptions() -> Iterator[None]:
+    """Raise `Interruption` for SIGTERM and SIGHUP, unless they are ignored (nohup) or handled by somebody else."""
+    if threading.current_thread() is not threading.main_thread():  # Python handles signals in the main thread alone
+        yield
+        return
+    latest = -REPEATING_SECONDS
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal latest
+        earlier, latest = latest, time.monotonic()
+        if latest - earlier > REPEATING_SECONDS:  # schedulers send a signal to a process and to its group
+            raise Interruption(signal.Signals(number))
+
+    ours = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) == signal.SIG_DFL]
+    for one in ours:
+        signal.signal(one, interrupt)
+    try:
+        yield
+    finally:
+        for one in ours:
+            signal.signal(one, signal.SIG_DFL)
 
 
 def _stop(line: str, status: int) -> NoReturn:

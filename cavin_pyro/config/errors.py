@@ -9,6 +9,14 @@ from contextlib import contextmanager
 class UserError(Exception):
     """Bad input, with its place and the valid choices: one line, shown without a traceback."""
 
+    status = 2  # of the command
+
+
+class WorkerError(UserError):
+    """A worker process was killed or stopped: nobody's input is bad, and the same command may succeed."""
+
+    status = 1
+
 
 @contextmanager
 def user_input() -> Iterator[None]:

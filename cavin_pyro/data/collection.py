@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,7 @@ from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptio
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
+from cavin_pyro.launching.workers import in_workers
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
@@ -63,22 +64,24 @@ def collect(
 
     Raises:
         UserError: the folder holds a dataset of another configuration.
+        WorkerError: a worker was killed or stopped.
     """
     metadata = _begin(config, folder)
     with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
         if metadata["transitions"] >= transitions:
             return metadata
-        for arrays, seconds in _shards(config, first=metadata["shards"], workers=workers):
-            write_shard(shard_path(folder, metadata["shards"]), arrays)
-            made = int(arrays["length"].sum())
-            metadata["shards"] += 1
-            metadata["episodes"] += len(arrays["length"])
-            metadata["transitions"] += made
-            _write(folder, metadata)
-            _log_time(folder, metadata["shards"] - 1, made, seconds)
-            bar.update(made)
-            if metadata["transitions"] >= transitions:
-                break
+        with closing(_shards(config, first=metadata["shards"], workers=workers)) as shards:
+            for arrays, seconds in shards:
+                write_shard(shard_path(folder, metadata["shards"]), arrays)
+                made = int(arrays["length"].sum())
+                metadata["shards"] += 1
+                metadata["episodes"] += len(arrays["length"])
+                metadata["transitions"] += made
+                _write(folder, metadata)
+                _log_time(folder, metadata["shards"] - 1, made, seconds)
+                bar.update(made)
+                if metadata["transitions"] >= transitions:
+                    break
     return metadata
 
 
@@ -185,17 +188,15 @@ def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str,
     return arrays, {"cpu": time.process_time() - began, **scene.seconds}
 
 
-def _shards(config: CollectionConfig, *, first: int, workers: int) -> Iterator[tuple[Arrays, dict[str, float]]]:
+def _shards(
+    config: CollectionConfig, *, first: int, workers: int
+) -> Generator[tuple[Arrays, dict[str, float]], None, None]:
     numbers = (first + number for number in range(10**9))
     if workers == 1:
         yield from (_collect_shard((config, number)) for number in numbers)
         return
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        waiting = [pool.apply_async(_collect_shard, ((config, next(numbers)),)) for _ in range(2 * workers)]
-        while True:
-            # A bounded queue: `imap` would buffer results without limit.
-            yield waiting.pop(0).get()
-            waiting.append(pool.apply_async(_collect_shard, ((config, next(numbers)),)))
+    with closing(in_workers(_collect_shard, ((config, number) for number in numbers), workers, ordered=True)) as made:
+        yield from (shard for _, shard in made)
 
 
 def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
+from cavin_pyro.launching.workers import in_workers
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 
@@ -32,8 +33,11 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     missing = missing_seeds(config, rows)
     if missing:
         announce_waiting(config)
-    with progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar:
-        for _, row in run_jobs([(config, seed) for seed in missing], config.workers):
+    with (
+        closing(run_jobs([(config, seed) for seed in missing], config.workers)) as finished,
+        progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar,
+    ):
+        for _, row in finished:
             rows[row["seed"]] = row
             append(folder, row)
             bar.update()
@@ -91,35 +95,35 @@ def episode_row(episode: Episode) -> Row:
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process
 
 
-def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Row]]:
+def run_jobs(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Row], None, None]:
     """Run episodes, one per job; yields a job's number and its row, in any order.
 
     A process keeps environment and planner until a job has another configuration, so jobs that share one should follow
-    one another.
+    one another. Close the iterator when leaving it early.
+
+    Raises:
+        WorkerError: a worker was killed or stopped.
     """
     if not jobs:
         return
-    numbered = list(enumerate(jobs))
     if workers == 1:
         try:
-            yield from map(_episode, numbered)
+            yield from ((number, _episode(job)) for number, job in enumerate(jobs))
         finally:
             _close()
         return
-    with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
-        yield from pool.imap_unordered(_episode, numbered)
-        pool.close()  # lets workers exit normally and release resources, such as the compiler's locks
-        pool.join()
+    with closing(in_workers(_episode, jobs, workers)) as rows:
+        yield from rows
 
 
-def _episode(numbered: tuple[int, Job]) -> tuple[int, Row]:
+def _episode(job: Job) -> Row:
     global _runner
-    number, (config, seed) = numbered
+    config, seed = job
     if _runner is None or _runner[0] != config:
         _close()
         torch.set_num_threads(1)  # one thread per worker: more threads per process slow all of them down
         _runner = config, make_runner(config)
-    return number, episode_row(_runner[1].rollout(seed))
+    return episode_row(_runner[1].rollout(seed))
 
 
 def _close() -> None:

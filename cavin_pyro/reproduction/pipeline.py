@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -142,11 +142,12 @@ def _evaluate(
         for seed in missing_seeds(config, rows[one])
     ]
     missing.sort(key=lambda job: (job[0], job[1], job[-1]))
-    for number, row in run_jobs([(config, seed) for *_, config, seed in missing], workers):
-        one = missing[number][2]
-        rows[one][row["seed"]] = row
-        append(evaluation_folder(home, one), row)
-        bar.update(scale.episode_seconds / workers)
+    with closing(run_jobs([(config, seed) for *_, config, seed in missing], workers)) as finished:
+        for number, row in finished:
+            one = missing[number][2]
+            rows[one][row["seed"]] = row
+            append(evaluation_folder(home, one), row)
+            bar.update(scale.episode_seconds / workers)
     return {one: [found[one.seed + place] for place in range(one.episodes)] for one, found in rows.items()}
 
 

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
 from cavin_pyro.config.commands.training import TrainerConfig
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, WorkerError
+from cavin_pyro.launching.workers import killed_by
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import Scale
 
 COLLECTING_SECONDS = 0.03  # per transition and core, for the time left
 PRETRAINING_SECONDS = 300.0
 POLLING_SECONDS = 2.0
+ENDING_SECONDS = 30.0  # for a command that was interrupted
 
 
 @dataclass(frozen=True)
@@ -52,27 +53,25 @@ class Stage:
         """The command as a user types it."""
         return shlex.join(["python", "-m", f"cavin_pyro.{self.command}", *self.options, f"output={self.folder}"])
 
-    def run(self) -> None:
+    def run(self, started: Callable[[subprocess.Popen[bytes]], None] = lambda process: None) -> None:
         """Run the command in a process of its own; what it prints goes to `log.txt` in its folder.
 
+        Args:
+            started: called with the process.
+
         Raises:
-            UserError: it failed, or an earlier process still runs it.
+            UserError: it failed; also where a process that an earlier run left behind still holds the folder.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        with open(self.folder / "lock", "w", encoding="utf-8") as lock, open(self.folder / "log.txt", "ab") as log:
-            try:
-                # The child inherits the lock and holds it until it ends, even if this process is killed.
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise UserError(
-                    f"{self.folder} is being written by a process of an earlier run: wait until it ends, or stop it"
-                ) from None
+        with open(self.folder / "log.txt", "ab") as log:
             words = shlex.split(self.line)[1:]
             environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            done = subprocess.run(
-                [sys.executable, *words], stdout=log, stderr=log, pass_fds=[lock.fileno()], env=environment
-            )
-        if done.returncode:
+            process = subprocess.Popen([sys.executable, *words], stdout=log, stderr=log, env=environment)
+            started(process)
+            status = process.wait()
+        if status < 0:
+            raise WorkerError(f"{self.line} {killed_by(-status)}; rerun the same command to resume")
+        if status:
             last = (self.folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
             raise UserError(f"{self.line} failed: {' '.join(last).removeprefix('error: ')} ({self.folder}/log.txt)")
 
@@ -141,16 +140,34 @@ def run_stages(stages: Sequence[Stage], workers: int, progress: Callable[[], Non
 
     Raises:
         UserError: one has failed; those that run go on to their end, others do not begin.
+        KeyboardInterrupt: also by SIGTERM or SIGHUP; those that run are interrupted as well.
     """
+    processes: list[subprocess.Popen[bytes]] = []
     with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(stage.run) for stage in stages if not stage.finished}
-        while running:
-            ended, running = wait(running, timeout=POLLING_SECONDS, return_when=FIRST_COMPLETED)
-            progress()
-            for one in ended:
-                if one.exception() is not None:
-                    pool.shutdown(cancel_futures=True, wait=False)
-                one.result()
+        running = {pool.submit(stage.run, processes.append) for stage in stages if not stage.finished}
+        try:
+            while running:
+                ended, running = wait(running, timeout=POLLING_SECONDS, return_when=FIRST_COMPLETED)
+                progress()
+                for one in ended:
+                    if one.exception() is not None:
+                        pool.shutdown(cancel_futures=True, wait=False)
+                    one.result()
+        except KeyboardInterrupt:
+            pool.shutdown(cancel_futures=True, wait=False)
+            _end(processes, running)
+            raise
+
+
+def _end(processes: Sequence[subprocess.Popen[bytes]], running: Iterable[Future[None]]) -> None:
+    """Interrupt commands, unless they end by themselves: Ctrl-C at a terminal goes to them too."""
+    for act in (None, subprocess.Popen.terminate, subprocess.Popen.kill):
+        for process in processes:
+            if act is not None and process.poll() is None:
+                act(process)
+        left = [one for one in running if not one.cancelled()]
+        if not wait(left, timeout=POLLING_SECONDS if act is None else ENDING_SECONDS).not_done:
+            return
 
 
 def _number(path: Path, name: str) -> float:

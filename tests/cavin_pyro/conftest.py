@@ -53,8 +53,13 @@ class Answer:
     @property
     def complaints(self) -> list[str]:
         """The lines on stderr, apart from progress bars."""
-        lines = self.errors.replace("\r", "\n").split("\n")
-        return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+(%\|| \w+ \[)", line)]
+        return complaints(self.errors)
+
+
+def complaints(errors: str) -> list[str]:
+    """The lines of stderr, apart from progress bars."""
+    lines = errors.replace("\r", "\n").split("\n")
+    return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+(%\|| \w+ \[)", line)]
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="session")
 def shell() -> SimpleNamespace:
     """Ways to run the commands."""
-    names: list[Callable] = [Case, contents, run_as_users, run_command, run_in_turn, start_command]
+    names: list[Callable] = [Case, complaints, contents, run_as_users, run_command, run_in_turn, start_command]
     return SimpleNamespace(**{name.__name__: name for name in names})
 
 

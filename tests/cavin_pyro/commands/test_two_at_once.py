@@ -18,7 +18,7 @@ def refusals(shell: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -
     """How every command ended in the folder that this process holds, and the folder before and after."""
     folder = tmp_path_factory.mktemp("two")
     with output_folder(folder / "held") as held:
-        for name in ("metadata.json", "episodes.jsonl", "config.yaml", ".other.partial.csv"):
+        for name in ("metadata.json", "episodes.jsonl", "config.yaml", ".plan.cavin-0123abcd.partial.csv"):
             (held / name).write_text("not to be read")
         before = shell.contents(held)
         cases = {name: shell.Case(name, [f"output={held}"]) for name in COMMANDS}

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -72,6 +73,37 @@ def test_an_interruption_is_one_line_and_its_own_status(capsys: pytest.CaptureFi
         guarded(act)
     assert stop.value.code == 130
     assert capsys.readouterr().err.startswith("error: interrupted; rerun the same command to resume")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_signals_that_end_a_command_do_so_in_one_line_once_everything_is_saved(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = []
+
+    def act() -> None:
+        try:
+            os.kill(os.getpid(), number)
+            done.append("went on")
+        finally:
+            os.kill(os.getpid(), number)  # as schedulers do, which signal a process and its group
+            done.append("saved")
+
+    with pytest.raises(SystemExit) as stop:
+        guarded(act)
+    assert (stop.value.code, done) == (128 + number, ["saved"])
+    said = f"error: interrupted by {number.name}; rerun the same command to resume, if it can\n"
+    assert capsys.readouterr() == ("", said)
+    assert signal.getsignal(number) == signal.SIG_DFL
+
+
+def test_a_signal_that_is_ignored_stays_so() -> None:
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert guarded(lambda: os.kill(os.getpid(), signal.SIGHUP)) is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None:
@@ -165,7 +197,7 @@ def test_a_disk_that_takes_no_more_ends_a_command_in_one_line(
     complaint = answer.complaints[-1]
     assert complaint.startswith(f"error: the disk refused to store results at out/{refused}: ")
     assert "Traceback" not in answer.errors
-    assert {path.name for path in (tmp_path / "out").iterdir() if path.is_file()} == left
+    assert {path.name for path in (tmp_path / "out").glob("*") if path.is_file()} == left
 
 
 def test_every_command_declares_its_options() -> None:

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import random
+import re
 import signal
 import time
 from dataclasses import replace
@@ -14,7 +15,6 @@ import numpy as np
 import pytest
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data import collection
 from cavin_pyro.data.collection import CollectionConfig, collect, collect_episode, repair
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path
 from envs.objects.sampling import ObjectRanges
@@ -199,32 +199,37 @@ def test_a_scene_without_room_is_a_user_error(small: SimpleNamespace, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
-def test_shards_of_several_workers_are_written_in_order(
-    small: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+def test_a_killed_worker_and_sigterm_end_a_collection_in_one_line_and_keep_its_files(
+    shell: SimpleNamespace, tmp_path: Path
 ) -> None:
-    """Shards that come late still come in order."""
-    made = []
+    """The first has two workers, of which one is killed; the second resumes it alone and is told to end."""
+    overrides = ["transitions=1000000", "steps=2", "episodes_per_shard=1", "seed=5", "output=out"]
+    folder, seen = tmp_path / "out", 0
+    for workers, status, said in (
+        (2, 1, "error: worker process [0-9]+ was killed by signal 9 .*: rerun the same command to resume"),
+        (1, 128 + signal.SIGTERM, "error: interrupted by SIGTERM; rerun the same command to resume, if it can"),
+    ):
+        process = shell.start_command("collect", *overrides, f"workers={workers}", folder=tmp_path)
+        while process.poll() is None and counted(folder) == seen:
+            time.sleep(0.01)
+        if workers == 2:
+            os.kill(workers_of(process.pid)[1], signal.SIGKILL)
+        else:
+            process.terminate()
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == status, errors
+        assert re.fullmatch(said, shell.complaints(errors)[-1])
+        assert "Traceback" not in errors
+        assert counted(folder) > seen
+        seen = counted(folder)
+        assert len(list(folder.glob("episodes-*.h5"))) - seen in (0, 1)  # a file counts when the metadata say so
+    assert not list(folder.glob(".*"))  # neither half-written files nor the lock
 
-    class Late:
-        def __init__(self, job: tuple[CollectionConfig, int]) -> None:
-            self.job = job
 
-        def get(self) -> tuple[dict, dict]:
-            made.append(self.job[1])
-            return {"length": np.array([self.job[1]])}, {}
+def counted(folder: Path) -> int:
+    return read_metadata(folder)["shards"] if (folder / "metadata.json").exists() else 0
 
-    class Pool:
-        def __enter__(self) -> Pool:
-            return self
 
-        def __exit__(self, *error: object) -> None:
-            pass
-
-        def apply_async(self, function: object, arguments: tuple) -> Late:
-            return Late(*arguments)
-
-    context = SimpleNamespace(Pool=lambda workers: Pool())
-    monkeypatch.setattr(collection.multiprocessing, "get_context", lambda method: context)
-    shards = collection._shards(small.pushes, first=3, workers=4)
-    assert [int(next(shards)[0]["length"][0]) for _ in range(20)] == list(range(3, 23))
-    shards.close()
+def workers_of(pid: int) -> list[int]:
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(one) for one in children if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]

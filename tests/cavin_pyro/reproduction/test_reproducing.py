@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from filelock import FileLock
 
+from cavin_pyro.config.errors import UserError, WorkerError
+from cavin_pyro.reproduction import stages
 from cavin_pyro.reproduction.stages import Stage, run_stages
+from cavin_pyro.storage.files import output_folder
 
 WHOLE = ("scale=minimal", "methods=[mpc]", "planners=[paper]", "workers=1", "output=whole")
 TWO_METHODS = ("scale=minimal", "methods=[cavin,mpc]", "planners=[paper]")  # in make soak
@@ -83,23 +88,45 @@ def test_a_reproduction_killed_three_times_equals_an_unbroken_one(shell: SimpleN
 
 
 def wait_for_orphans(home: Path) -> None:
-    """Processes of a killed run hold their locks until they end."""
-    import fcntl
-
-    for path in home.rglob("lock"):
-        with open(path) as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+    """Processes of a killed run hold their folders until they end."""
+    for path in home.rglob(".lock"):
+        with FileLock(path):
+            pass
 
 
 def test_a_stage_that_another_process_writes_is_refused(tmp_path: Path) -> None:
-    import fcntl
+    stage = Stage("collect", ("transitions=1",), tmp_path / "data", "statistics.png", 1.0)
+    with output_folder(stage.folder), pytest.raises(UserError, match=r"failed: .*data is being written by process \d+"):
+        stage.run()
 
-    stage = Stage("train", (), tmp_path / "train", "training.png", 1.0)
-    stage.folder.mkdir()
-    with open(stage.folder / "lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(Exception, match="is being written by a process of an earlier run"):
-            stage.run()
+
+class Sleeping(Stage):
+    """A command that sleeps, and ends otherwise only by a signal."""
+
+    @property
+    def line(self) -> str:
+        return f"python -c 'import time; time.sleep({self.seconds})'"
+
+
+def test_an_interruption_reaches_the_stages_that_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "POLLING_SECONDS", 0.2)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_stages([Sleeping("", (), tmp_path / name, "never", 60.0) for name in "abc"], 2, interrupt)
+    assert time.monotonic() - began < 30
+    assert not (tmp_path / "c").exists()  # it had to wait, and does not begin
+
+
+def test_a_killed_stage_is_told_with_its_signal(tmp_path: Path) -> None:
+    def kill(process: subprocess.Popen[bytes]) -> None:
+        process.kill()
+
+    with pytest.raises(WorkerError, match=r"sleep\(60.0\)' was killed by signal 9 \(SIGKILL\), perhaps because memory"):
+        Sleeping("", (), tmp_path / "a", "never", 60.0).run(kill)
 
 
 def test_a_failed_stage_is_told_with_its_command_and_its_last_line(tmp_path: Path) -> None:

@@ -87,7 +87,8 @@ def test_partial_files_of_others_stay(tmp_path: Path) -> None:
     for name in names:
         (tmp_path / name).write_text("a user's")
     (tmp_path / ".sawyer.cavin-0123abcd.partial").mkdir()
-    output_folder(tmp_path)
+    with output_folder(tmp_path):
+        pass
     assert {path.name for path in tmp_path.iterdir()} == {*names, ".sawyer.cavin-0123abcd.partial"}
 
 

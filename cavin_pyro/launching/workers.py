@@ -1,0 +1,220 @@
+"""Worker processes of one command: when one dies, the command says so and ends; when the command dies, they end too.
+
+Each worker has a pipe of its own. The pools of Python's library share one queue of results among all workers, so one
+that is killed while it sends a result leaves the others, and who waits for them, locked for ever:
+`multiprocessing.Pool` also waits for ever for the result of any worker that was killed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple, TypeVar
+
+from cavin_pyro.config.errors import WorkerError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+POLLING_SECONDS = 2.0  # between looks for stopped workers
+PATIENCE_SECONDS = 1.0  # for our own signal, when a worker was ended by one that goes to the whole group
+ENDING_SECONDS = 30.0  # for workers that have nothing left to do
+GROUP_SIGNALS = {-signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
+
+
+def in_workers(
+    function: Callable[[Job], Result], jobs: Iterable[Job], workers: int, *, ordered: bool = False
+) -> Generator[tuple[int, Result], None, None]:
+    """Yield the number of each job and what the function makes of it, in worker processes.
+
+    Close the iterator (`contextlib.closing`) when leaving it early: that ends the workers at once.
+
+    Args:
+        function: importable by its name. jobs: may be endless. workers: processes, one job each at a time.
+        ordered: in the order of the jobs; no worker then runs ahead by more than two jobs for each worker.
+
+    Raises:
+        WorkerError: a worker was killed or stopped. What other workers had finished by then comes first.
+        Exception: whatever the function raises, with the worker's traceback as its cause.
+    """
+    ahead = 2 * workers if ordered else None
+    with _Workers(function, workers) as pool:
+        early: dict[int, Result] = {}
+        given, next_number = 0, 0
+        queue = enumerate(jobs)
+        while True:
+            free = pool.idle if ahead is None else min(pool.idle, next_number + ahead - given)
+            for job in itertools.islice(queue, max(0, free)):
+                pool.give(*job)
+                given += 1
+            if not pool.busy:
+                break
+            for number, result in pool.collect():
+                if not ordered:
+                    yield number, result
+                    continue
+                early[number] = result
+                while next_number in early:
+                    yield next_number, early.pop(next_number)
+                    next_number += 1
+        pool.end()
+
+
+class _Worker(NamedTuple):
+    process: BaseProcess
+    pipe: Connection
+
+
+class _Workers:
+    """Processes and what each is doing."""
+
+    def __init__(self, function: Callable[[Any], Any], most: int) -> None:
+        self._function, self._most = function, most
+        self._workers: list[_Worker] = []
+        self._jobs: dict[Connection, int] = {}  # numbers of the jobs that are being done
+        self._suspects: set[int] = set()  # workers that were stopped when last looked at
+
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for worker in self._workers:
+            worker.process.kill()  # also a stopped one
+            worker.process.join()
+            worker.pipe.close()
+        self._workers.clear()
+
+    @property
+    def idle(self) -> int:
+        """Jobs that could be given now."""
+        return self._most - len(self._jobs)
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._jobs)
+
+    def give(self, number: int, job: Any) -> None:
+        """Give a job to an idle worker, or to a new one."""
+        worker = next((one for one in self._workers if one.pipe not in self._jobs), None) or self._start()
+        self._jobs[worker.pipe] = number
+        with suppress(OSError):  # it is dead: `collect` tells how it ended
+            worker.pipe.send(job)
+
+    def collect(self) -> Iterator[tuple[int, Any]]:
+        """Wait until something is finished."""
+        pipes = [worker.pipe for worker in self._workers]
+        while not (ready := wait(pipes, POLLING_SECONDS)):
+            self._look_for_stopped()
+        self._suspects.clear()
+        dead = []
+        for pipe in ready:
+            assert isinstance(pipe, Connection)
+            try:
+                succeeded, result = pipe.recv()
+            except (EOFError, OSError):
+                dead.append(pipe)
+                continue
+            number = self._jobs.pop(pipe)
+            if not succeeded:
+                error, text = result
+                raise error from RuntimeError(f"in a worker process:\n{text}")
+            yield number, result
+        if dead:
+            raise WorkerError(self._epitaph(dead[0]))
+
+    def end(self) -> None:
+        """Let idle workers exit as processes do, so that they release resources such as the compiler's locks."""
+        for worker in self._workers:
+            worker.pipe.close()
+        deadline = time.monotonic() + ENDING_SECONDS
+        for worker in self._workers:
+            worker.process.join(max(0.0, deadline - time.monotonic()))
+
+    def _start(self) -> _Worker:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(self._function, theirs), daemon=True)
+        with _blocked(signal.SIGINT):  # Ctrl-C goes to the whole group; workers inherit the mask and leave it to us
+            process.start()
+        theirs.close()
+        worker = _Worker(process, ours)
+        self._workers.append(worker)
+        return worker
+
+    def _look_for_stopped(self) -> None:
+        """Find workers that are stopped, as by SIGSTOP, at two looks: after `fg` the first may come too early."""
+        stopped = {worker.process.pid for worker in self._workers if worker.pipe in self._jobs and _stopped(worker)}
+        for pid in stopped & self._suspects:
+            raise WorkerError(f"worker process {pid} was stopped by a signal and does not go on; {_ADVICE}")
+        self._suspects = {pid for pid in stopped if pid is not None}
+
+    def _epitaph(self, pipe: Connection) -> str:
+        process = next(worker.process for worker in self._workers if worker.pipe is pipe)
+        process.join(ENDING_SECONDS)
+        code = process.exitcode
+        if code in GROUP_SIGNALS:
+            time.sleep(PATIENCE_SECONDS)  # our own signal, if there is one, ends this command in its own line
+        if code is None or code >= 0:
+            return f"worker process {process.pid} ended with exit status {code}; {_ADVICE}"
+        return f"worker process {process.pid} {killed_by(-code)}; {_ADVICE}"
+
+
+_ADVICE = "what was finished is kept: rerun the same command to resume"
+
+
+def killed_by(number: int) -> str:
+    """What a signal did to a process, for an error line."""
+    reason = ", perhaps because memory ran out: try fewer workers" if number == signal.SIGKILL else ""
+    return f"was killed by signal {number} ({signal.Signals(number).name}){reason}"
+
+
+def _stopped(worker: _Worker) -> bool:
+    assert worker.process.pid is not None
+    with suppress(ChildProcessError):  # it has ended
+        return os.waitid(os.P_PID, worker.process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+    return False
+
+
+@contextmanager
+def _blocked(number: signal.Signals) -> Iterator[None]:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [number])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _work(function: Callable[[Any], Any], pipe: Connection) -> None:
+    """What a worker does: a job at a time, until the parent closes the pipe or ends in any way."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    while True:
+        try:
+            job = pipe.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            answer: tuple[bool, Any] = True, function(job)
+        except Exception as error:
+            answer = False, (error, traceback.format_exc())
+        try:
+            pipe.send(answer)
+        except OSError:
+            return
+        except Exception as error:  # an error of the user's own that cannot be sent
+            pipe.send((False, (RuntimeError(f"{type(error).__name__}: {error}"), traceback.format_exc())))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
