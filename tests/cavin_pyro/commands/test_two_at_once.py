@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -39,10 +38,3 @@ def test_a_second_command_is_refused_in_one_line(command: str, refusals: SimpleN
 def test_a_refused_command_touches_nothing(refusals: SimpleNamespace) -> None:
     assert len(refusals.before) == 5  # with the lock itself
     assert refusals.after == refusals.before
-
-
-def test_a_reader_needs_no_lock(shell: SimpleNamespace, own_pushes: Path, tmp_path: Path) -> None:
-    with output_folder(own_pushes):
-        overrides = [f"data={own_pushes}", "steps=1", "clouds=10", "batch_size=2", "output=out"]
-        answer = shell.run_command("pretrain", *overrides, folder=tmp_path)
-    assert answer.status == 0, answer.errors

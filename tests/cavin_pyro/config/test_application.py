@@ -248,7 +248,7 @@ def test_a_configuration_from_python_is_that_of_the_command() -> None:
 
 def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
     for overrides, complaint in {
-        ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from cascaded, flat,",
+        ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from auto_iaf, auto_low_rank,",
         ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",
         ("plan", "guide=flat"): "unknown override 'guide': valid are checkpoint, ",
         ("plan", "objects=many"): "objects must be a whole number, not many",
