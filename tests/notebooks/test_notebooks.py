@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,11 @@ def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncKernelManage
     return AsyncKernelManager(kernel_name=KERNEL, kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))
 
 
-def test_there_are_notebooks() -> None:
-    assert len(NOTEBOOKS) >= 3
+def test_notebooks_follow_a_workflow_and_each_leads_to_the_next() -> None:
+    names = [path.name for path in NOTEBOOKS]
+    assert [name[:2] for name in names] == [f"{number}_" for number in range(1, len(names) + 1)] and len(names) >= 5
+    for path, following in pairwise(NOTEBOOKS):
+        assert f"]({following.name})" in read(path).cells[-1].source
 
 
 def test_the_kernel_is_the_interpreter_of_the_tests(kernel: AsyncKernelManager) -> None:
