@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("pretrain")
 def main(config: DictConfig) -> None:
-    """Train PointNet to reconstruct a dataset's clouds, and write it as a checkpoint."""
+    """Train PointNet to reconstruct a dataset's clouds, and write it as a checkpoint; resumes an interrupted run."""
     import numpy as np
     import torch
 
@@ -18,7 +18,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.checkpoint import save_checkpoint
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
-    from cavin_pyro.storage.run_directory import write_config
+    from cavin_pyro.storage.run_directory import check_same_run, write_config
     from cavin_pyro.training.factory import data_folders
     from cavin_pyro.training.pretraining import pretrain
     from cavin_pyro.visualization.training import draw_reconstructions
@@ -33,6 +33,7 @@ def main(config: DictConfig) -> None:
             generator=np.random.default_rng(config.seed),
             held_out_objects=config.held_out_objects,
         )
+        check_same_run(folder, config, ignore=("data", "output"))
         stored_config = write_config(folder, config)
         losses = pretrain(
             autoencoder,
@@ -42,6 +43,7 @@ def main(config: DictConfig) -> None:
             learning_rate=config.learning_rate,
             seed=config.seed,
             log=folder / "metrics.csv",
+            resume=folder / "resume.safetensors",
         )
         record = {**provenance(), "clouds": len(clouds), "losses": losses}
         parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}

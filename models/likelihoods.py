@@ -54,6 +54,11 @@ class LikelihoodScales(Scales):
     start: float = 0.077  # normalised
     motion: float = 0.245  # normalised
 
+    def __post_init__(self) -> None:
+        """Raises `ValueError` for one that is not positive."""
+        for name, value in vars(self).items():
+            _check_positive(name, value)
+
 
 @dataclass(frozen=True)
 class PredictedScales(LikelihoodScales):
@@ -90,14 +95,18 @@ class LearnedScales(Scales, nn.Module):
         """Initial values. Raises `ValueError` for one that is not positive."""
         super().__init__()
         for name, value in (("center", center), ("feature", feature), ("start", start), ("motion", motion)):
-            if not value > 0:
-                raise ValueError(f"scales.{name} must be positive, not {value:g}")
+            _check_positive(name, value)
             self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(value).log()))
 
     def __getattr__(self, name: str) -> Any:
         if name in ("center", "feature", "start", "motion"):
             return self.get_parameter(f"log_{name}").exp()
         return super().__getattr__(name)
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not 0 < value < float("inf"):
+        raise ValueError(f"scales.{name} must be positive, not {value:g}")
 
 
 def _masked_normal(mean: Tensor, scale: float | Tensor, mask: Tensor, event_dims: int) -> TorchDistribution:

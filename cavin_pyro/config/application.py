@@ -33,6 +33,8 @@ PACKAGES = ("models", "guides", "planning", "envs")
 REPEATING_SECONDS = 1.0
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
 
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "calculation overflowed")  # torch's words
+
 T = TypeVar("T")
 Body = Callable[[DictConfig], None]
 
@@ -80,6 +82,10 @@ def guarded(action: Callable[[], T]) -> T:
             f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR",
             2,
         )
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not any(said in str(error) for said in _NO_MEMORY):
+            raise
+        _stop(f"these options need more memory than there is: choose smaller ones ({str(error)[:160]})", 2)
     except KeyboardInterrupt as error:
         number = error.number if isinstance(error, Interruption) else signal.SIGINT
         by = "" if number == signal.SIGINT else f" by {number.name}"

@@ -41,6 +41,7 @@ class About:
         help: one line. unit: of a number. group: the heading under which `--help` lists it.
         choices: names, or the dotted path of a collection of them, which is imported on demand.
         minimum, maximum: both allowed. above: an exclusive lower bound.
+        limit: a number beyond it is a slip, which would fill the memory or never end; `--help` does not tell it.
     """
 
     help: str
@@ -50,6 +51,7 @@ class About:
     minimum: float | None = None
     maximum: float | None = None
     above: float | None = None
+    limit: float | None = None
 
     @property
     def names(self) -> tuple[str, ...] | None:
@@ -134,6 +136,9 @@ def check_value(name: str, value: Any, about: About, *, whole: bool = False) -> 
         and not about.minimum <= value <= (float("inf") if about.maximum is None else about.maximum)
     ):
         raise UserError(f"{name} must be {_range(about, whole)}, not {shown(value)}")
+    elif about.limit is not None and not value <= about.limit:
+        unit = f" {about.unit}" if about.unit else ""
+        raise UserError(f"{name} must be at most {about.limit:.10g}{unit}, not {shown(value)}")
 
 
 def shown(value: Any) -> Any:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pyro
+from omegaconf import ListConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import check_sizes
@@ -45,6 +46,8 @@ def choose_sections(names: str | Sequence[str] | None, sizes: Mapping[str, Mappi
     Raises:
         UserError: unknown section, none at all, or a size below 1.
     """
+    if not isinstance(names, str | Sequence | ListConfig | None):
+        raise UserError(f"sections must be a list of {', '.join(SECTIONS)}, not {names}")
     wanted = list(SECTIONS) if names is None else [names] if isinstance(names, str) else list(names)
     unknown = [name for name in wanted if name not in SECTIONS]
     if unknown or not wanted:

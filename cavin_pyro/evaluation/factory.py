@@ -29,7 +29,7 @@ from models.model import Model
 from models.networks.geometry import Geometry
 from models.priors.flow import FlowPrior
 from planning import Planner
-from planning.inputs import OptimizerError
+from planning.inputs import NoFiniteCandidateError, OptimizerError
 from planning.optimizers import Shooting
 from planning.protocol import RewardFunction
 from planning.searching import SearchingPlanner
@@ -56,12 +56,13 @@ class EpisodeRunner:
         """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`.
 
         Raises:
-            UserError: an optimizer of the user's own breaks the interface of optimizers.
+            UserError: an optimizer of the user's own breaks the interface of optimizers, or the model predicts nothing
+                finite.
         """
         parts = self.env, self.planner, self.pointnet
         try:
             return rollout(*parts, seed=seed, pushes_per_plan=self.pushes_per_plan, **options)
-        except OptimizerError as error:
+        except (OptimizerError, NoFiniteCandidateError) as error:
             raise UserError(str(error)) from error
 
 

@@ -104,21 +104,7 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
             module.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
-    check_manifest(path, shipped_folder())
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
-    if header.get("format") != FORMAT:
-        raise UserError(f"{path} is a safetensors file of another program, not a checkpoint of cavin_pyro")
-    if header.get("version") != str(FORMAT_VERSION):
-        raise UserError(
-            f"checkpoint {path} has format version {header.get('version')}, this program reads {FORMAT_VERSION}"
-        )
+    header, tensors = _read(path)
     try:
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
     except (KeyError, ValueError, RecursionError) as error:
@@ -127,7 +113,6 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
     if not isinstance(provenance, dict):
         raise UserError(f"checkpoint {path} has a damaged header (its provenance has no entries)")
-    _check_weights(tensors, header.get("sha256"), path)
     if old := renamed(config):
         raise UserError(
             f"checkpoint {path} has old names: {', '.join(old)}: "
@@ -171,6 +156,36 @@ def shipped_folder() -> Path:
 def default_checkpoint() -> Path:
     """The checkpoint that commands load by default."""
     return find_checkpoint(DEFAULT_CHECKPOINT)
+
+
+def verify_checkpoint(path: Path) -> None:
+    """Check that a file is a whole checkpoint with the weights that were saved, without building anything.
+
+    Raises:
+        UserError: it is not.
+    """
+    _read(path)
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """The header and the checked weights of a checkpoint."""
+    if not path.is_file():
+        raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
+    check_manifest(path, shipped_folder())
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path} is a safetensors file of another program, not a checkpoint of cavin_pyro")
+    if header.get("version") != str(FORMAT_VERSION):
+        raise UserError(
+            f"checkpoint {path} has format version {header.get('version')}, this program reads {FORMAT_VERSION}"
+        )
+    _check_weights(tensors, header.get("sha256"), path)
+    return header, tensors
 
 
 def _check_weights(tensors: Mapping[str, Tensor], digest: str | None, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import math
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
+from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
 from models.networks.pointnet import PointNetAutoencoder
 
 
@@ -27,6 +29,7 @@ def pretrain(
     learning_rate: float,
     seed: int,
     log: Path,
+    resume: Path | None = None,
 ) -> dict[str, float]:
     """Minimise the Chamfer distance between clouds and their reconstructions.
 
@@ -35,13 +38,15 @@ def pretrain(
 
     Args:
         clouds: [N, 256, 3] metres from their centres. log: where the losses go, as CSV.
+        resume: a file that keeps the state at every fiftieth of the steps, from which the same call resumes; the result
+            equals that of an unbroken run.
 
     Returns:
         Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, the loss of one
         average cloud for all.
 
     Raises:
-        UserError: the loss is not finite.
+        UserError: the loss is not finite, or the resume file is damaged or of other clouds.
     """
     generator = np.random.default_rng(seed)
     held_out = max(1, len(clouds) // 10)
@@ -49,9 +54,23 @@ def pretrain(
     optimizer = torch.optim.Adam(autoencoder.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     rows: list[tuple[int, float, float]] = []
-    running = 0.0
-    with progress_bar("pretraining", total=steps) as bar:
-        for step in range(1, steps + 1):
+    begun, running = 0, 0.0
+    digest = hashlib.sha256(clouds.tobytes()).hexdigest()
+    if resume is not None and resume.exists():
+        with resuming(resume) as (tensors, state):
+            if state["clouds"] != digest:
+                raise ValueError("it was made with other clouds")
+            autoencoder.load_state_dict(section(tensors, "autoencoder"))
+            load_optimizer(optimizer, tensors)
+            generator.bit_generator.state = state["generator"]
+            schedule.last_epoch, schedule._last_lr = state["step"], [state["rate"]]
+            optimizer.param_groups[0]["lr"] = float(state["rate"])
+            rows = [(int(step), float(loss), float(validated)) for step, loss, validated in state["rows"]]
+            begun = rows[-1][0]
+            if begun != state["step"]:
+                raise ValueError("its counters contradict one another")
+    with progress_bar("pretraining", total=steps, initial=begun) as bar:
+        for step in range(begun + 1, steps + 1):
             batch = _augment(training[generator.integers(len(training), size=batch_size)], generator)
             optimizer.zero_grad(set_to_none=True)
             loss = autoencoder.loss(batch)
@@ -63,15 +82,15 @@ def pretrain(
             running += loss.item()
             bar.update()
             if step % max(1, steps // 50) == 0 or step == steps:
-                rows.append(
-                    (
-                        step,
-                        running / max(1, step - (rows[-1][0] if rows else 0)),
-                        _loss(autoencoder, validation),
-                    )
-                )
+                mean = running / max(1, step - (rows[-1][0] if rows else 0))
+                rows.append((step, mean, _loss(autoencoder, validation)))
                 running = 0.0
                 bar.set_postfix(validation=f"{rows[-1][2]:.4f}")
+                if resume is not None:
+                    weights = {f"autoencoder.{name}": value for name, value in autoencoder.state_dict().items()}
+                    state = {"clouds": digest, "step": step, "rate": schedule.get_last_lr()[0], "rows": rows}
+                    state["generator"] = generator.bit_generator.state
+                    write_resume(resume, {**weights, **optimizer_tensors(optimizer)}, state)
     with atomic_write(log) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("step", "training", "validation"), *rows])
     return {"validation": rows[-1][2], "mean_shape": _mean_shape_loss(training, validation)}

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyro
 import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
-from cavin_pyro.config.errors import user_input
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
-from cavin_pyro.data.windows import load_windows
-from cavin_pyro.storage.checkpoint import save_checkpoint
+from cavin_pyro.data.dataset import content_fingerprint, read_metadata
+from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.storage.checkpoint import save_checkpoint, verify_checkpoint
 from cavin_pyro.storage.files import output_folder, write_json
 from cavin_pyro.storage.geometry import check_fit, chosen_geometry, part_name
+from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.factory import build_objective, data_folders
-from cavin_pyro.training.provenance import training_provenance
 from cavin_pyro.training.trainer import Trainer, fixed_windows
 from envs.workspace import MAXIMUM_OBJECTS
 
@@ -80,7 +83,43 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
 
     trainer = configured(TrainerConfig, config.trainer, "trainer")
     run = Trainer(model, guide, objective, windows, folder, save, trainer, seed=config.seed)
+    run.resume()
+    _keep_best(run, path, save)
     run.run()
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
     return run
+
+
+def training_provenance(data: Sequence[Path], geometry: Mapping[str, Any], windows: WindowTable) -> dict[str, Any]:
+    """The provenance of a trained model: the run, its data and what `geometry` says of the geometric features."""
+    names = ("transitions", "episodes", "configuration", "made_by")
+    return {
+        **provenance(),
+        "data": [
+            {**{name: read_metadata(folder)[name] for name in names}, "fingerprint": content_fingerprint(folder)}
+            for folder in data
+        ],
+        **geometry,
+        "training_windows": len(windows.training),
+        "validation_windows": len(windows.validation),
+    }
+
+
+def _keep_best(run: Trainer, path: Path, save: Callable[[int, dict[str, float]], None]) -> None:
+    """Make sure that a resumed run still has its best checkpoint, which a later validation need not surpass.
+
+    Raises:
+        UserError: it is gone or damaged, and the weights in the resume file are later ones.
+    """
+    if not run.rows:
+        return
+    if not path.exists() and run.best_step == run.step:
+        save(run.step, run.rows[-1])
+    try:
+        verify_checkpoint(path)
+    except UserError as error:
+        raise UserError(
+            f"{path}, the best checkpoint of this run, of step {run.best_step}, is gone or damaged, and later weights "
+            f"cannot replace it: restore it, delete {run.resume_path.name} to start again, or choose another output=DIR"
+        ) from error

@@ -13,12 +13,9 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pyro
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 
@@ -30,6 +27,7 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
 from cavin_pyro.training.objectives import Objective
+from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
 from guides.guide import Guide
 from models.model import Model
 
@@ -80,10 +78,9 @@ class Trainer:
         """Train until the steps are done or patience is lost; resumes from the resume file if it exists.
 
         Raises:
-            UserError: a loss or gradient that is not finite (the term is named), or a damaged resume file.
+            UserError: a loss or gradient that is not finite (the term is named), or as `resume`.
         """
-        if self.resume_path.exists():
-            self._resume()
+        self.resume()
         self._check_programs()
         config, running, since = self.config, 0.0, time.perf_counter()
         with (
@@ -188,31 +185,33 @@ class Trainer:
             "counters": torch.tensor([self.step, self.best, self.best_step, self.stale], dtype=torch.float64),
         }
         for part, module in (("model", self.model), ("guide", self.guide)):
-            tensors |= {f"{part}.{name}": value.detach() for name, value in module.state_dict().items()}
-        for number, entry in self._optimizer.state_dict()["state"].items():
-            tensors |= {f"adam.{number}.{name}": value for name, value in entry.items()}
-        with atomic_write(self.resume_path) as temporary:
-            temporary.write_bytes(save({name: value.contiguous() for name, value in tensors.items()}))
+            tensors |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
+        write_resume(self.resume_path, {**tensors, **optimizer_tensors(self._optimizer)}, {})
 
-    def _resume(self) -> None:
-        try:
-            tensors = load_file(self.resume_path)
-        except (SafetensorError, OSError) as error:
-            raise UserError(
-                f"{self.resume_path} is damaged ({error}): delete it to start again, or choose another output=DIR"
-            ) from error
-        for part, module in (("model", self.model), ("guide", self.guide)):
-            module.load_state_dict(_section(tensors, part))
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, value in _section(tensors, "adam").items():
-            number, _, entry = name.partition(".")
-            moments.setdefault(int(number), {})[entry] = value
-        self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": moments})
-        step, best, best_step, stale = tensors["counters"].tolist()
-        self.step, self.best, self.best_step, self.stale = int(step), best, int(best_step), int(stale)
+    def resume(self) -> None:
+        """Take over the state in the resume file, if there is one.
+
+        Raises:
+            UserError: it is damaged, or `metrics.csv` does not belong to it.
+        """
+        if self.step or not self.resume_path.exists():
+            return
+        with resuming(self.resume_path) as (tensors, _):
+            for part, module in (("model", self.model), ("guide", self.guide)):
+                module.load_state_dict(section(tensors, part))
+            load_optimizer(self._optimizer, tensors)
+            step, best, best_step, stale = tensors["counters"].tolist()
+            if not (math.isfinite(best) and 1 <= best_step <= step and stale >= 0):
+                raise ValueError("its counters contradict one another")
+            self.step, self.best, self.best_step, self.stale = int(step), best, int(best_step), int(stale)
+            self._batches.set_state(tensors["batches"])
+            torch.set_rng_state(tensors["random"])
         self.rows = [row for row in read_rows(self.folder / "metrics.csv") if row["step"] <= step]
-        self._batches.set_state(tensors["batches"])
-        torch.set_rng_state(tensors["random"])
+        if not {self.step, self.best_step} <= {int(row["step"]) for row in self.rows}:
+            raise UserError(
+                f"{self.folder / 'metrics.csv'} lacks step {self.step} or {self.best_step} of {self.resume_path.name}: "
+                "delete both to start again, or choose another output=DIR"
+            )
 
 
 def fixed_windows(windows: WindowTable, count: int, seed: int) -> Tensor:
@@ -230,10 +229,19 @@ def unchecked_programs() -> Iterator[None]:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The metrics that a run has written so far."""
-    with open(path, newline="", encoding="utf-8") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    """The metrics that a run has written so far.
 
-
-def _section(tensors: dict[str, Any], part: str) -> dict[str, Any]:
-    return {name[len(part) + 1 :]: value for name, value in tensors.items() if name.startswith(f"{part}.")}
+    Raises:
+        UserError: the file is missing, or holds something else.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        if not all({"step", "validation_loss"} <= set(row) and math.isfinite(row["step"]) for row in rows):
+            raise ValueError("a row has no step")
+        return rows
+    except (OSError, ValueError, TypeError, AttributeError, csv.Error) as error:
+        raise UserError(
+            f"{path} is missing or damaged ({' '.join(str(error).split())}): delete resume.safetensors beside it to "
+            "start again, or choose another output=DIR"
+        ) from error

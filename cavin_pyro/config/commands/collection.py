@@ -15,16 +15,22 @@ class CollectionOptions:
     """Options that determine the collected episodes, apart from their world."""
 
     seed: int = seed_option("root of all randomness", group="run")
-    steps: int = option(10, "pushes per episode", minimum=1, group="data")
+    steps: int = option(10, "pushes per episode", minimum=1, group="data", limit=10_000)
     intent_length: int = option(
-        5, "pushes in a row that share a target object and a direction", minimum=1, group="data"
+        5,
+        "pushes in a row that share a target object and a direction",
+        minimum=1,
+        group="data",
+        limit=10_000,
     )
     perturbation_rate: float = option(
         0.3, "fraction of pushes with a perturbed start", minimum=0, maximum=1, group="data"
     )
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
     maximum_objects: int = option(MAXIMUM_OBJECTS, "objects on the table, at most", group="data")
-    episodes_per_shard: int = option(50, "episodes per file, the unit of resuming", minimum=1, group="data")
+    episodes_per_shard: int = option(
+        50, "episodes per file, the unit of resuming", minimum=1, group="data", limit=10_000
+    )
 
 
 @dataclass
@@ -33,13 +39,17 @@ class CollectConfig(CollectionOptions):
 
     defaults: list[Any] = field(default_factory=lambda: ["_self_", {"env/ranges": "paper"}, "base"])
     transitions: int = option(
-        100_000, "pushes to collect, at least; whole files of episodes are written", minimum=1, group="data"
+        100_000,
+        "pushes to collect, at least; whole files of episodes are written",
+        minimum=1,
+        group="data",
+        limit=10**9,
     )
     output: str | None = option(
         None,
         "folder for the dataset, in which an unfinished one resumes; by default data/pushes, or beside it",
         group="run",
     )
-    workers: int = option(2, "processes; the data do not depend on it", minimum=1, group="run")
+    workers: int = option(2, "processes; the data do not depend on it", minimum=1, group="run", limit=1024)
     repair: bool = option(False, "collect missing or corrupt files again", group="run")
     env: WorldConfig = field(default_factory=collection_world)

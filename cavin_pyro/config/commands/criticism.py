@@ -31,7 +31,7 @@ class CheckConfig:
         group="run",
     )
     seed: int = seed_option(group="run")
-    windows: int = option(1000, "held-out windows, and as many training windows", minimum=1, group="data")
+    windows: int = option(1000, "held-out windows, and as many training windows", minimum=1, group="data", limit=10**7)
     sections: Any = option(None, "sections of the report, [elbo,consistency]; by default all", group="run")
     export: str | None = option(
         None,

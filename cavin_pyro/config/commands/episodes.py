@@ -54,7 +54,9 @@ class EpisodeConfig:
     objects: int = option(
         ENVIRONMENT["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS, group="task"
     )
-    maximum_steps: int = option(ENVIRONMENT["maximum_steps"], "pushes per episode, at most", minimum=1, group="task")
+    maximum_steps: int = option(
+        ENVIRONMENT["maximum_steps"], "pushes per episode, at most", minimum=1, group="task", limit=10_000
+    )
     planner: Any = None
     pushes_per_plan: int | None = option(
         1, "executed pushes per plan; null executes all T (paper, Algorithm 1, line 11)", group="planning"
@@ -65,6 +67,7 @@ class EpisodeConfig:
         unit="metres",
         minimum=0,
         group="planning",
+        limit=10,
     )
     matmul_precision: str = option(
         "bfloat16",
@@ -103,9 +106,13 @@ class EvaluateConfig(EpisodeConfig):
         "folder for the results, in which an unfinished evaluation resumes; by default a separate one in runs/evaluate",
         group="run",
     )
-    episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1, group="run")
+    episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1, group="run", limit=10**6)
     workers: int = option(
-        2, "processes; results do not depend on it, apart from planning times", minimum=1, group="run"
+        2,
+        "processes; results do not depend on it, apart from planning times",
+        minimum=1,
+        group="run",
+        limit=1024,
     )
     compare: str | None = option(
         None, "folder of another evaluation of the same scenes, to compare episode by episode", group="run"

@@ -34,10 +34,18 @@ class ReproduceConfig:
         group="run",
     )
     episodes: int | None = option(
-        None, "per cell of the top row; by default the scale's. A finished run goes on to more", minimum=1, group="run"
+        None,
+        "per cell of the top row; by default the scale's. A finished run goes on to more",
+        minimum=1,
+        group="run",
+        limit=10**6,
     )
     bottom_episodes: int | None = option(
-        None, "per cell of the bottom row and of the variants; by default the scale's", minimum=1, group="run"
+        None,
+        "per cell of the bottom row and of the variants; by default the scale's",
+        minimum=1,
+        group="run",
+        limit=10**6,
     )
     models: str | None = option(
         None,
@@ -48,7 +56,7 @@ class ReproduceConfig:
     output: str | None = option(
         None, "folder for everything, where an unfinished run is resumed; by default one in runs/reproduce", group="run"
     )
-    workers: int = option(2, "processes; the table does not depend on it", minimum=1, group="run")
+    workers: int = option(2, "processes; the table does not depend on it", minimum=1, group="run", limit=1024)
     shard: str = option(
         "1/1", "i/n: the i-th of every n trainings and their episodes, so that n machines share the work", group="run"
     )

@@ -18,8 +18,8 @@ DATA = "dataset folder from collect, or several: data=[data/one,data/two]"
 class TrainerConfig:
     """How to train (section `trainer`)."""
 
-    steps: int = option(1_000_000, "gradient steps, at most", minimum=1, group="trainer")
-    batch_size: int = option(64, "windows per step", minimum=1, group="trainer")
+    steps: int = option(1_000_000, "gradient steps, at most", minimum=1, group="trainer", limit=10**9)
+    batch_size: int = option(64, "windows per step", minimum=1, group="trainer", limit=10**6)
     learning_rate: float = option(1e-4, "Adam's", above=0, group="trainer")
     schedule: str = option(
         "constant", "of the learning rate; cosine ends at a hundredth of it", choices=SCHEDULES, group="trainer"
@@ -43,10 +43,16 @@ class TrainerConfig:
         group="trainer",
     )
     validate_every: int = option(
-        1000, "steps between validations, at which a killed run can resume", minimum=1, group="trainer"
+        1000,
+        "steps between validations, at which a killed run can resume",
+        minimum=1,
+        group="trainer",
+        limit=10**9,
     )
-    validation_windows: int = option(4096, "windows per validation, at most", minimum=1, group="trainer")
-    patience: int = option(20, "validations without a new best before training stops", minimum=1, group="trainer")
+    validation_windows: int = option(4096, "windows per validation, at most", minimum=1, group="trainer", limit=10**9)
+    patience: int = option(
+        20, "validations without a new best before training stops", minimum=1, group="trainer", limit=10**9
+    )
 
     def rate(self, step: int) -> float:
         """The learning rate of a step, from 0."""
@@ -132,15 +138,17 @@ class PretrainConfig:
     data: Any = option("data/pushes", DATA, group="data")
     output: str | None = option(
         None,
-        "folder for the results; by default runs/pretrain, or beside it",
+        "folder for the results, in which an unfinished run resumes; by default runs/pretrain, or beside it",
         group="run",
     )
     seed: int = seed_option(group="run")
-    clouds: int = option(60_000, "point clouds of the dataset, one in ten for validation", minimum=2, group="data")
+    clouds: int = option(
+        60_000, "point clouds of the dataset, one in ten for validation", minimum=2, group="data", limit=10**8
+    )
     held_out_objects: list[str] = option(
         [], "names of objects, [mug,banana]; training omits their clouds", group="data"
     )
-    steps: int = option(6000, "gradient steps", minimum=1, group="training")
-    batch_size: int = option(128, "clouds per step", minimum=1, group="training")
+    steps: int = option(6000, "gradient steps", minimum=1, group="training", limit=10**9)
+    batch_size: int = option(128, "clouds per step", minimum=1, group="training", limit=10**6)
     learning_rate: float = option(1e-3, "Adam's", above=0, group="training")
     autoencoder: Any = None

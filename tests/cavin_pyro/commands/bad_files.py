@@ -36,6 +36,7 @@ BAD_FILES = [
             ),
         )
     ),
+    ("plan", "checkpoint=@nan", "nan is damaged: guide."),
     ("plan", "checkpoint=@width", "is of another architecture"),
     ("plan", "checkpoint=@segment_length", "is of another architecture"),
     ("plan", "checkpoint=@untrusted", "asks to run numpy.save, which is not part of this program"),

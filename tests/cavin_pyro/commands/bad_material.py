@@ -47,8 +47,10 @@ def spoil_checkpoints(folder: Path, good: Path) -> None:
         header = file.metadata()
     config = json.loads(header["config"])
 
-    def save(name: str, *, without: str = "nothing", **changes: str) -> None:
-        kept = {key: value for key, value in tensors.items() if not key.startswith(without)}
+    del header["sha256"]  # as older versions wrote it
+
+    def save(name: str, *, without: str = "nothing", factor: float = 1.0, **changes: str) -> None:
+        kept = {key: factor * value for key, value in tensors.items() if not key.startswith(without)}
         save_file(kept, folder / name, metadata={**header, **changes})
 
     def save_model(name: str, **changes: object) -> None:
@@ -56,6 +58,7 @@ def spoil_checkpoints(folder: Path, good: Path) -> None:
 
     save_file(tensors, folder / "foreign", metadata={"format": "pt"})
     save("version", version="7")
+    save("nan", factor=float("nan"))
     save("damaged_header", config="{")
     save("no_sections", config="[1]")
     save("no_prior", config=json.dumps({"model": config["model"]}))

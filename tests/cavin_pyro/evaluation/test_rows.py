@@ -10,10 +10,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation import evaluation
+from cavin_pyro.evaluation import evaluation, factory
 from cavin_pyro.evaluation.comparison import earlier_rows
 from cavin_pyro.evaluation.evaluation import evaluate
 from cavin_pyro.evaluation.rows import finished_episodes
+from planning.inputs import NoFiniteCandidateError
 
 ROW: dict[str, Any] = {
     "seed": 10,
@@ -81,3 +82,13 @@ def test_damaged_results_are_not_compared_with(tmp_path: Path) -> None:
         (tmp_path / "results.json").write_text(json.dumps({"per_episode": rows}))
         with pytest.raises(UserError, match=r"holds damaged results \(.*\): evaluate it again"):
             earlier_rows(tmp_path, OmegaConf.create({}))
+
+
+def test_a_model_that_predicts_nothing_finite_ends_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*parts: Any, **options: Any) -> None:
+        raise NoFiniteCandidateError(0, "none of the 8 returns of effect plans is finite")
+
+    monkeypatch.setattr(factory, "rollout", fail)
+    runner: Any = factory.EpisodeRunner(env=None, planner=None, pointnet=None, pushes_per_plan=1)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="none of the 8 returns of effect plans is finite"):
+        runner.rollout(3)

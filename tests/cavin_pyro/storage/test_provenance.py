@@ -15,7 +15,7 @@ from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import save_checkpoint
 from cavin_pyro.storage.geometry import pointnet_provenance
 from cavin_pyro.storage.provenance import provenance
-from cavin_pyro.training.provenance import training_provenance
+from cavin_pyro.training.run import training_provenance
 
 
 def test_provenance_names_command_versions_and_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,12 +21,19 @@ def clouds(count: int = 60) -> NDArray[np.float32]:
 
 
 def pretrained(
-    folder: Path, *, seed: int = 0, steps: int = 60, rate: float = 3e-3
+    folder: Path,
+    *,
+    seed: int = 0,
+    steps: int = 60,
+    rate: float = 3e-3,
+    resume: Path | None = None,
+    points: NDArray[np.float32] | None = None,
 ) -> tuple[PointNet, dict[str, float]]:
     torch.manual_seed(0)
     autoencoder = PointNetAutoencoder(feature_dimension=16, width=32, points=32)
     log = folder / "metrics.csv"
-    losses = pretrain(autoencoder, clouds(), steps=steps, batch_size=16, learning_rate=rate, seed=seed, log=log)
+    options = {"steps": steps, "batch_size": 16, "learning_rate": rate, "seed": seed, "log": log, "resume": resume}
+    losses = pretrain(autoencoder, clouds() if points is None else points, **options)
     return autoencoder.encoder, losses
 
 

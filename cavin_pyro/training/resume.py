@@ -1,0 +1,83 @@
+"""Resume files: the complete state of an unfinished training, with a digest of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.storage.digests import tensors_digest
+from cavin_pyro.storage.files import atomic_write
+
+
+def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+    """Write tensors, and a state that JSON can hold, atomically."""
+    whole = {name: value.detach().contiguous() for name, value in tensors.items()}
+    header = {"sha256": tensors_digest(whole), "state": json.dumps(state)}
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(save(whole, metadata=header))
+
+
+@contextmanager
+def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
+    """Yield the tensors and the state of a resume file; whatever does not fit within the block is a damaged file.
+
+    Raises:
+        UserError: the file is truncated, changed or of another training.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if header.get("sha256") not in (None, tensors_digest(tensors)):  # older versions wrote none
+            raise ValueError("its tensors are not those that were saved")
+        if odd := [name for name, value in tensors.items() if not bool(value.isfinite().all())]:
+            raise ValueError(f"{odd[0]} is not finite")
+        yield tensors, json.loads(header.get("state", "{}"))
+    except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"{path} is damaged ({line}): delete it to start again, or choose another output=DIR"
+        ) from error
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Adam's moments, by names."""
+    return {
+        f"adam.{number}.{name}": value
+        for number, entry in optimizer.state_dict()["state"].items()
+        for name, value in entry.items()
+    }
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Take over the moments that `optimizer_tensors` gave.
+
+    Raises:
+        ValueError: some lack, or are of another shape.
+    """
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in section(tensors, "adam").items():
+        place, _, entry = name.partition(".")
+        moments.setdefault(int(place), {})[entry] = value
+    parameters: list[nn.Parameter] = [one for group in optimizer.param_groups for one in group["params"]]
+    for number, parameter in enumerate(parameters):
+        for entry in ("exp_avg", "exp_avg_sq"):
+            if number in moments and moments[number][entry].shape != parameter.shape:
+                raise ValueError(f"adam.{number}.{entry} is of another shape")
+    if max(moments, default=0) >= len(parameters):
+        raise ValueError(f"adam.{max(moments)} belongs to no weight")
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
+
+
+def section(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with a part's, without it."""
+    return {name[len(part) + 1 :]: value for name, value in tensors.items() if name.startswith(f"{part}.")}
