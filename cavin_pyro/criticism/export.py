@@ -25,7 +25,7 @@ from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.statistics.codes import log_weights, some_windows
+from cavin_pyro.criticism.statistics.codes import log_weights
 from cavin_pyro.criticism.statistics.windows import seeded
 from cavin_pyro.storage.files import atomic_write
 
@@ -101,7 +101,7 @@ def write_samples(
 def sample_groups(context: CheckContext, *, windows: int, samples: int) -> dict[str, dict[str, Tensor]]:
     """Variables by group: `[1, S, B, ...]` for S samples of the windows `[B]`, `[B, ...]` for observations."""
     model, guide = context.model, context.guide
-    window = some_windows(context.validation, windows, context.seed)
+    window, _ = context.held_out(windows)
     real, after = window.states.mask, window.states.step(slice(1, None))
     options = {"num_samples": samples, "parallel": True}
     groups: dict[str, dict[str, Tensor]] = {}

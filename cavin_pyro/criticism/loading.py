@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
 from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.dataset import content_fingerprint, read_metadata, with_current_names
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.data.world import collecting_world
@@ -55,11 +58,21 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
     folders = data_folders(config.data)
     data = [compare_data(folder, checkpoint.provenance) for folder in folders]
     table = load_windows(folders, pointnet, windows, segment_length=segment_length, seed=split)
-    training, validation = (
+    (training, trained_in), (validation, held_out_in) = (
         sample_windows(table, getattr(table, name), config.windows, seed=[config.seed, number])
         for number, name in enumerate(("training", "validation"))
     )
-    context = CheckContext(model, guide, pointnet, training, validation, seed=config.seed, world=world)
+    context = CheckContext(
+        model,
+        guide,
+        pointnet,
+        training,
+        validation,
+        seed=config.seed,
+        world=world,
+        training_episodes=trained_in,
+        validation_episodes=held_out_in,
+    )
     own_prior = (checkpoint.config["model"].get("prior") or {}).get("_target_")
     about = {
         "checkpoint": str(path),
@@ -71,6 +84,7 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         "trained": checkpoint.provenance,
         "data": data,
         "windows": {"training": len(training.actions), "validation": len(validation.actions)},
+        "episodes": {"training": len(trained_in.unique()), "validation": len(held_out_in.unique())},
         "seed": config.seed,
         "run": provenance(),
     }
@@ -119,11 +133,14 @@ def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowCo
         ) from error
 
 
-def sample_windows(table: WindowTable, numbers: torch.Tensor, count: int, *, seed: Sequence[int]) -> Window:
-    """At most `count` of the windows with these numbers, among those that count for all terms."""
+def sample_windows(
+    table: WindowTable, numbers: torch.Tensor, count: int, *, seed: Sequence[int]
+) -> tuple[Window, torch.Tensor]:
+    """At most `count` of the windows with these numbers, among those that count for all terms, and their episodes."""
     counted = numbers[table.sequence_mask[numbers]]
     order = np.random.default_rng(list(seed)).permutation(len(counted))[:count]
-    return table.batch(counted[torch.from_numpy(np.sort(order))])
+    chosen = counted[torch.from_numpy(np.sort(order))]
+    return table.batch(chosen), table.episodes[chosen]
 
 
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,7 +165,9 @@ def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[An
     if not entries:
         return None, "the checkpoint does not say what it was trained on"
     wanted = metadata["configuration"]
-    same_configuration = [entry for entry in entries if with_current_names(entry.get("configuration") or {}) == wanted]
+    same_configuration = [
+        entry for entry in entries if _completed(entry.get("configuration") or {}) == _completed(wanted)
+    ]
     if not same_configuration:
         return False, "the model was trained on other data, on none of these episodes"
     entry = next(
@@ -163,6 +182,15 @@ def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[An
         return False, "collected with the configuration of the training data, but by another program: other episodes"
     unknown = "the checkpoint does not say whether the content is"
     return None, f"configuration and seed are those of the training data{grown}; {unknown}"
+
+
+def _completed(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """A collection's configuration, with the defaults of options that an older version did not know."""
+    known, found = asdict(CollectionConfig()), with_current_names(configuration)
+    ranges = {**known["ranges"], **(found.get("ranges") or {})}
+    merged = {name: found.get(name, value) for name, value in known.items() if name != "assets"}
+    extra = {name: value for name, value in found.items() if name not in known}
+    return json.loads(json.dumps({**extra, **merged, "ranges": ranges}))
 
 
 def _objective(config: Mapping[str, Any]) -> str | None:

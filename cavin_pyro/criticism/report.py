@@ -6,7 +6,8 @@ Keys of report.json:
                 `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check),
                 `graph` of the program (see `cavin_pyro.criticism.graph`)
-    sections    by name: `title`, `findings` (sentences) and `values`, which the section's function documents
+    sections    by name: `title`, `verdict` (`level`: good, look, bad, too few or none; `rule`; `advice`, what to do
+                next), `findings` (sentences) and `values`, which the section's function documents
 
 Floats have six significant digits; non-finite numbers are null.
 """
@@ -18,6 +19,7 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from cavin_pyro.criticism.glossary import glossary_of
 from cavin_pyro.criticism.section import Section, Table
 from cavin_pyro.storage.files import atomic_write, write_json
 
@@ -37,7 +40,7 @@ LARGEST_DRAWING = 400_000  # bytes of SVG; larger drawings become pixels
 MISSING = "–"
 
 Part = dict[str, Any]
-"""A rendered section, JSON-ready: name, title, explanation, findings, values, tables, pictures."""
+"""A rendered section, JSON-ready: name, title, explanation, findings, verdict, values, tables, pictures."""
 
 
 def render(section: Section) -> Part:
@@ -47,6 +50,7 @@ def render(section: Section) -> Part:
         "title": section.title,
         "explanation": section.explanation,
         "findings": list(section.findings),
+        "verdict": asdict(section.verdict) if section.verdict else None,
         "values": plain(section.values),
         "tables": [_table(table) for table in section.tables],
         "pictures": [
@@ -59,7 +63,7 @@ def render(section: Section) -> Part:
 def write_report(folder: Path, about: Mapping[str, Any], parts: Sequence[Part]) -> None:
     """Write both files, each atomically."""
     about = plain(about)
-    sections = {part["name"]: {key: part[key] for key in ("title", "findings", "values")} for part in parts}
+    sections = {part["name"]: {key: part[key] for key in ("title", "verdict", "findings", "values")} for part in parts}
     write_json(folder / "report.json", {"about": about, "sections": sections})
     with atomic_write(folder / "report.html") as temporary:
         temporary.write_text(page(about, parts), encoding="utf-8")
@@ -74,7 +78,9 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
     details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
     # Old checkpoints may lack some of these.
     trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
-    return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
+    return environment.from_string(source).render(
+        about=about, trained=trained, details=details, sections=parts, glossary=glossary_of(parts)
+    )
 
 
 def plain(value: Any) -> Any:

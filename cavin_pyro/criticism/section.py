@@ -8,6 +8,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from cavin_pyro.criticism.verdict import Verdict
+
 
 @dataclass(frozen=True)
 class Table:
@@ -34,6 +36,7 @@ class Section:
     Attributes:
         name: key in report.json. title: heading. explanation: the measurement, its data, and how to read it.
         findings: of this run, a sentence each, derived from the values.
+        verdict: good, look or bad, by which rule, and what to do next.
         values: for report.json: numbers, strings, lists and dictionaries of them.
     """
 
@@ -44,3 +47,4 @@ class Section:
     values: Mapping[str, Any]
     tables: Sequence[Table] = field(default_factory=tuple)
     pictures: Sequence[Picture] = field(default_factory=tuple)
+    verdict: Verdict | None = None

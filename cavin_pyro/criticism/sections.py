@@ -20,6 +20,8 @@ from cavin_pyro.criticism.checks.elbo import assess_elbo
 from cavin_pyro.criticism.checks.growth import assess_growth
 from cavin_pyro.criticism.checks.guide_error import assess_guide_error
 from cavin_pyro.criticism.checks.predictive import assess_predictive
+from cavin_pyro.criticism.checks.prior import assess_prior
+from cavin_pyro.criticism.checks.simulation import assess_simulation
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section
@@ -31,7 +33,9 @@ SECTIONS: dict[str, Callable[..., Section]] = {
     "elbo": assess_elbo,
     "guide_error": assess_guide_error,
     "amortization": assess_amortization,
+    "simulation": assess_simulation,
     "codes": assess_codes,
+    "prior": assess_prior,
     "aggregate_posterior": assess_aggregate,
     "predictive": assess_predictive,
     "calibration": assess_calibration,

@@ -29,7 +29,7 @@ class WindowTable:
     Batches gather windows on demand, so overlapping windows share their memory.
 
     Attributes:
-        training, validation: numbers of windows, for `batch`.
+        training, validation: numbers of windows, for `batch`. episodes: the episode that each window is from.
     """
 
     def __init__(
@@ -40,6 +40,7 @@ class WindowTable:
         self._steps = torch.arange(segment_length + 1)
         self.starts = torch.empty(0, dtype=torch.int64)
         self.sequence_mask = torch.empty(0, dtype=torch.bool)
+        self.episodes = torch.empty(0, dtype=torch.int64)
         self.training = torch.empty(0, dtype=torch.int64)
         self.validation = torch.empty(0, dtype=torch.int64)
         # Objects up to the last real one, at each position.
@@ -158,6 +159,7 @@ def _find_windows(episodes: Arrays, config: WindowConfig, segment_length: int, s
     episode, start = np.nonzero(chosen)
     table.starts = torch.from_numpy(episode * positions + start)
     table.sequence_mask = torch.from_numpy(informative[chosen])
+    table.episodes = torch.from_numpy(episode)
     table.training = torch.from_numpy(np.flatnonzero(~validation[chosen]))
     table.validation = torch.from_numpy(np.flatnonzero(validation[chosen]))
     for name in ("training", "validation"):

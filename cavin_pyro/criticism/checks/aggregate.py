@@ -1,4 +1,4 @@
-"""Comparison of inferred codes with the prior, from which planners sample."""
+"""Comparison of inferred codes with the prior's, without their states: for that see `prior.py`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from torch import Tensor
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.aggregate import WORST, draw_comparison
 from cavin_pyro.criticism.section import Picture, Section, Table
-from cavin_pyro.criticism.statistics.codes import SYMBOLS, sample_guide, sample_prior, some_windows, without_codes
-from cavin_pyro.criticism.statistics.information import ACTIVE, posterior_mean_variance
-from cavin_pyro.criticism.statistics.two_sample import CodeComparison, TwoSample, compare_codes, energy_test
+from cavin_pyro.criticism.statistics.codes import SYMBOLS, sample_guide, sample_prior, without_codes
+from cavin_pyro.criticism.statistics.inference.information import ACTIVE, posterior_mean_variance
+from cavin_pyro.criticism.statistics.prior.two_sample import CodeComparison, TwoSample, compare_codes, energy_test
 from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.verdict import conclude, grade
 
-NAME, TITLE = "aggregate_posterior", "Whether inferred codes are distributed like the prior"
+NAME, TITLE = "aggregate_posterior", "Whether inferred codes, without their states, are spread like the prior's"
 LEVEL = 0.05
+SMALL_DISTANCE, LARGE_DISTANCE = 0.01, 0.05  # energy distances over their largest value, less chance
 SAMPLES = 64  # of each window's codes, to find the active dimensions
 
 
@@ -29,12 +31,12 @@ def assess_aggregate(context: CheckContext, *, windows: int = 1000, permutations
     """
     if not context.codes:
         return without_codes(NAME, TITLE)
-    window = some_windows(context.validation, windows, context.seed)
+    window, episodes = context.held_out(windows)
     with seeded(context.seed):
         samples = sample_guide(context.guide, window, SAMPLES)
         inferred = {name: value[0] for name, value in samples.items()}
         expected = sample_prior(context.model, window)
-    keywords: dict[str, Any] = {"permutations": permutations, "seed": context.seed}
+    keywords: dict[str, Any] = {"episodes": episodes, "permutations": permutations, "seed": context.seed}
     found = {
         name: compare_codes(
             inferred[name], expected[name], active=posterior_mean_variance(samples[name]) > ACTIVE, **keywords
@@ -47,15 +49,29 @@ def assess_aggregate(context: CheckContext, *, windows: int = 1000, permutations
         together = energy_test(*pair, **keywords)
     explanation = (
         f"One code from the guide and one from the prior for each of {len(window.actions)} validation windows. The "
-        "distance is the energy distance over its largest value (0: the same, 1: apart). With so many windows small "
-        "differences are detected too, so read the distance and the spread along with p. Windows of one episode are "
-        "similar, which makes p a little small."
+        "distance is the energy distance over its largest value (0: the same, 1: apart). The test does not see the "
+        "state: a prior whose codes belong to other scenes passes it, and it says nothing about sampling from the "
+        "prior (see the section prior). With so many windows small differences are detected too: read the distance "
+        "along with p, for which the windows of an episode are exchanged together."
     )
     pictures = [_picture(name, comparison) for name, comparison in found.items()]
     values = {name: _values(comparison) for name, comparison in found.items()}
     if together is not None:
         values["together"] = together._asdict()
-    return Section(NAME, TITLE, explanation, _findings(found, together), values, _tables(found, together), pictures)
+    tests = [test for one in found.values() for test in (one.whole, one.active) if test] + (
+        [together] if together else []
+    )
+    excess = max(test.distance - test.chance for test in tests)
+    verdict = conclude(
+        grade(excess, excess, good=SMALL_DISTANCE, bad=LARGE_DISTANCE),
+        f"The largest distance beyond chance: good up to {SMALL_DISTANCE:g}, bad from {LARGE_DISTANCE:g}. Good is no "
+        "licence to sample from the prior: the section prior decides that.",
+        "The prior's spread is wrong for every state: train with prior=conditional or prior=flow.",
+        windows=len(episodes),
+        episodes=episodes,
+    )
+    tables = _tables(found, together)
+    return Section(NAME, TITLE, explanation, _findings(found, together), values, tables, pictures, verdict)
 
 
 def _values(comparison: CodeComparison) -> dict[str, Any]:
@@ -79,7 +95,7 @@ def _findings(found: dict[str, CodeComparison], together: TwoSample | None) -> l
         tests = {"all dimensions": comparison.whole, "active dimensions": comparison.active}
         outcomes = "; ".join(f"{label}: {_outcome(test)}" for label, test in tests.items() if test)
         differ = any(test.p_value < LEVEL for test in tests.values() if test)
-        verdict = "differ from" if differ else "cannot be distinguished from"
+        verdict = "differ from" if differ else "cannot be distinguished, without their states, from"
         ratio = (comparison.guide.double().std(0) / comparison.prior.double().std(0)).tolist()
         sentences.append(
             f"Inferred {SYMBOLS[name]} {verdict} the prior's ({outcomes}). {differing} of {len(ratio)} dimensions "

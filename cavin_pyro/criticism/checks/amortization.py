@@ -10,11 +10,14 @@ from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.amortization import draw_gaps
 from cavin_pyro.criticism.refinement import refine
 from cavin_pyro.criticism.section import Picture, Section, Table
-from cavin_pyro.criticism.statistics.codes import log_weights, mean_with_error, some_windows, without_codes
-from cavin_pyro.criticism.statistics.importance import UNRELIABLE, evidence_bounds, pareto_shapes
+from cavin_pyro.criticism.statistics.clusters import mean_interval, mean_with_error
+from cavin_pyro.criticism.statistics.codes import log_weights, without_codes
+from cavin_pyro.criticism.statistics.inference.importance import evidence_bounds, pareto_shapes, reliable_limit
 from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.verdict import conclude, grade
 
 NAME, TITLE = "amortization", "The amortization gap"
+SMALL_GAP, LARGE_GAP = 1.0, 5.0  # nats per window
 
 
 def assess_amortization(
@@ -38,7 +41,7 @@ def assess_amortization(
     if not context.codes:
         return without_codes(NAME, TITLE)
     model, guide = context.model, context.guide
-    window = some_windows(context.validation, windows, context.seed)
+    window, episodes = context.held_out(windows)
     with seeded(context.seed):
         refined = refine(model, guide, window, steps=steps, particles=particles)
     logs = []
@@ -48,16 +51,18 @@ def assess_amortization(
     gap = logs[1].mean(0) - logs[0].mean(0)
     bounds = [evidence_bounds(log, [samples])[samples] for log in logs]
     left = bounds[1] - logs[1].mean(0)
-    tails = [(pareto_shapes(log) > UNRELIABLE).double().mean().item() for log in logs]
+    limit = reliable_limit(samples)
+    tails = [(pareto_shapes(log) > limit).double().mean().item() for log in logs]
     values: dict[str, Any] = {
         "windows": len(gap),
-        "elbo": mean_with_error(logs[0].mean(0)),
-        "refined_elbo": mean_with_error(logs[1].mean(0)),
-        "gap": mean_with_error(gap),
+        "elbo": mean_with_error(logs[0].mean(0), episodes),
+        "refined_elbo": mean_with_error(logs[1].mean(0), episodes),
+        "gap": mean_with_error(gap, episodes),
         "gap_median": gap.median().item(),
-        "approximation_gap": mean_with_error(left),
-        "pareto_k_above_0.7": {"guide": tails[0], "refined": tails[1]},
-        "bound_gained": mean_with_error(bounds[1] - bounds[0]),
+        "approximation_gap": mean_with_error(left, episodes),
+        "pareto_k_limit": limit,
+        "pareto_k_above_limit": {"guide": tails[0], "refined": tails[1]},
+        "bound_gained": mean_with_error(bounds[1] - bounds[0], episodes),
     }
     explanation = (
         f"Each of {len(gap)} validation windows gets a shift and a stretch of its own for every dimension of its "
@@ -65,20 +70,28 @@ def assess_amortization(
         f"gap; what the bound of {samples} particles of the refined guide still lies above its ELBO is (at least) the "
         "approximation gap."
     )
-    return Section(
-        NAME, TITLE, explanation, _findings(values), values, [_table(values, steps, samples)], [_picture(gap, left)]
+    interval = mean_interval(gap, episodes)
+    verdict = conclude(
+        grade(interval.low, interval.high, good=SMALL_GAP, bad=LARGE_GAP),
+        f"The gap's 95 % interval over episodes: good if it ends below {SMALL_GAP:g} nats, bad if it begins above "
+        f"{LARGE_GAP:g}.",
+        "Train longer or widen the guide's network; guide=joint reads the pushes too.",
+        windows=len(gap),
+        episodes=episodes,
     )
+    tables, pictures = [_table(values, steps, samples)], [_picture(gap, left)]
+    return Section(NAME, TITLE, explanation, _findings(values), values, tables, pictures, verdict)
 
 
 def _findings(values: dict[str, Any]) -> list[str]:
-    gap, left, tails = values["gap"], values["approximation_gap"], values["pareto_k_above_0.7"]
+    gap, left, tails = values["gap"], values["approximation_gap"], values["pareto_k_above_limit"]
     share = gap["mean"] / max(gap["mean"] + left["mean"], 1e-12)
     return [
         f"Refining the guide for each window gains {gap['mean']:.2f} ± {gap['standard_error']:.2f} nats (median "
         f"{values['gap_median']:.2f}); at least {left['mean']:.2f} ± {left['standard_error']:.2f} nats are left to the "
         "shape of the guide.",
         f"So {min(max(share, 0.0), 1.0):.0%} of the known error of the guide is its network's, and the rest its "
-        f"family's. k-hat is above {UNRELIABLE} for {tails['guide']:.0%} of the windows before and "
+        f"family's. k-hat is above {values['pareto_k_limit']:.2f} for {tails['guide']:.0%} of the windows before and "
         f"{tails['refined']:.0%} after.",
     ]
 

@@ -22,6 +22,7 @@ from cavin_pyro.criticism.subgoal_rollout import (
     SubgoalRollout,
     subgoal_rollouts,
 )
+from cavin_pyro.criticism.verdict import FEW, GOOD, NONE, Verdict, grade
 from cavin_pyro.storage.progress import progress_bar
 
 
@@ -50,7 +51,8 @@ def assess_consistency(context: CheckContext, *, scenes: int = 150, objects: int
     values: dict[str, Any] = {"scenes": scenes, "objects": objects, "samples": samples, "selections": []}
     if not context.codes:
         nothing = ["The model has no codes and generates no pushes: there is nothing to execute."]
-        return Section("consistency", TITLE, _EXPLANATION, nothing, values)
+        none = Verdict(NONE, "The model generates no pushes.")
+        return Section("consistency", TITLE, _EXPLANATION, nothing, values, verdict=none)
     finished: list[SubgoalRollout] = []
     with progress_bar("executing", total=scenes, unit="scene") as bar:
         for rollouts in subgoal_rollouts(context, scenes=scenes, objects=objects, samples=samples):
@@ -74,7 +76,22 @@ def assess_consistency(context: CheckContext, *, scenes: int = 150, objects: int
         values=values,
         tables=_tables({name_of(selection): numbers for selection, numbers in measured.items()}, has_subgoals),
         pictures=_pictures(named, best, has_subgoals),
+        verdict=_verdict({name_of(selection): numbers for selection, numbers in measured.items()}[best], best, scenes),
     )
+
+
+def _verdict(numbers: Mapping[str, Any], name: str, scenes: int) -> Verdict:
+    rule = (
+        f"The part of the way to the subgoal that is left ({name}): good if its 95 % interval over scenes ends below "
+        f"{NEAR:.0%}, bad if it begins above {FAR:.0%}."
+    )
+    if scenes < FEWEST:
+        return Verdict(FEW, f"Only {scenes} scenes: a conclusion needs at least {FEWEST}. ({rule})", "More scenes.")
+    if "relative" not in numbers:
+        return Verdict(NONE, "The model has no subgoals.")
+    level = grade(numbers["low"], numbers["high"], good=NEAR, bad=FAR)
+    advice = "Where f expected less to be left, f is too hopeful: plan with planner.robustness or more perturbed data."
+    return Verdict(level, rule, advice if level != GOOD else "")
 
 
 def name_of(selection: tuple[str, str]) -> str:
@@ -83,6 +100,8 @@ def name_of(selection: tuple[str, str]) -> str:
 
 
 TITLE = "Subgoal consistency in physics"
+NEAR, FAR = 0.35, 0.65  # of the way to the subgoal
+FEWEST = 50  # scenes
 _EXPLANATION = f"""\
 The paper asserts that the pushes generated for a state s and an effect code c lead to the subgoal h(s, c). This check \
 executes them: it samples and observes scenes as data collection does, obtains codes, executes the pushes g(s, c, z) \

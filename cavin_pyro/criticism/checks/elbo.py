@@ -7,11 +7,14 @@ import torch
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.elbo import draw_differences
 from cavin_pyro.criticism.section import Picture, Section, Table
-from cavin_pyro.criticism.statistics.codes import mean_with_error, some_windows
+from cavin_pyro.criticism.statistics.clusters import mean_with_error
 from cavin_pyro.criticism.statistics.elbo import TOTAL, adjusted_difference, scene_sizes, terms_by_window
 from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.verdict import Verdict, conclude, grade
 
 NAME, TITLE = "elbo", "The ELBO, term by term"
+SMALL_LOSS, LARGE_LOSS = 5.0, 20.0  # nats per window
+NORMAL = 1.96  # standard errors to either side, of a 95 % interval
 
 
 def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4, batch: int = 256) -> Section:
@@ -24,18 +27,24 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
         windows: at most so many of each. batch: bounds the memory.
     """
     parts = {
-        name: some_windows(window, windows, context.seed)
-        for name, window in (("training", context.training), ("validation", context.validation))
+        "training": context.trained_on(windows),
+        "validation": context.held_out(windows),
     }
     with seeded(context.seed):
         terms = {
-            name: terms_by_window(context.model, context.guide, part, samples, batch) for name, part in parts.items()
+            name: terms_by_window(context.model, context.guide, part, samples, batch)
+            for name, (part, _) in parts.items()
         }
-    values = {name: {term: mean_with_error(value) for term, value in found.items()} for name, found in terms.items()}
-    covariates = torch.cat([scene_sizes(part) for part in parts.values()])
-    held_out = torch.arange(len(covariates)) >= len(parts["training"].actions)
+    values = {
+        name: {term: mean_with_error(value, parts[name][1]) for term, value in found.items()}
+        for name, found in terms.items()
+    }
+    covariates = torch.cat([scene_sizes(part) for part, _ in parts.values()])
+    held_out = torch.arange(len(covariates)) >= len(parts["training"][1])
+    # An episode is either in training or held out, so its number alone may name two: the sign tells them apart.
+    clusters = torch.cat([parts["training"][1], -1 - parts["validation"][1]])
     differences = {
-        term: adjusted_difference(torch.cat([found[term] for found in terms.values()]), held_out, covariates)
+        term: adjusted_difference(torch.cat([found[term] for found in terms.values()]), held_out, covariates, clusters)
         for term in terms["training"]
     }
     counts = {name: len(found[TOTAL]) for name, found in terms.items()}
@@ -47,8 +56,10 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
     ]
     explanation = (
         "Nats per window; every term is minus a log density (or a KL), so smaller is better. Densities are of metres "
-        "and unit vectors, so likelihood terms may be negative: read their differences. ± is one standard error over "
-        "windows; windows of one episode overlap, which makes it a little small. The difference is taken at equal "
+        "and unit vectors, so likelihood terms may be negative: read their differences. ± is one standard error, "
+        "clustered by episode, since windows of one episode overlap. The last state of a window is scored twice, by h "
+        "as the subgoal and by f as the last transition: so the sum is a bound on the density of the program's sites, "
+        "with two observations of that state, and no log density of a window. The difference is taken at equal "
         "numbers of objects (by linear regression), which density terms grow with. "
         f"{counts['training']} training and {counts['validation']} validation windows."
     )
@@ -60,7 +71,19 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
         {**values, "difference": differences, "windows": counts},
         [Table(["term", "training", "validation", "validation - training"], rows)],
         [_picture(differences)],
+        _verdict(differences[TOTAL], counts["validation"], parts["validation"][1]),
     )
+
+
+def _verdict(total: dict[str, float], windows: int, episodes: torch.Tensor) -> Verdict:
+    ends = [total["mean"] + sign * NORMAL * total["standard_error"] for sign in (-1, 1)]
+    rule = (
+        "How much worse -ELBO is on held-out windows: good if its 95 % interval over episodes ends below "
+        f"{SMALL_LOSS:g} nats, bad if it begins above {LARGE_LOSS:g}."
+    )
+    advice = "The model overfits: collect more data, or stop training earlier."
+    level = grade(*ends, good=SMALL_LOSS, bad=LARGE_LOSS)
+    return conclude(level, rule, advice, windows=windows, episodes=episodes)
 
 
 def _with_error(value: dict[str, float]) -> str:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
 import torch
+from torch import Tensor
 
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.growth import draw_growth
 from cavin_pyro.criticism.recordings import record
 from cavin_pyro.criticism.section import Picture, Section, Table
+from cavin_pyro.criticism.statistics.clusters import Interval, bootstrap_interval
 from cavin_pyro.criticism.statistics.growth import errors_over_segments, farthest_moves, summary
 from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.verdict import FEW, GOOD, Verdict, grade
 
+SMALL, LARGE = 0.5, 0.9  # of the error of the guess that nothing moves
+FEWEST = 20  # episodes, each ten segments long
 CURVES = {
     "f": "f, under the real pushes",
     "h": "h, codes inferred from the real effects",
@@ -43,6 +49,7 @@ def assess_growth(context: CheckContext, *, episodes: int = 40, segments: int = 
     results = {name: [summary(column) for column in values.unbind(-1)] for name, values in errors.items()}
     moved = farthest_moves(recording, T)
     informative = (moved[moved.isfinite()] > 0.1).float().mean().item()
+    relative = _relative(errors, context.seed)
     return Section(
         name="growth",
         title="How does the error grow with the horizon?",
@@ -50,7 +57,13 @@ def assess_growth(context: CheckContext, *, episodes: int = 40, segments: int = 
             EXPLANATION.format(episodes=episodes, pushes=segments * T, informative=100 * informative).split()
         ),
         findings=list(_findings(results)),
-        values={"episodes": episodes, "segment_length": T, "informative_share": informative, "errors": results},
+        values={
+            "episodes": episodes,
+            "segment_length": T,
+            "informative_share": informative,
+            "errors": results,
+            "relative": relative._asdict(),
+        },
         tables=[_table(results)],
         pictures=[
             Picture(
@@ -59,7 +72,34 @@ def assess_growth(context: CheckContext, *, episodes: int = 40, segments: int = 
                 draw_growth({CURVES[name]: values for name, values in results.items()}),
             )
         ],
+        verdict=_verdict(relative, episodes, segments),
     )
+
+
+def _relative(errors: Mapping[str, Tensor], seed: int) -> Interval:
+    """f's error after the last segment over that of the guess that nothing moves, resampled by episode."""
+    error, nothing = (errors[name][:, -1].double() for name in ("f", "nothing_moves"))
+    known = error.isfinite() & nothing.isfinite()
+    error, nothing = error[known], nothing[known]
+    if len(error) < 2 or nothing.sum() == 0:
+        return Interval(math.nan, math.nan, math.nan)
+    return bootstrap_interval(
+        lambda weights: weights @ error / (weights @ nothing), torch.arange(len(error)), seed=seed
+    )
+
+
+def _verdict(relative: Interval, episodes: int, segments: int) -> Verdict:
+    rule = (
+        f"f's error after {segments} segments over that of the guess that nothing moves: good if its 95 % interval "
+        f"over episodes ends below {SMALL:.0%}, bad if it begins above {LARGE:.0%}."
+    )
+    if episodes < FEWEST:
+        return Verdict(
+            FEW, f"Only {episodes} episodes: a conclusion needs at least {FEWEST}. ({rule})", "More episodes."
+        )
+    advice = "Plan fewer segments ahead, or replan more often; more data of long episodes help f."
+    level = grade(relative.low, relative.high, good=SMALL, bad=LARGE)
+    return Verdict(level, rule, advice if level != GOOD else "")
 
 
 def _table(results: Mapping[str, list[dict[str, float]]]) -> Table:

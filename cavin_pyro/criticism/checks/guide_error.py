@@ -9,18 +9,14 @@ from torch import Tensor
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.guide_error import draw_guide_error
 from cavin_pyro.criticism.section import Picture, Section, Table
-from cavin_pyro.criticism.statistics.codes import (
-    effect_log_weights,
-    log_weights,
-    mean_with_error,
-    sample_guide,
-    some_windows,
-    without_codes,
-)
-from cavin_pyro.criticism.statistics.importance import UNRELIABLE, Weights, evidence_bounds, pareto_shapes
+from cavin_pyro.criticism.statistics.clusters import mean_interval, mean_with_error
+from cavin_pyro.criticism.statistics.codes import effect_log_weights, log_weights, sample_guide, without_codes
+from cavin_pyro.criticism.statistics.inference.importance import Weights
 from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.verdict import Verdict, conclude, grade
 
 NAME, TITLE = "guide_error", "How far the guide is from the posterior"
+FEW_TAILS, MANY_TAILS = 0.2, 0.5  # shares of windows with a k-hat above the limit
 LABELS = {
     "joint": "all codes: the guide for the posterior",
     "effect_code": "c alone: q(c) for p(c | s, s', a)",
@@ -58,20 +54,23 @@ def assess_guide_error(
     if not context.codes:
         return without_codes(NAME, TITLE)
     model, guide = context.model, context.guide
-    window = some_windows(context.validation, windows, context.seed)
+    window, episodes = context.held_out(windows)
+    few, inner_episodes = context.held_out(inner_windows)
     samples = max(particles)
     with seeded(context.seed):
         logs = {"joint": log_weights(model, guide, window, samples)}
         if len(context.codes) > 1:
-            few = some_windows(context.validation, inner_windows, context.seed)
             logs["effect_code"] = effect_log_weights(model, guide, few, samples, inner=inner_particles)
             later = ("motion_code", "actions")
             logs["effect_code_given_subgoal"] = log_weights(model, guide, window, samples, excluded=later)
             fixed = {"effect_code": sample_guide(guide, window, 1)["effect_code"][0]}
             logs["motion_code"] = log_weights(model, guide, window, samples, fixed=fixed)
-    found = {name: Weights(evidence_bounds(log, particles), pareto_shapes(log)) for name, log in logs.items()}
+    found = {
+        name: Weights.of(log, particles, inner_episodes if name == "effect_code" else episodes)
+        for name, log in logs.items()
+    }
     text, findings, values = _explanation(found), _findings(found), _values(found)
-    return Section(NAME, TITLE, text, findings, values, [_table(found)], [_picture(found)])
+    return Section(NAME, TITLE, text, findings, values, [_table(found)], [_picture(found)], _verdict(found["joint"]))
 
 
 def _explanation(found: dict[str, Weights]) -> str:
@@ -80,7 +79,8 @@ def _explanation(found: dict[str, Weights]) -> str:
     text = (
         "The ELBO falls short of log p(observed) by KL(guide | posterior). The bound of K particles, one logarithm for "
         "each window, comes nearer to it as K grows, so its rise from K = 1 is a lower bound on that shortfall. k-hat "
-        f"is the shape of the tail of the {samples} importance weights of a window: above {UNRELIABLE} the guide "
+        f"is the shape of the tail of the {samples} importance weights of a window: above {joint.limit:.2f}, the limit "
+        "for so many (min(1 - 1 / log10 S, 0.7), Vehtari and others), the guide "
         f"misses parts of the posterior that matter. {count} validation windows."
     )
     if "effect_code" in found:
@@ -91,12 +91,24 @@ def _explanation(found: dict[str, Weights]) -> str:
 def _findings(found: dict[str, Weights]) -> list[str]:
     sentences = []
     for name, weights in found.items():
-        gap, share = mean_with_error(weights.gap), (weights.shapes > UNRELIABLE).double().mean().item()
+        gap, share = mean_with_error(weights.gap, weights.episodes), mean_interval(weights.unreliable, weights.episodes)
         sentences.append(
             f"{LABELS[name]}: at least {gap['mean']:.2f} ± {gap['standard_error']:.2f} nats short; k-hat is above "
-            f"{UNRELIABLE} for {share:.0%} of the windows."
+            f"{weights.limit:.2f} for {share.mean:.0%} of the windows ({max(share.low, 0):.0%} to "
+            f"{min(share.high, 1):.0%})."
         )
     return sentences
+
+
+def _verdict(joint: Weights) -> Verdict:
+    share = mean_interval(joint.unreliable, joint.episodes)
+    rule = (
+        f"The share of windows whose k-hat is above {joint.limit:.2f}, all codes together: good if its 95 % interval "
+        f"over episodes ends below {FEW_TAILS:.0%}, bad if it begins above {MANY_TAILS:.0%}."
+    )
+    advice = "Do not importance-sample from this guide; the amortization section tells whether its network fails."
+    level = grade(share.low, share.high, good=FEW_TAILS, bad=MANY_TAILS)
+    return conclude(level, rule, advice, windows=len(joint.shapes), episodes=joint.episodes)
 
 
 def _values(found: dict[str, Weights]) -> dict[str, object]:
@@ -105,12 +117,12 @@ def _values(found: dict[str, Weights]) -> dict[str, object]:
         base = weights.bounds[min(weights.bounds)]
         values[name] = {
             "windows": len(weights.shapes),
-            "bounds": {str(K): mean_with_error(bound) for K, bound in weights.bounds.items()},
-            "rises": {str(K): mean_with_error(bound - base) for K, bound in weights.bounds.items()},
+            "bounds": {str(K): mean_with_error(bound, weights.episodes) for K, bound in weights.bounds.items()},
+            "rises": {str(K): mean_with_error(bound - base, weights.episodes) for K, bound in weights.bounds.items()},
             "pareto_k": {
                 **{key: _shown(weights.shapes, part) for key, part in (("p5", 0.05), ("median", 0.5), ("p95", 0.95))},
-                "above_0.5": (weights.shapes > 0.5).double().mean().item(),
-                "above_0.7": (weights.shapes > UNRELIABLE).double().mean().item(),
+                "limit": weights.limit,
+                "above_limit": weights.unreliable.mean().item(),
             },
         }
     return values
@@ -124,11 +136,16 @@ def _shown(shapes: Tensor, part: float) -> float | None:
 
 def _table(found: dict[str, Weights]) -> Table:
     Ks = list(found["joint"].bounds)
-    header = ["proposal and target", *(f"rise at K = {K}" for K in Ks if K > 1), "k-hat, median", "share above 0.7"]
+    header = [
+        "proposal and target",
+        *(f"rise at K = {K}" for K in Ks if K > 1),
+        "k-hat, median",
+        "share above its limit",
+    ]
     rows = []
     for name, weights in found.items():
         rises = [(weights.bounds[K] - weights.bounds[min(Ks)]).mean().item() for K in Ks if K > 1]
-        share = (weights.shapes > UNRELIABLE).double().mean().item()
+        share = weights.unreliable.mean().item()
         rows.append([LABELS[name], *rises, _shown(weights.shapes, 0.5), share])
     return Table(header, rows, digits=2)
 

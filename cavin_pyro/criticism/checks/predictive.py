@@ -9,13 +9,16 @@ import math
 from collections.abc import Iterator, Sequence
 
 import torch
+from torch import Tensor
 
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.predictive import draw_histograms
 from cavin_pyro.criticism.section import Picture, Section, Table
+from cavin_pyro.criticism.statistics.clusters import Interval, mean_interval
 from cavin_pyro.criticism.statistics.pushing import Nearness, Statistic, statistics_of
 from cavin_pyro.criticism.statistics.replicates import compare, replicate, summaries
 from cavin_pyro.criticism.statistics.windows import Outcome, generated, observed, seeded
+from cavin_pyro.criticism.verdict import LOOK, Verdict, conclude, grade, worst
 
 SOURCES = {
     "prior_means": "prior, as planned",
@@ -23,6 +26,7 @@ SOURCES = {
     "guide_means": "guide, means",
     "guide": "guide, as sampled",
 }
+SMALL_EFFECT, LARGE_EFFECT = 0.2, 0.8  # small and large by Cohen's (1988) convention
 EXTREME = 0.01  # a tail probability this near to 0 or 1 is a misfit
 
 # statistic -> source -> mean or q95 -> numbers of `replicates.compare`
@@ -50,7 +54,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     Args:
         windows: of `context.validation` at most. replicates: datasets generated per source.
     """
-    window = context.validation.map(lambda field: field[:windows])
+    window, episodes = context.held_out(windows)
     nearness = Nearness.of(observed(context.training))
     sources = [name for name in SOURCES if context.codes or name.startswith("prior")]
     replicated, real = {}, {}
@@ -72,6 +76,10 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         target = summaries(real[name].unsqueeze(0), statistic)
         results[name] = {"observed": {key: {"mean": float(value[0])} for key, value in target.items()}}
         results[name] |= {source: compare(replicated[source][name], real[name], statistic) for source in sources}
+    effects = {
+        statistic.name: _effect(replicated["prior_means"][statistic.name], real[statistic.name], episodes)
+        for statistic in statistics
+    }
     numbers = {"replicates": replicates, "windows": len(window.actions)}
     distances = {"pair": 100 * nearness.pair, "tool": 100 * nearness.tool}
     return Section(
@@ -84,6 +92,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
             "pair_distance": nearness.pair,
             "tool_distance": nearness.tool,
             "statistics": results,
+            "effects": {name: effect._asdict() for name, effect in effects.items()},
         },
         tables=_tables(statistics, results, sources),
         pictures=[
@@ -94,7 +103,46 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
                 draw_histograms(statistics, real, replicated, {source: SOURCES[source] for source in sources}, results),
             )
         ],
+        verdict=_verdict(effects, {one.name: one.label for one in statistics}, episodes),
     )
+
+
+def _effect(replicated: Tensor, real: Tensor, episodes: Tensor) -> Interval:
+    """How much more the model as planned has than was observed, in standard deviations of single windows.
+
+    Args:
+        replicated: `[R, B]` or `[R, B, T]`. real: `[B]` or `[B, T]`.
+    """
+    expected, observed = replicated.double().nanmean(0), real.double()
+    if observed.dim() > 1:
+        expected, observed = expected.nanmean(-1), observed.nanmean(-1)
+    known = observed[~observed.isnan()]
+    spread = known.std().item() if len(known) > 1 else 0.0
+    difference = mean_interval(expected - observed, episodes)
+    return Interval(*(end / spread for end in difference)) if spread > 0 else Interval(*[math.nan] * 3)
+
+
+def _verdict(effects: dict[str, Interval], labels: dict[str, str], episodes: Tensor) -> Verdict:
+    graded = {
+        name: grade(*_from_zero(effect), good=SMALL_EFFECT, bad=LARGE_EFFECT)
+        for name, effect in effects.items()
+        if math.isfinite(effect.mean)
+    }
+    level = worst(graded.values()) if graded else LOOK
+    named = [f"{labels[name]} ({effects[name].mean:+.2f})" for name, one in graded.items() if one == level]
+    rule = (
+        "The difference of each statistic, as planned, from the observed one, in standard deviations of single "
+        f"windows: good if every 95 % interval over episodes lies within {SMALL_EFFECT:g}, bad if one lies beyond "
+        f"{LARGE_EFFECT:g}. Decided by: {'; '.join(named)}."
+    )
+    advice = "See which part (h, f or g) the statistic belongs to, and whether codes from the guide have it too."
+    return conclude(level, rule, advice, windows=len(episodes), episodes=episodes)
+
+
+def _from_zero(effect: Interval) -> tuple[float, float]:
+    """The ends of the interval of an effect's size."""
+    inside = effect.low <= 0 <= effect.high
+    return (0.0 if inside else min(abs(effect.low), abs(effect.high))), max(abs(effect.low), abs(effect.high))
 
 
 def _that_exist(statistics: Sequence[Statistic], outcome: Outcome) -> list[Statistic]:

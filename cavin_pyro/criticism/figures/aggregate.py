@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from cavin_pyro.criticism.statistics.codes import SYMBOLS
-from cavin_pyro.criticism.statistics.two_sample import CodeComparison, projection
+from cavin_pyro.criticism.statistics.prior.two_sample import CodeComparison, projection
 
 COLORS = {"guide": "#0072B2", "prior": "#D55E00"}
 WORST = 4  # dimensions shown

@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from cavin_pyro.criticism.statistics.codes import SYMBOLS
-from cavin_pyro.criticism.statistics.information import ACTIVE
+from cavin_pyro.criticism.statistics.inference.information import ACTIVE
 
 
 def draw_dimensions(values: dict[str, Any], codes: tuple[str, ...]) -> Figure:

@@ -13,18 +13,13 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from cavin_pyro.criticism.section import Section
+from cavin_pyro.criticism.verdict import NONE, Verdict
 from cavin_pyro.training.elbo import Program, substitute, window_terms
 from models.state import Window
 
 ROWS = 4096  # particles times windows at once: some 100 MB with five objects
 SYMBOLS = {"effect_code": "c", "motion_code": "z"}  # the paper's symbols
 Codes = dict[str, Tensor]
-
-
-def some_windows(windows: Window, number: int, seed: int) -> Window:
-    """At most `number` of the windows `[B]`, the same ones for the same seed."""
-    order = torch.randperm(len(windows.actions), generator=torch.Generator().manual_seed(seed))
-    return windows.map(lambda field: field[order[:number]])
 
 
 @torch.no_grad()
@@ -70,7 +65,7 @@ def effect_log_weights(model: Program, guide: Program, window: Window, samples: 
 
 @torch.no_grad()
 def sample_guide(guide: Program, window: Window, samples: int, *, rows: int = ROWS) -> Codes:
-    """Codes `[samples, B, D]` of each window `[B]` from the guide."""
+    """Codes `[samples, B, D]` of each window `[B]` from the guide; from the prior, if the model takes its place."""
     pieces: dict[str, list[Tensor]] = {}
     step = max(1, rows // max(1, len(window.actions)))
     for start in range(0, samples, step):
@@ -82,9 +77,12 @@ def sample_guide(guide: Program, window: Window, samples: int, *, rows: int = RO
 
 
 @torch.no_grad()
-def sample_prior(model: Program, window: Window) -> Codes:
-    """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first."""
-    codes = _codes(poutine.trace(model).get_trace(window))
+def sample_prior(model: Program, window: Window, *, fixed: Codes | None = None) -> Codes:
+    """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first.
+
+    Codes in `fixed` are not sampled.
+    """
+    codes = _codes(poutine.trace(substitute(model, fixed or {})).get_trace(window))
     return {name: site["value"] for name, site in codes.items()}
 
 
@@ -108,12 +106,7 @@ def _codes(trace: poutine.Trace) -> dict[str, Any]:
     return {name: site for name, site in sites.items() if not site_is_subsample(site)}
 
 
-def mean_with_error(values: Tensor) -> dict[str, float]:
-    """Mean and its standard error over windows, `values: [B]`; overlapping windows make the error a little small."""
-    error = values.std().item() / len(values) ** 0.5 if len(values) > 1 else 0.0
-    return {"mean": values.mean().item(), "standard_error": error}
-
-
 def without_codes(name: str, title: str) -> Section:
     """The section of a model that has no codes."""
-    return Section(name, title, "", ["The model has no codes, so there is nothing to check here."], {})
+    nothing = Verdict(NONE, "The model has no codes.")
+    return Section(name, title, "", ["The model has no codes, so there is nothing to check here."], {}, verdict=nothing)

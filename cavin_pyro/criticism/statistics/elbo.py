@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cavin_pyro.criticism.statistics.clusters import clustered_error
 from cavin_pyro.training.elbo import Program, window_terms
 from models.state import Window
 
@@ -48,14 +49,18 @@ def scene_sizes(window: Window) -> Tensor:
     return torch.stack((subgoals.sum(-1), moves.sum((-2, -1))), -1).double()
 
 
-def adjusted_difference(values: Tensor, held_out: Tensor, covariates: Tensor) -> dict[str, float]:
+def adjusted_difference(
+    values: Tensor, held_out: Tensor, covariates: Tensor, episodes: Tensor | None = None
+) -> dict[str, float]:
     """Mean of `values: [N]` where `held_out: [N]` less the mean elsewhere, at equal `covariates: [N, C]`.
 
-    The coefficient of a linear regression, with its heteroscedastic standard error (White, 1980).
+    The coefficient of a linear regression, with its standard error clustered by `episodes: [N]` (Liang and Zeger,
+    1986); without them every value is its own (White, 1980).
     """
     centered = covariates - covariates.mean(0)
     design = torch.cat((torch.stack((torch.ones(len(values)), held_out), -1).double(), centered), -1)
     inverse = torch.linalg.pinv(design)  # [2 + C, N]; covariates may depend on each other
     coefficients = inverse @ values
-    error = (inverse[1] * (values - design @ coefficients)).square().sum().sqrt()
-    return {"mean": coefficients[1].item(), "standard_error": error.item()}
+    influences = len(values) * inverse[1] * (values - design @ coefficients)
+    episodes = torch.arange(len(values)) if episodes is None else episodes
+    return {"mean": coefficients[1].item(), "standard_error": clustered_error(influences, episodes)}

@@ -6,6 +6,7 @@ likelihood, also a user's own and mixtures over codes.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from pyro import poutine
 from pyro.ops.stats import crps_empirical, energy_score_empirical
 from torch import Tensor
 
+from cavin_pyro.criticism.statistics.clusters import Interval, bootstrap_interval
 from cavin_pyro.criticism.statistics.pushing import MOVED
 from cavin_pyro.criticism.statistics.windows import repeated
 from guides.guide import Guide
@@ -75,6 +77,44 @@ def predict_subgoals(model: Model, window: Window, samples: int, *, guide: Guide
     counted = first.mask & last.mask
     moved = counted & _far(last.centers - first.centers)
     return Prediction(centers, features, last.centers, last.features[..., chosen], counted, moved)
+
+
+def predict_actions(model: Model, window: Window, samples: int, *, guide: Guide) -> Tensor:
+    """g's pushes of windows `[B]`, with codes from the guide: `[samples, B, T, 4]` normalised."""
+    parts = []
+    for count, copies in repeated(window, samples):
+        replayed: Any = poutine.replay(model, trace=poutine.trace(guide).get_trace(copies))
+        actions = poutine.trace(replayed).get_trace(copies, generate=True).nodes["actions"]["value"]
+        parts.append(actions.unflatten(0, (count, -1)))
+    return torch.cat(parts)
+
+
+class Scale(NamedTuple):
+    """How wide a quantity's likelihood is, against what would be right."""
+
+    stated: float  # root of the mean variance of samples
+    error: float  # root of the mean squared error of their mean
+    ratio: Interval  # stated over error, with a 95 % interval over episodes; 1 is right, above it too wide
+
+
+def scale_of(samples: Tensor, real: Tensor, counted: Tensor, episodes: Tensor, *, seed: int = 0) -> Scale:
+    """Scale of samples `[S, B, ...]` of `real: [B, ...]`, over entries that are `counted: [B, ...]` bool.
+
+    Args:
+        episodes: of the windows `[B]`.
+    """
+    variance = (samples.var(0) * counted).double().flatten(1).sum(1)
+    # The mean of S samples errs by itself; that much is taken off.
+    squared = ((real - samples.mean(0)).square() * counted).double().flatten(1).sum(1) - variance / len(samples)
+    weight = counted.expand_as(real).double().flatten(1).sum(1)
+
+    def ratio(weights: Tensor) -> Tensor:
+        return (weights @ variance / (weights @ squared).clamp(min=1e-30)).sqrt()
+
+    if weight.sum() == 0:
+        return Scale(math.nan, math.nan, Interval(math.nan, math.nan, math.nan))
+    stated, error = ((total.sum() / weight.sum()).clamp(min=0).sqrt().item() for total in (variance, squared))
+    return Scale(stated, error, bootstrap_interval(ratio, episodes, seed=seed))
 
 
 class Transforms(NamedTuple):

@@ -36,11 +36,11 @@ class Nearness:
         `pair`: so that 1 % of the last states have a nearer pair; 0 without two objects anywhere. `tool`: so that
         as many pushes come nearer to a centre as moved an object by more than 1 cm.
         """
-        closest = _pair_distances(real.steps[:, -1], real.first.mask).amin((-1, -2))
+        closest = pair_distances(real.steps[:, -1], real.first.mask).amin((-1, -2))
         several = closest[closest.isfinite()]
         pair = torch.quantile(several, CLOSE_PAIR_SHARE).item() if len(several) else 0.0
-        moved = (_moves_of_pushes(real) > MOVED).any(-1).float().mean()
-        return cls(pair, torch.quantile(_path_distances(real).amin(-1), moved).item())
+        moved = (_moves_of_pushes(real) > MOVED).any(-1).to(real.steps.dtype).mean()
+        return cls(pair, torch.quantile(path_distances(real).amin(-1), moved).item())
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,11 @@ def _moved_objects(part: str, outcome: Outcome) -> Tensor:
 
 def _close_pairs(part: str, near: float, outcome: Outcome) -> Tensor:
     # Every pair stands in the matrix twice.
-    return (_pair_distances(_end(part, outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
+    return (pair_distances(_end(part, outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
 
 
 def _touching(near: float, outcome: Outcome) -> Tensor:
-    return (_path_distances(outcome).amin(-1) < near).float().mean(-1)
+    return (path_distances(outcome).amin(-1) < near).float().mean(-1)
 
 
 def _before(outcome: Outcome) -> Tensor:
@@ -121,7 +121,7 @@ def _moves_of_pushes(outcome: Outcome) -> Tensor:
     return (outcome.steps - _before(outcome)).norm(dim=-1) * outcome.first.mask.unsqueeze(1)
 
 
-def _pair_distances(centers: Tensor, mask: Tensor) -> Tensor:
+def pair_distances(centers: Tensor, mask: Tensor) -> Tensor:
     """Planar distances `[B, M, M]` between `centers: [B, M, 3]`; infinite unless both are real and distinct."""
     plane = centers[..., :2]
     distances = (plane.unsqueeze(-2) - plane.unsqueeze(-3)).norm(dim=-1)
@@ -134,7 +134,7 @@ def _endpoints(actions: Tensor) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(start).to(actions), torch.from_numpy(end).to(actions)
 
 
-def _path_distances(outcome: Outcome) -> Tensor:
+def path_distances(outcome: Outcome) -> Tensor:
     """From each push's path to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
     start, end = (point.unsqueeze(-2) for point in _endpoints(outcome.actions))
     line, offset = end - start, _before(outcome)[..., :2] - start
@@ -143,7 +143,7 @@ def _path_distances(outcome: Outcome) -> Tensor:
     return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
 
 
-def _start_distances(outcome: Outcome) -> Tensor:
+def start_distances(outcome: Outcome) -> Tensor:
     """From each push's start to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
     start, _ = _endpoints(outcome.actions)
     distances = (_before(outcome)[..., :2] - start.unsqueeze(-2)).norm(dim=-1)
@@ -151,11 +151,16 @@ def _start_distances(outcome: Outcome) -> Tensor:
 
 
 def _start_to_nearest(outcome: Outcome) -> Tensor:
-    return _start_distances(outcome).amin(-1)
+    return start_distances(outcome).amin(-1)
 
 
 def _start_to_moved(outcome: Outcome) -> Tensor:
     """To the object that the push moves farthest; NaN if none goes farther than `PUSHED`."""
     farthest, which = _moves_of_pushes(outcome).max(-1)
-    distance = _start_distances(outcome).gather(-1, which.unsqueeze(-1)).squeeze(-1)
+    distance = start_distances(outcome).gather(-1, which.unsqueeze(-1)).squeeze(-1)
     return distance.masked_fill(farthest <= PUSHED, torch.nan)
+
+
+def push_starts(actions: Tensor) -> Tensor:
+    """Where pushes `[..., 4]` start, in the plane of the table: `[..., 2]` metres."""
+    return _endpoints(actions)[0]

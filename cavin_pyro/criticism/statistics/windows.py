@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,6 +13,7 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
+from cavin_pyro.training.elbo import substitute
 from guides.guide import Guide
 from models.model import Model
 from models.state import State, Window
@@ -44,7 +45,12 @@ def observed(window: Window) -> Outcome:
 
 
 def generated(
-    model: Model, window: Window, *, guide: Guide | None = None, means: Sequence[str] | None = None
+    model: Model,
+    window: Window,
+    *,
+    guide: Guide | None = None,
+    means: Sequence[str] | None = None,
+    codes: Mapping[str, Tensor] | None = None,
 ) -> Outcome:
     """Run the program once for each window `[B]` with `generate=True`.
 
@@ -52,8 +58,9 @@ def generated(
         guide: where the codes come from; by default the model's own prior given s.
         means: names of the codes. If given, everything else takes the mean of its likelihood, as planning does;
             by default everything is sampled.
+        codes: `[B, D]` by name, in place of samples.
     """
-    program: Any = model
+    program: Any = substitute(model, codes or {})
     if guide is not None:
         program = poutine.replay(model, trace=poutine.trace(guide).get_trace(window))
     if means is not None:

@@ -13,6 +13,8 @@ from pyro.nn import PyroModule
 from torch import Tensor
 
 from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.statistics.inference.simulation import simulate
+from cavin_pyro.criticism.statistics.windows import seeded
 from models.networks.pointnet import PointNet
 from models.state import State, Window
 
@@ -113,6 +115,72 @@ class NoGuide(PyroModule):
     def forward(self, window: Window) -> None: ...
 
 
+class SceneModel(PyroModule):
+    """c ~ N(10 s, I), s' ~ N(c, 0.25 I), z ~ N(0, I), three pushes ~ N(z, 0.25 I) each; the next states stay at zero.
+
+    s and s' are the centres of one object. `shuffled`: the prior is that of another scene.
+    """
+
+    codes = ("effect_code", "motion_code")
+
+    def __init__(self, shuffled: bool = False) -> None:
+        super().__init__()
+        self.shuffled = shuffled
+
+    def forward(self, window: Window, generate: bool = False) -> None:
+        mean = scene_mean(window).roll(int(self.shuffled), 0)
+        with pyro.plate("windows", len(mean)):
+            c = pyro.sample("effect_code", normal(mean, 1.0))
+            last = window.last
+            after, kind = (None, None) if generate else (last.centers, last.features)
+            pyro.sample("subgoal_centers", distributions.Normal(c.unsqueeze(-2), NOISE).to_event(2), obs=after)
+            still = torch.zeros_like(last.features)
+            pyro.sample("subgoal_features", distributions.Normal(still, 0.1).to_event(2), obs=kind)
+            z = pyro.sample("motion_code", normal(torch.zeros_like(window.actions[:, 0]), 1.0))
+            pushes = distributions.Normal(z.unsqueeze(-2).expand(*z.shape[:-1], 3, 4), NOISE).to_event(2)
+            pyro.sample("actions", pushes, obs=None if generate else window.actions)
+        if generate:
+            pyro.deterministic("next_centers", torch.zeros(len(mean), 3, 1, 3), event_dim=3)
+            pyro.deterministic("next_features", torch.ones(len(mean), 3, 1, 2), event_dim=3)
+
+
+class SceneGuide(PyroModule):
+    """The posterior of `SceneModel`, with its deviations multiplied by `stretch`; `blind`: N(10 s + shift, I) for c."""
+
+    def __init__(self, stretch: float = 1.0, *, blind: bool = False, shift: float = 0.0, reads: float = 0.0) -> None:
+        super().__init__()
+        self.stretch, self.blind, self.shift, self.reads = stretch, blind, shift, reads
+
+    def forward(self, window: Window) -> None:
+        mean = scene_mean(window) + self.shift
+        after = (mean + PRECISION * window.last.centers[:, 0]) / (1 + PRECISION)
+        after = after + self.reads * window.actions[:, 0, :3]
+        with pyro.plate("windows", len(mean)):
+            q = normal(mean, 1.0) if self.blind else normal(after, self.stretch * (1 + PRECISION) ** -0.5)
+            pyro.sample("effect_code", q)
+            pushes = PRECISION * window.actions.sum(-2) / (1 + 3 * PRECISION)
+            pyro.sample("motion_code", normal(pushes, self.stretch * (1 + 3 * PRECISION) ** -0.5))
+
+
+def scene_mean(window: Window) -> Tensor:
+    return 10 * window.first.centers[:, 0]
+
+
+def scene_context(guide: PyroModule, *, shuffled: bool = False, batch: int = 600, each: int = 2) -> CheckContext:
+    """Windows of `SceneModel`, `each` of an episode, for a model whose prior may be shuffled."""
+    generator = torch.Generator().manual_seed(3)
+    centers = 0.3 * torch.randn(batch, 1, 1, 3, generator=generator).expand(-1, 4, -1, -1)
+    ones = torch.ones(batch, 4, 1, dtype=torch.bool)
+    seen = torch.ones(batch, 3, dtype=torch.bool)
+    blank = Window(State(centers, torch.ones(batch, 4, 1, 2), ones), torch.zeros(batch, 3, 4), seen, seen[:, 0])
+    with seeded(4):
+        _, window = simulate(SceneModel(), blank)
+    episodes = torch.arange(batch) // each
+    return CheckContext(
+        SceneModel(shuffled), guide, PointNet(feature_dimension=2), window, window, validation_episodes=episodes
+    )
+
+
 def covariance() -> Tensor:
     """Of (x, y): [4, 4]."""
     eye = torch.eye(2, dtype=torch.float64)
@@ -157,6 +225,12 @@ def linear() -> SimpleNamespace:
         context=linear_context,
         windows=linear_windows,
     )
+
+
+@pytest.fixture(scope="session")
+def scenes() -> SimpleNamespace:
+    """A known cascade whose prior depends on the state, and what goes with it."""
+    return SimpleNamespace(model=SceneModel, guide=SceneGuide, context=scene_context, precision=PRECISION)
 
 
 @pytest.fixture

@@ -95,11 +95,13 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
 def test_sampled_windows_depend_on_their_seed(check_config: Callable[..., DictConfig], pushes: Path) -> None:
     context, _ = load_context(check_config("windows=1000"))
     numbers = torch.arange(40)
-    table: Any = SimpleNamespace(sequence_mask=numbers % 2 == 0, batch=lambda chosen: chosen)
-    first, again, other = (sample_windows(table, numbers, 6, seed=[seed, 0]) for seed in (0, 0, 1))
+    table: Any = SimpleNamespace(sequence_mask=numbers % 2 == 0, batch=lambda chosen: chosen, episodes=numbers // 10)
+    (first, episodes), (again, _), (other, _) = (
+        sample_windows(table, numbers, 6, seed=[seed, 0]) for seed in (0, 0, 1)
+    )
     assert len(set(first.tolist())) == 6 and first.equal(again) and not first.equal(other)
-    assert (first % 2 == 0).all()
-    assert sample_windows(table, numbers[:7], 1000, seed=[0]).tolist() == [0, 2, 4, 6]
+    assert (first % 2 == 0).all() and episodes.equal(first // 10)
+    assert sample_windows(table, numbers[:7], 1000, seed=[0])[0].tolist() == [0, 2, 4, 6]
     assert context.seed == 0
 
 

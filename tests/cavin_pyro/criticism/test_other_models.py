@@ -18,7 +18,15 @@ WINDOWS = {
     "maximum_move": 0.5,
     "negative_fraction": 0.25,
 }
-SECTIONS_OF_CODES = {"guide_error", "amortization", "codes", "aggregate_posterior", "consistency"}
+SECTIONS_OF_CODES = {
+    "guide_error",
+    "amortization",
+    "simulation",
+    "codes",
+    "prior",
+    "aggregate_posterior",
+    "consistency",
+}
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from cavin_pyro.criticism.report import page, plain, render, write_report
 from cavin_pyro.criticism.section import Picture, Section, Table
+from cavin_pyro.criticism.verdict import Verdict
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 ABOUT: dict[str, Any] = {
@@ -79,6 +80,7 @@ def section(**changes: Any) -> Section:
         "explanation": "One.\n\nTwo <em>.",
         "findings": ['It is "<b>bold</b>".'],
         "values": {"rate": np.float32(1 / 3), "list": torch.arange(2), "none": math.nan, "far": [math.inf]},
+        "verdict": Verdict("look", "By <s>rule</s>.", "Do <i>this</i>."),
         "tables": [Table(["name", "x<y"], [["<a>", 0.12345], ["b", math.nan], ["c", -math.inf]], digits=2)],
         "pictures": [
             Picture("sampled", "Lines <u>.", figure(photograph=False)),
@@ -99,7 +101,20 @@ def test_the_page_is_valid_html_without_external_references() -> None:
 
 def test_the_page_shows_what_is_in_the_sections() -> None:
     reader = read(page(ABOUT, [render(section()), render(section(name="second"))]))
-    for phrase in ('It is "<b>bold</b>".', "One.", "Two <em>.", "x<y", "<a>", "0.12", "–", "−∞", "Lines <u>."):
+    for phrase in (
+        'It is "<b>bold</b>".',
+        "One.",
+        "Two <em>.",
+        "By <s>rule</s>.",
+        "Do <i>this</i>.",
+        "Glossary",
+        "x<y",
+        "<a>",
+        "0.12",
+        "–",
+        "−∞",
+        "Lines <u>.",
+    ):
         assert phrase in reader.text
     assert {"#first", "#second"} <= set(reader.references)
     kinds = [reference[:19] for reference in reader.references if reference.startswith("data:")]
@@ -108,7 +123,7 @@ def test_the_page_shows_what_is_in_the_sections() -> None:
 
 def test_strings_are_escaped_wherever_they_come_from() -> None:
     html = page(ABOUT, [render(section())])
-    for hostile in ("<script>alert", "<b>bold", "<em>", "<i>", "<u>", "here/<b>"):
+    for hostile in ("<script>alert", "<b>bold", "<em>", "<i>", "<u>", "<s>", "here/<b>"):
         assert hostile not in html
     assert "here/&lt;b&gt;.safetensors" in html
 
@@ -127,7 +142,7 @@ def test_the_data_is_valid_json_of_finite_numbers(tmp_path: Path) -> None:
     report = json.loads((tmp_path / "report.json").read_text(), parse_constant=refuse)
     assert report["about"] == ABOUT
     assert report["sections"]["first"]["values"] == {"rate": 0.333333, "list": [0, 1], "none": None, "far": [None]}
-    assert set(report["sections"]["first"]) == {"title", "findings", "values"}
+    assert set(report["sections"]["first"]) == {"title", "verdict", "findings", "values"}
     assert {path.name for path in tmp_path.iterdir()} == {"report.json", "report.html"}
 
 

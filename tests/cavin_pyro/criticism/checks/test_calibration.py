@@ -42,9 +42,9 @@ SIZES = {"effect_dimension": 2, "motion_dimension": 2, "feature_dimension": 4, "
 COUNT = 400
 
 
-def model_of(center: float = 0.01) -> CascadedModel:
+def model_of(center: float = 0.01, feature: float = 0.1) -> CascadedModel:
     torch.manual_seed(1)
-    model = CascadedModel(**SIZES, scales=LikelihoodScales(center=center))
+    model = CascadedModel(**SIZES, scales=LikelihoodScales(center=center, feature=feature))
     with torch.no_grad():
         model.meta_dynamics.change.head.weight.mul_(5.0)  # codes that matter
     return model.requires_grad_(False).eval()
@@ -100,6 +100,28 @@ def test_a_scale_half_as_large_as_it_should_be_is_caught(right: SimpleNamespace)
     pits = planar_transforms(model_of(center=0.005), right.f, "f")
     assert kstest(pits.numpy(), "uniform").pvalue < 1e-6
     assert coverage(pits, 0.9) == pytest.approx(2 * norm.cdf(norm.ppf(0.95) / 2) - 1, abs=0.03)
+
+
+def test_only_the_scale_that_is_four_times_too_wide_is_called_so(right: SimpleNamespace) -> None:
+    findings, levels = {}, {}
+    for name, feature in (("right", 0.1), ("wide", 0.4)):
+        context = context_of(model_of(feature=feature), OwnGuide(), right.f)
+        section = assess_calibration(context, windows=200, samples=20)
+        findings[name] = [one for one in section.findings if one.startswith(("Features of f", "Centres of f"))]
+        levels[name] = section.values["scales"]["f_features"]["ratio"]
+    assert all("about right" in finding for finding in findings["right"])
+    assert "about right" in findings["wide"][0] and "4.4 times too wide" in findings["wide"][1]
+    # The features between are of unit length again, so that their error is a little less than the 0.1 that made them.
+    assert 1.0 < levels["right"]["mean"] < 1.2
+    assert levels["wide"]["mean"] == pytest.approx(4 * levels["right"]["mean"], rel=0.05)
+
+
+def test_the_verdict_names_what_decided_it(right: SimpleNamespace) -> None:
+    section = assess_calibration(context_of(model_of(feature=0.4), OwnGuide(), right.f), windows=200, samples=20)
+    assert section.verdict is not None and section.verdict.level == "bad"
+    assert "Decided by: features of f" in section.verdict.rule
+    few = assess_calibration(context_of(model_of(), OwnGuide(), right.f), windows=40, samples=4)
+    assert few.verdict is not None and few.verdict.level == "too few"
 
 
 def tails(model: PyroModule, window: Window, part: str) -> dict[str, float]:
@@ -181,6 +203,15 @@ class OnlyDynamics(PyroModule):
             else:
                 before = window.states.step(slice(0, -1))
                 observe_transitions(self.dynamics, self.scales, window, self.encoder(before))
+
+
+class OwnGuide(PyroModule):
+    """N(0, I), the prior of the models here."""
+
+    def forward(self, window: Window, generate: bool = False) -> None:
+        with pyro.plate("windows", len(window.actions)):
+            for name in ("effect_code", "motion_code"):
+                pyro.sample(name, pyro.distributions.Normal(torch.zeros(len(window.actions), 2), 1.0).to_event(1))
 
 
 class NoGuide(PyroModule):

@@ -9,7 +9,13 @@ import torch
 
 from cavin_pyro.criticism.checks.codes import assess_codes
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.statistics.information import dimension_kl, posterior_mean_variance
+from cavin_pyro.criticism.statistics.inference.information import (
+    Information,
+    conditional_bounds,
+    dimension_kl,
+    marginal_bounds,
+    posterior_mean_variance,
+)
 
 MANY = {"windows": 1000, "samples": 64, "pairs": 300}
 
@@ -71,3 +77,42 @@ def test_dimensions_sum_to_the_kl_of_the_whole_code(cascade: CheckContext) -> No
 def test_one_code_has_one_row_and_none_a_sentence(linear: SimpleNamespace) -> None:
     assert len(assess_codes(linear.one_code(), windows=50, samples=8, pairs=20).tables[0].rows) == 1
     assert "no codes" in assess_codes(linear.no_code()).findings[0]
+
+
+def test_bounds_hold_for_a_prior_that_depends_on_the_state(scenes: SimpleNamespace) -> None:
+    """c tells s and nothing of s': by the rate less I(c; s, s'), a divergence would be some -2 nats."""
+    found = assess_codes(scenes.context(scenes.guide(blind=True)), windows=600, pairs=200).values["effect_code"]
+    assert found["information"]["lower"] > 1.5
+    assert found["prior_varies"] and found["aggregate_kl"] is None
+    assert found["information_given_state"] == {"low": None, "high": pytest.approx(0.0, abs=1e-6)}
+    assert found["aggregate_kl_given_state"]["high"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_nats_that_only_separate_the_aggregate_from_the_prior_are_no_information(scenes: SimpleNamespace) -> None:
+    found = assess_codes(scenes.context(scenes.guide(blind=True, shift=1.0)), windows=600, pairs=50).values[
+        "effect_code"
+    ]
+    assert found["kl"]["mean"] == pytest.approx(1.5)
+    assert (
+        0.7
+        < found["aggregate_kl_given_state"]["low"]
+        <= 1.5
+        == pytest.approx(found["aggregate_kl_given_state"]["high"])
+    )
+    assert found["information_given_state"]["high"] < 0.8
+
+
+def test_the_posterior_carries_at_most_its_rate(scenes: SimpleNamespace) -> None:
+    found = assess_codes(scenes.context(scenes.guide()), windows=600, pairs=50).values["effect_code"]
+    information = 1.5 * math.log(1 + scenes.precision)
+    assert found["information_given_state"]["high"] == pytest.approx(information, abs=0.2)
+    assert found["aggregate_kl_given_state"]["low"] < 0.1
+
+
+def test_a_number_that_is_no_bound_is_refused() -> None:
+    between = Information(1.0, 2.0, 0.0, 0.0)
+    assert marginal_bounds(3.0, between, varies=False) == (1.0, 2.0)
+    with pytest.raises(ValueError, match="bounds no divergence when the prior depends on the state"):
+        marginal_bounds(3.0, between, varies=True)
+    assert conditional_bounds(3.0, -1.0) == ((None, 3.0), (0.0, 3.0))
+    assert conditional_bounds(3.0, 1.0) == ((None, 2.0), (1.0, 3.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from scipy.stats import ks_2samp
@@ -17,12 +17,18 @@ class TwoSample(NamedTuple):
     p_value: float
 
 
-def energy_test(first: Tensor, second: Tensor, *, permutations: int = 999, seed: int = 0) -> TwoSample:
+def energy_test(
+    first: Tensor, second: Tensor, *, episodes: Tensor | None = None, permutations: int = 999, seed: int = 0
+) -> TwoSample:
     """Energy test (Székely and Rizzo, 2013) of samples `[N, D]` and `[N, D]`, row with row.
 
     2 E|x - y| - E|x - x'| - E|y - y'|, divided by 2 E|x - y|. Permutations exchange x and y within rows: what rows
     have in common (the state that both codes belong to) stays as it is, so the test holds for priors that depend on the
-    state as well. The p-value is at least 1 / (permutations + 1).
+    state as well. But it compares the two heaps of codes alone: a prior whose codes belong to other states passes.
+    The p-value is at least 1 / (permutations + 1).
+
+    Args:
+        episodes: `[N]`; rows of one episode are exchanged together.
 
     Raises:
         ValueError: samples of different shape.
@@ -31,7 +37,10 @@ def energy_test(first: Tensor, second: Tensor, *, permutations: int = 999, seed:
         raise ValueError(f"samples [N, D] of one shape are wanted, not {[*first.shape]} and {[*second.shape]}")
     count, both = len(first), torch.cat((first, second)).double()
     distances = torch.cdist(both, both)
-    side = torch.randint(0, 2, (count, permutations), generator=torch.Generator().manual_seed(seed)) * 2.0 - 1
+    _, which = torch.unique(torch.arange(count) if episodes is None else episodes, return_inverse=True)
+    groups = int(which.max()) + 1
+    side = torch.randint(0, 2, (groups, permutations), generator=torch.Generator().manual_seed(seed)) * 2.0 - 1
+    side = side[which]
     side = torch.cat((torch.ones(count, 1), side), 1).double() / count  # the samples as they came stand first
     signs = torch.cat((side, -side))
     # With weights 1 / N on one sample and -1 / N on the other, the energy is minus a quadratic form.
@@ -59,16 +68,21 @@ class CodeComparison(NamedTuple):
 
 
 def compare_codes(
-    guide: Tensor, prior: Tensor, *, active: Tensor, permutations: int = 999, seed: int = 0
+    guide: Tensor,
+    prior: Tensor,
+    *,
+    active: Tensor,
+    episodes: Tensor | None = None,
+    permutations: int = 999,
+    seed: int = 0,
 ) -> CodeComparison:
-    """Tests of codes `[N, D]` against codes `[N, D]`, paired by row; `active: [D]` bool."""
+    """Tests of codes `[N, D]` against codes `[N, D]`, paired by row; `active: [D]` bool; `episodes: [N]`."""
+    together: dict[str, Any] = {"episodes": episodes, "permutations": permutations, "seed": seed}
     tests = [ks_2samp(x.numpy(), y.numpy()) for x, y in zip(guide.double().T, prior.double().T, strict=True)]
     p_values = torch.tensor([float(test.pvalue) for test in tests], dtype=torch.float64)
     statistics = torch.tensor([float(test.statistic) for test in tests], dtype=torch.float64)
-    whole = energy_test(guide, prior, permutations=permutations, seed=seed)
-    part = (
-        energy_test(guide[:, active], prior[:, active], permutations=permutations, seed=seed) if active.any() else None
-    )
+    whole = energy_test(guide, prior, **together)
+    part = energy_test(guide[:, active], prior[:, active], **together) if active.any() else None
     return CodeComparison(guide, prior, whole, part, statistics, (p_values * len(tests)).clamp(max=1.0))
 
 

@@ -10,7 +10,6 @@ import torch
 from pyro.ops.stats import fit_generalized_pareto
 from torch import Tensor
 
-UNRELIABLE = 0.7  # k-hat above which importance sampling is not to be trusted (Vehtari et al., 2024)
 SMALLEST_TAIL = 10
 
 
@@ -19,11 +18,33 @@ class Weights(NamedTuple):
 
     bounds: dict[int, Tensor]  # by K, [B]
     shapes: Tensor  # k-hat [B]
+    episodes: Tensor  # [B]
+    limit: float  # of k-hat, for so many samples
+
+    @classmethod
+    def of(cls, log_weights: Tensor, particles: Sequence[int], episodes: Tensor) -> Weights:
+        """From log weights `[N, B]` of windows from `episodes: [B]`, for bounds of several K."""
+        limit = reliable_limit(len(log_weights))
+        return cls(evidence_bounds(log_weights, particles), pareto_shapes(log_weights), episodes, limit)
+
+    @property
+    def unreliable(self) -> Tensor:
+        """Windows whose weights are not to be trusted: `[B]`, 0 or 1."""
+        return (self.shapes > self.limit).double()
 
     @property
     def gap(self) -> Tensor:
         """The largest bound minus the ELBO: `[B]` nats."""
         return self.bounds[max(self.bounds)] - self.bounds[min(self.bounds)]
+
+
+def reliable_limit(samples: int) -> float:
+    """The k-hat above which so many importance weights are not to be trusted: min(1 - 1 / log10 S, 0.7).
+
+    Vehtari, Simpson, Gelman, Yao and Gabry, "Pareto smoothed importance sampling", 2024, section 3.2.4: few samples
+    need a lighter tail. Ten samples or fewer are never to be trusted unless the weights are bounded (limit 0).
+    """
+    return max(0.0, min(1 - 1 / math.log10(samples), 0.7)) if samples > 10 else 0.0
 
 
 def evidence_bounds(log_weights: Tensor, particles: Sequence[int]) -> dict[int, Tensor]:
@@ -56,7 +77,7 @@ def pareto_shapes(log_weights: Tensor, *, flat: float = 1e-3) -> Tensor:
     """k-hat of each column of `log_weights: [N, B]`: `[B]` float64.
 
     The generalised Pareto shape of the largest min(N / 5, 3 sqrt(N)) weights, as `pyro.infer.importance` fits it: below
-    0.5 the weights have a variance, above 0.7 no practical number of them is enough.
+    0.5 the weights have a variance; `reliable_limit` tells above which value so many of them are not enough.
 
     Args:
         flat: nats; weights that differ by less are equal but for rounding. Their k-hat is -inf. Where one weight

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavin_pyro.criticism.statistics.importance import evidence_bounds, pareto_shapes
+from cavin_pyro.criticism.statistics.inference.importance import Weights, evidence_bounds, pareto_shapes, reliable_limit
 
 
 def test_bounds_take_one_logarithm_for_each_window_and_group() -> None:
@@ -56,3 +56,15 @@ def test_equal_weights_have_no_tail_and_a_single_one_is_all_tail() -> None:
     logs[:, 1] += 1e-5 * torch.rand(1000)
     logs[0, 2] = 100.0
     assert pareto_shapes(logs - 500).tolist() == [-math.inf, -math.inf, math.inf]
+
+
+@pytest.mark.parametrize("samples, limit", [(10, 0.0), (100, 0.5), (1000, 2 / 3), (10_000, 0.7)])
+def test_few_weights_need_a_lighter_tail(samples: int, limit: float) -> None:
+    assert reliable_limit(samples) == pytest.approx(limit)
+
+
+def test_weights_are_judged_by_the_limit_of_their_number() -> None:
+    logs = gaussian_weights(0.6).reshape(-1, 100)[:200]  # 200 of each of 100 windows; k-hat is 0.64 in theory
+    found = Weights.of(logs, (1, 200), torch.arange(100))
+    assert found.limit == pytest.approx(reliable_limit(200)) and found.limit < 0.6
+    assert found.unreliable.mean() == (found.shapes > found.limit).double().mean() > 0.4

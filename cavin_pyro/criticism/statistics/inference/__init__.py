@@ -1,0 +1,1 @@
+"""Whether the guide is right: importance weights, information, simulation-based calibration."""
