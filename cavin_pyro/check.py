@@ -1,4 +1,4 @@
-"""Criticise: `python -m cavin_pyro.check checkpoint=FILE data=DIR output=DIR`."""
+"""Criticise: `python -m cavin_pyro.check checkpoint=FILE data=DIR output=DIR`, or two with `a=FILE b=FILE`."""
 
 from __future__ import annotations
 
@@ -14,37 +14,36 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.config.parts import check_sizes
     from cavin_pyro.criticism.checks.consistency import check_objects
+    from cavin_pyro.criticism.comparison.side_by_side import check_pair, write_pair
     from cavin_pyro.criticism.export import check_export, write_samples
     from cavin_pyro.criticism.graph import program_graph
     from cavin_pyro.criticism.loading import load_context
     from cavin_pyro.criticism.report import write_report
-    from cavin_pyro.criticism.sections import choose_sections, run_sections
+    from cavin_pyro.criticism.sections import choose_sections, fingerprint_of, print_findings, run_sections
     from cavin_pyro.storage.files import output_folder
-    from cavin_pyro.storage.provenance import program_fingerprint
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     names = choose_sections(config.sections, config.sizes)
-    export = check_export(config.export)
+    pair, export = check_pair(config), check_export(config.export)
     check_sizes("sizes.export", config.sizes.export)
     with output_folder(config.output) as folder:
-        context, about = load_context(config)
-        if "consistency" in names:  # before anything is written
-            check_objects(context, config.sizes.consistency.objects)
-        check_same_run(folder, config, ignore=("output", "sections", "export"))
-        write_config(folder, config)
-        if export:
-            write_samples(
-                context, export, about, windows=config.sizes.export.windows, samples=config.sizes.export.samples
-            )
-            print(f"written: {export}")
-        # A section of an earlier run is reused if a new run would give the same result.
-        data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
-        fingerprint = " ".join([program_fingerprint(), about["weights"], *data])
-        parts = run_sections(names, context, config.sizes, folder, fingerprint)
-        write_report(folder, {**about, "graph": program_graph(context.model, context.validation)}, parts)
-        for part in parts:
-            print("\n  ".join([part["title"], *part["findings"]]))
+        if pair:
+            parts = write_pair(config, names, folder)
+        else:
+            context, about = load_context(config)
+            if "consistency" in names:  # before anything is written
+                check_objects(context, config.sizes.consistency.objects)
+            check_same_run(folder, config, ignore=("output", "sections", "export"))
+            write_config(folder, config)
+            if export:
+                sizes = config.sizes.export
+                write_samples(context, export, about, windows=sizes.windows, samples=sizes.samples)
+                print(f"written: {export}")
+            # A section of an earlier run is reused if a new run would give the same result.
+            parts = run_sections(names, context, config.sizes, folder, fingerprint_of(about))
+            write_report(folder, {**about, "graph": program_graph(context.model, context.validation)}, parts)
+        print_findings(parts)
         print(f"written: {folder / 'report.html'}")
 
 

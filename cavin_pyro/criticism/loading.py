@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,10 +30,23 @@ from cavin_pyro.training.factory import data_folders
 from envs.workspace import MAXIMUM_OBJECTS
 from guides.guide import Guide
 from models.model import Model
+from models.networks.geometry import Geometry
 from models.state import Window
 
 # Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
 ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum_move", "negative_fraction")
+
+
+class Loaded(NamedTuple):
+    """A checkpoint with its data. path: of the file. windows: all of the data, as its own training split them."""
+
+    path: Path
+    checkpoint: Checkpoint
+    model: Model
+    guide: Guide
+    pointnet: Geometry
+    table: WindowTable
+    folders: list[Path]
 
 
 def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
@@ -49,19 +62,58 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
     world = collecting_world(config.env)
-    path = find_checkpoint(config.checkpoint)
+    loaded = _load(config, config.checkpoint)
+    return _context(config, loaded, world, loaded.table.validation)
+
+
+def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any]]]:
+    """The same for the options `a` and `b`, with the same held-out windows: those that neither was trained on.
+
+    Raises:
+        UserError: their windows are not of the same data, or none is held out by both.
+    """
+    world = collecting_world(config.env)
+    both = {name: _load(config, config[name]) for name in ("a", "b")}
+    tables = {name: loaded.table for name, loaded in both.items()}
+    lengths = {name: loaded.model.segment_length for name, loaded in both.items()}
+    held_out_objects = [list(trained_windows(one.checkpoint, one.path)[0].held_out_objects) for one in both.values()]
+    if len(set(lengths.values())) > 1 or held_out_objects[0] != held_out_objects[1]:
+        raise UserError(
+            f"a and b cannot be compared on the same windows: they have segments of {lengths['a']} and {lengths['b']} "
+            f"pushes and hold out the objects {held_out_objects[0]} and {held_out_objects[1]}"
+        )
+    starts = [tables[name].starts[_counted(tables[name], tables[name].validation)] for name in tables]
+    common = starts[0][torch.isin(starts[0], starts[1])].sort().values
+    if not len(common):
+        raise UserError("no window was held out by both a and b: give other data=, on which neither was trained")
+    contexts = {}
+    for name, loaded in both.items():
+        order = tables[name].starts.argsort()
+        numbers = order[torch.searchsorted(tables[name].starts[order], common)]
+        contexts[name] = _context(config, loaded, world, numbers)
+    return contexts
+
+
+def _load(config: DictConfig, name: str) -> Loaded:
+    path = find_checkpoint(name)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
     pointnet = geometry_of(checkpoint, path)
     check_fit(model, pointnet, MAXIMUM_OBJECTS)
     windows, segment_length, split = trained_windows(checkpoint, path)
     folders = data_folders(config.data)
-    data = [compare_data(folder, checkpoint.provenance) for folder in folders]
+    for folder in folders:
+        compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
     table = load_windows(folders, pointnet, windows, segment_length=segment_length, seed=split)
-    (training, trained_in), (validation, held_out_in) = (
-        sample_windows(table, getattr(table, name), config.windows, seed=[config.seed, number])
-        for number, name in enumerate(("training", "validation"))
-    )
+    return Loaded(path, checkpoint, model, guide, pointnet, table, folders)
+
+
+def _context(
+    config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: torch.Tensor
+) -> tuple[CheckContext, dict[str, Any]]:
+    path, checkpoint, model, guide, pointnet, table, folders = loaded
+    training, trained_in = sample_windows(table, table.training, config.windows, seed=[config.seed, 0])
+    validation, held_out_in = sample_windows(table, held_out, config.windows, seed=[config.seed, 1])
     context = CheckContext(
         model,
         guide,
@@ -82,7 +134,7 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         "prior": _last(own_prior or checkpoint.config["prior"].get("_target_")),
         "objective": _objective(checkpoint.config),
         "trained": checkpoint.provenance,
-        "data": data,
+        "data": [compare_data(folder, checkpoint.provenance) for folder in folders],
         "windows": {"training": len(training.actions), "validation": len(validation.actions)},
         "episodes": {"training": len(trained_in.unique()), "validation": len(held_out_in.unique())},
         "seed": config.seed,
@@ -137,10 +189,14 @@ def sample_windows(
     table: WindowTable, numbers: torch.Tensor, count: int, *, seed: Sequence[int]
 ) -> tuple[Window, torch.Tensor]:
     """At most `count` of the windows with these numbers, among those that count for all terms, and their episodes."""
-    counted = numbers[table.sequence_mask[numbers]]
+    counted = _counted(table, numbers)
     order = np.random.default_rng(list(seed)).permutation(len(counted))[:count]
     chosen = counted[torch.from_numpy(np.sort(order))]
     return table.batch(chosen), table.episodes[chosen]
+
+
+def _counted(table: WindowTable, numbers: torch.Tensor) -> torch.Tensor:
+    return numbers[table.sequence_mask[numbers]]
 
 
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,8 +30,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavin_pyro.criticism.glossary import glossary_of
 from cavin_pyro.criticism.section import Section, Table
+from cavin_pyro.criticism.verdicts.glossary import glossary_of
 from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6

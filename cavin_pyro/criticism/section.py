@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from cavin_pyro.criticism.verdict import Verdict
+from cavin_pyro.criticism.verdicts.verdict import Verdict
 
 
 @dataclass(frozen=True)

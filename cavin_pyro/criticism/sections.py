@@ -26,6 +26,7 @@ from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.storage.files import read_json, write_json
+from cavin_pyro.storage.provenance import program_fingerprint
 
 # In the order of the report. Each takes the context and the options `sizes.<name>`; long ones show
 # their progress.
@@ -62,6 +63,12 @@ def choose_sections(names: str | Sequence[str] | None, sizes: Mapping[str, Mappi
     return [name for name in SECTIONS if name in wanted]
 
 
+def fingerprint_of(about: Mapping[str, Any]) -> str:
+    """What a section of an earlier run must have been made from, to be reused: program, weights and data."""
+    data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
+    return " ".join([program_fingerprint(), about["weights"], *data])
+
+
 def run_sections(
     names: Sequence[str], context: CheckContext, sizes: Mapping[str, Mapping[str, Any]], folder: Path, fingerprint: str
 ) -> list[Part]:
@@ -82,6 +89,13 @@ def run_sections(
             write_json(kept / f"{name}.json", {"fingerprint": fingerprint, "part": part})
         parts.append(part)
     return parts
+
+
+def print_findings(parts: Sequence[Part]) -> None:
+    """Titles with their verdicts, and the findings."""
+    for part in parts:
+        verdict = f" [{part['verdict']['level']}]" if part["verdict"] else ""
+        print("\n  ".join([f"{part['title']}{verdict}", *part["findings"]]))
 
 
 def _arguments(sizes: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from cavin_pyro.criticism.statistics.codes import SYMBOLS, sample_guide, sample_
 from cavin_pyro.criticism.statistics.inference.information import ACTIVE, posterior_mean_variance
 from cavin_pyro.criticism.statistics.prior.two_sample import CodeComparison, TwoSample, compare_codes, energy_test
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import conclude, grade
+from cavin_pyro.criticism.verdicts.verdict import conclude, grade
 
 NAME, TITLE = "aggregate_posterior", "Whether inferred codes, without their states, are spread like the prior's"
 LEVEL = 0.05

@@ -14,7 +14,7 @@ from cavin_pyro.criticism.statistics.clusters import mean_interval, mean_with_er
 from cavin_pyro.criticism.statistics.codes import log_weights, without_codes
 from cavin_pyro.criticism.statistics.inference.importance import evidence_bounds, pareto_shapes, reliable_limit
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import conclude, grade
+from cavin_pyro.criticism.verdicts.verdict import conclude, grade
 
 NAME, TITLE = "amortization", "The amortization gap"
 SMALL_GAP, LARGE_GAP = 1.0, 5.0  # nats per window

@@ -28,7 +28,7 @@ from cavin_pyro.criticism.statistics.predictions import (
     transform,
 )
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import LOOK, Verdict, conclude, within, worst
+from cavin_pyro.criticism.verdicts.verdict import LOOK, Verdict, conclude, within, worst
 from models.model import Model
 from models.state import Window
 

@@ -25,7 +25,7 @@ from cavin_pyro.criticism.statistics.inference.simulation import simulate, simul
 from cavin_pyro.criticism.statistics.prior.classifier import divergence_bound, held_out_logits
 from cavin_pyro.criticism.statistics.prior.features import describe
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import BAD, GOOD, LOOK, Verdict, conclude, worst
+from cavin_pyro.criticism.verdicts.verdict import BAD, GOOD, LOOK, Verdict, conclude, worst
 from cavin_pyro.training.elbo import window_terms
 from models.model import Model
 from models.state import Window

@@ -22,7 +22,7 @@ from cavin_pyro.criticism.subgoal_rollout import (
     SubgoalRollout,
     subgoal_rollouts,
 )
-from cavin_pyro.criticism.verdict import FEW, GOOD, NONE, Verdict, grade
+from cavin_pyro.criticism.verdicts.verdict import FEW, GOOD, NONE, Verdict, grade
 from cavin_pyro.storage.progress import progress_bar
 
 

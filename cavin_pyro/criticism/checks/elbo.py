@@ -10,7 +10,7 @@ from cavin_pyro.criticism.section import Picture, Section, Table
 from cavin_pyro.criticism.statistics.clusters import mean_with_error
 from cavin_pyro.criticism.statistics.elbo import TOTAL, adjusted_difference, scene_sizes, terms_by_window
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import Verdict, conclude, grade
+from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, grade
 
 NAME, TITLE = "elbo", "The ELBO, term by term"
 SMALL_LOSS, LARGE_LOSS = 5.0, 20.0  # nats per window

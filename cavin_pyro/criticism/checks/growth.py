@@ -15,7 +15,7 @@ from cavin_pyro.criticism.section import Picture, Section, Table
 from cavin_pyro.criticism.statistics.clusters import Interval, bootstrap_interval
 from cavin_pyro.criticism.statistics.growth import errors_over_segments, farthest_moves, summary
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import FEW, GOOD, Verdict, grade
+from cavin_pyro.criticism.verdicts.verdict import FEW, GOOD, Verdict, grade
 
 SMALL, LARGE = 0.5, 0.9  # of the error of the guess that nothing moves
 FEWEST = 20  # episodes, each ten segments long

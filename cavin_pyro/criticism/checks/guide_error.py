@@ -13,7 +13,7 @@ from cavin_pyro.criticism.statistics.clusters import mean_interval, mean_with_er
 from cavin_pyro.criticism.statistics.codes import effect_log_weights, log_weights, sample_guide, without_codes
 from cavin_pyro.criticism.statistics.inference.importance import Weights
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import Verdict, conclude, grade
+from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, grade
 
 NAME, TITLE = "guide_error", "How far the guide is from the posterior"
 FEW_TAILS, MANY_TAILS = 0.2, 0.5  # shares of windows with a k-hat above the limit

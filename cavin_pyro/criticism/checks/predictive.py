@@ -18,7 +18,7 @@ from cavin_pyro.criticism.statistics.clusters import Interval, mean_interval
 from cavin_pyro.criticism.statistics.pushing import Nearness, Statistic, statistics_of
 from cavin_pyro.criticism.statistics.replicates import compare, replicate, summaries
 from cavin_pyro.criticism.statistics.windows import Outcome, generated, observed, seeded
-from cavin_pyro.criticism.verdict import LOOK, Verdict, conclude, grade, worst
+from cavin_pyro.criticism.verdicts.verdict import LOOK, Verdict, conclude, grade, worst
 
 SOURCES = {
     "prior_means": "prior, as planned",

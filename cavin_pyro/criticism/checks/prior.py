@@ -23,7 +23,7 @@ from cavin_pyro.criticism.statistics.prior.expected_coverage import (
 from cavin_pyro.criticism.statistics.prior.features import decode, describe
 from cavin_pyro.criticism.statistics.pushing import Nearness, push_starts
 from cavin_pyro.criticism.statistics.windows import observed, seeded
-from cavin_pyro.criticism.verdict import LOOK, Verdict, conclude, grade, worst
+from cavin_pyro.criticism.verdicts.verdict import LOOK, Verdict, conclude, grade, worst
 from models.model import Model
 from models.state import State, Window
 

@@ -22,7 +22,7 @@ from cavin_pyro.criticism.statistics.inference.simulation import (
 )
 from cavin_pyro.criticism.statistics.predictions import has_subgoals
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdict import Verdict, conclude, within, worst
+from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, within, worst
 
 NAME, TITLE = "simulation", "Simulation-based calibration of the guide"
 ACTIVE_CONTRACTION = 0.1  # a dimension counts as informed where its variance shrinks by more, given s

@@ -13,7 +13,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from cavin_pyro.criticism.section import Section
-from cavin_pyro.criticism.verdict import NONE, Verdict
+from cavin_pyro.criticism.verdicts.verdict import NONE, Verdict
 from cavin_pyro.training.elbo import Program, substitute, window_terms
 from models.state import Window
 

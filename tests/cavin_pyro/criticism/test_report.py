@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cavin_pyro.criticism.report import page, plain, render, write_report
 from cavin_pyro.criticism.section import Picture, Section, Table
-from cavin_pyro.criticism.verdict import Verdict
+from cavin_pyro.criticism.verdicts.verdict import Verdict
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 ABOUT: dict[str, Any] = {

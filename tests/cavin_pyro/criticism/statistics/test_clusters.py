@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cavin_pyro.criticism.statistics.clusters import bootstrap_interval, mean_interval, mean_with_error
-from cavin_pyro.criticism.verdict import conclude, grade, within, worst
+from cavin_pyro.criticism.verdicts.verdict import conclude, grade, within, worst
 
 
 def test_copies_of_a_window_add_no_evidence() -> None:

@@ -1,0 +1,1 @@
+"""What sections conclude, and the words that they use."""
