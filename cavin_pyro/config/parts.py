@@ -20,6 +20,7 @@ from models.model import Model
 
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "models.priors.standard.StandardPrior"
+LARGEST_SIZE = 10**6  # a layer of more would fill the memory, or take minutes to begin
 FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
 PAPER_DYNAMICS = {"_target_": "models.networks.dynamics.Dynamics"}
 
@@ -47,7 +48,7 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
 
 
 def check_sizes(section: str, config: Config) -> None:
-    """Check that every whole number of a section, apart from weights, is at least 1.
+    """Check that every whole number of a section, apart from weights, is at least 1 and no slip.
 
     Raises:
         UserError: one is not.
@@ -55,6 +56,8 @@ def check_sizes(section: str, config: Config) -> None:
     for name, value in config.items():
         if type(value) is int and not str(name).endswith("_weight"):
             at_least(f"{section}.{name!s}", value, 1)
+            if value > LARGEST_SIZE:
+                raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
 
 
 def build_model(config: Config) -> Model:

@@ -121,7 +121,7 @@ BAD_OPTIONS = [
     ("collect", "steps=100000000000", "steps must be at most 10000, not 100000000000"),
     ("evaluate", "episodes=100000000000", "episodes must be at most 1000000, not 100000000000"),
     ("plan", "margin=inf", "margin must be at most 10 metres, not inf"),
-    ("train", "model.width=1000000000", "models.cascaded.CascadedModel cannot be built: "),
+    ("train", "model.width=1000000000", "model.width must be at most 1000000, not 1000000000"),
     # Numbers out of their range.
     ("train", "scales.center=0", "scales.center must be positive, not 0"),
     ("train", "scales.motion=-1", "scales.motion must be positive, not -1"),
