@@ -60,6 +60,15 @@ def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
             "a planner takes states with centers [B, M, 3] and mask [B, M], "
             f"not {list(centers.shape)} and {list(state.mask.shape)}"
         )
+    if state.features.ndim != 3 or state.features.shape[:-1] != centers.shape[:-1]:
+        raise ValueError(
+            f"a planner takes states with features [B, M, F], not {list(state.features.shape)} for centers "
+            f"{list(centers.shape)}"
+        )
+    kinds = centers.dtype, state.features.dtype, state.mask.dtype
+    if kinds[:2] != (torch.float32, torch.float32) or kinds[2] != torch.bool:
+        found = ", ".join(str(kind).removeprefix("torch.") for kind in kinds)
+        raise ValueError(f"a planner takes centers and features of float32 and a mask of bool, not {found}")
     if len(generators) != len(centers):
         raise ValueError(f"one generator per environment: {len(centers)} needed, {len(generators)} given")
     if len({id(generator) for generator in generators}) != len(generators):

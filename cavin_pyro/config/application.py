@@ -182,12 +182,21 @@ def read_command_line(arguments: Sequence[str]) -> CommandLine:
     parser.add_argument("--version", action="store_true")
     parser.add_argument("--multirun", "-m", action="store_true")
     parser.add_argument("--config-dir", "-cd")
-    for flag in (["--cfg", "-c"], ["--package", "-p"], ["--config-path", "-cp"], ["--config-name", "-cn"]):
-        parser.add_argument(*flag)
-    parser.add_argument("--info", "-i", nargs="?")
+    parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+    parser.add_argument("--package", "-p")
+    kinds = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+    parser.add_argument("--info", "-i", nargs="?", const="all", choices=kinds)
     known, others = parser.parse_known_intermixed_args(list(arguments))
     if unknown := [one for one in others if one.startswith("-")]:
         raise UserError(f"unknown flag {unknown[0]}: --help lists flags and options")
+    if known.multirun and (known.cfg or known.info):
+        raise UserError("-m runs a sweep, and --cfg and --info run nothing: give one of them")
+    if known.package and not known.cfg:
+        raise UserError("--package chooses what --cfg prints: give --cfg job as well")
+    if known.config_dir is not None and not Path(known.config_dir).is_dir():
+        raise UserError(
+            f"--config-dir {known.config_dir} is no folder: give one with presets, such as planner/mine.yaml"
+        )
     return CommandLine([*known.overrides, *others], known.help, known.version, known.multirun, known.config_dir)
 
 

@@ -45,7 +45,10 @@ def with_output(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
 def run_name(name: str, config: DictConfig, hydra_config: Any) -> str:
     """A name that identifies a run of a command: presets by name, other differences by their hash."""
     pattern, irrelevant = FOLDERS[name]
-    defaults, usual = preset_defaults(name, list(hydra_config.overrides.task))
+    # A folder of the user's own presets (--config-dir) is on the search path, which the composition here lacks.
+    own = [f"file://{one.path}" for one in hydra_config.runtime.config_sources if one.schema == "file"]
+    search = [f"hydra.searchpath=[{','.join(own)}]"] if own else []
+    defaults, usual = preset_defaults(name, [*hydra_config.overrides.task, *search])
     choices = {str(group): choice for group, choice in hydra_config.runtime.choices.items()}
     values: dict[str, Any] = {**{str(key): value for key, value in config.items()}, **choices}
     template = pattern.partition("/")[2].partition("/")[2] if "{" in pattern else ""

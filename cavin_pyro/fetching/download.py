@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import http.client
+import time
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -16,6 +17,8 @@ from cavin_pyro.storage.progress import progress_bar
 
 TIMEOUT = 30.0  # seconds without an answer
 CHUNK = 1 << 16  # bytes
+LARGEST = 2_000_000_000  # bytes of a download, whatever length it declares; no archive here has a tenth of it
+SLOWEST, PATIENCE = 2_000, 60.0  # bytes a second, on average after so many seconds
 
 
 class Checksums:
@@ -108,12 +111,24 @@ def _store(url: str, answer: Any, partial: Path, begun: int) -> None:
         open(partial, "ab" if begun else "wb") as file,
         progress_bar(partial.name.removesuffix(PARTIAL), total=total or 0, initial=begun, unit="byte") as bar,
     ):
-        while chunk := answer.read(CHUNK):
+        _check_size(url, total or 0)
+        since, received = time.monotonic(), 0
+        while chunk := answer.read1(CHUNK):
             file.write(chunk)
             bar.update(len(chunk))
+            received += len(chunk)
+            _check_size(url, file.tell())
+            spent = time.monotonic() - since
+            if spent > PATIENCE and received < SLOWEST * spent:
+                raise UserError(f"{url} sends under {SLOWEST} bytes a second: run again to go on, or name a mirror")
         held = file.tell()
     if total is not None and held != total:
         raise UserError(f"{url} broke off after {held} of {total} bytes: run again to go on")
+
+
+def _check_size(url: str, size: int) -> None:
+    if size > LARGEST:
+        raise UserError(f"{url} is refused: it has over {LARGEST} bytes")
 
 
 def _unreachable(url: str) -> str:

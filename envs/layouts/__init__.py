@@ -23,6 +23,7 @@ from envs.tasks import TASKS, Task
 from envs.tasks.contract import check_fields
 
 RANDOM = "random"
+LARGEST = 100_000  # characters of a layout; ours have 200
 _FOLDER = Path(__file__).parent
 
 
@@ -130,7 +131,7 @@ def _path(kind: type[Task], layout: int | str | Path) -> Path:
 
 def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = _PlainLoader(_text(path)).get_single_data()
     except OSError as error:
         reason = error.strerror
         raise ValueError(f"layout {path} cannot be read ({reason}): give {_choices(kind)}") from error
@@ -139,6 +140,26 @@ def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"layout {path} must hold the keys {', '.join(kind.layout_keys())}")
     return content
+
+
+def _text(path: Path) -> str:
+    """The text of a file that is a file, and no larger than a layout can be."""
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no file")
+    with open(path, encoding="utf-8") as file:
+        text = file.read(LARGEST + 1)
+    if len(text) > LARGEST:
+        raise ValueError(f"it has over {LARGEST} characters")
+    return text
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Reads plain data; `*name`, which can make a short file endless, is refused."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("it refers to another part of itself with *")
+        return super().compose_node(parent, index)
 
 
 def _choices(kind: type[Task]) -> str:

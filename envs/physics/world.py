@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,10 @@ class PhysicsWorld:
     Every `reset` starts from an empty simulation: Bullet's contact caches would otherwise keep the history of earlier
     scenes, and equal seeds would not give equal states.
     """
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse `copy.deepcopy` and pickling: a copy would push the objects of the same simulation."""
+        raise TypeError("a simulation cannot be copied: make a second environment and reset it with the same seed")
 
     def __init__(self) -> None:
         self._bullet = connect()

@@ -78,6 +78,9 @@ BAD_FILES = [
     # Layouts.
     ("plan", "layout=@nothing.yaml", "nothing.yaml cannot be read"),
     ("plan", "layout=@no_yaml.yaml", "no_yaml.yaml is not YAML"),
+    ("plan", "layout=/dev/zero", "layout /dev/zero is not YAML: it is no file"),
+    ("plan", "layout=@bomb.yaml", "bomb.yaml is not YAML: it refers to another part of itself with *"),
+    ("plan", "layout=@large.yaml", "large.yaml is not YAML: it has over 100000 characters"),
     ("plan", "layout=@overlapping.yaml", "tile [2, 3] is listed twice, tiles must not overlap"),
     ("plan", "layout=@off_table.yaml", "tile [5, 3] is off the table, which holds [0, 0] to [4, 6]"),
     ("plan", "layout=@off_bridge.yaml", "off_bridge.yaml: goal tile [4, 4] is off the bridge, add it to region"),

@@ -31,6 +31,9 @@ def make_material(folder: Path, pushes: Path, checkpoint_file: Path, small: Simp
         text = "".join(f"{key}: {value}\n" for key, value in content.items())
         (folder / f"{name}.yaml").write_text(text)
     (folder / "no_yaml.yaml").write_text("region: [[1, 2]")
+    bomb = ["a0: &a0 [1, 1]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30))]
+    (folder / "bomb.yaml").write_text("\n".join(bomb))
+    (folder / "large.yaml").write_text("#" * 200_000)
     (folder / "used").mkdir()
     (folder / "used" / "config.yaml").write_text("seed: 17\n")
     (folder / "used" / "results.json").write_text("{}")

@@ -78,6 +78,13 @@ BAD_OPTIONS = [
     ("collect", "transitions", "'transitions': write overrides as name=value"),
     ("collect", "transitions=[1,", "write overrides as name=value"),
     ("plan", "seed=1,2", "several values need -m: python -m cavin_pyro.plan -m seed=1,2"),
+    ("plan", "--cfg nonsense", "argument --cfg/-c: invalid choice: 'nonsense'"),
+    ("plan", "--info nonsense", "argument --info/-i: invalid choice: 'nonsense'"),
+    ("plan", "--config-name x", "unknown flag --config-name: --help lists flags and options"),
+    ("plan", "--config-path x", "unknown flag --config-path: --help lists flags and options"),
+    ("plan", "--config-dir nowhere", "--config-dir nowhere is no folder: give one with presets"),
+    ("plan", "--package planner", "--package chooses what --cfg prints: give --cfg job as well"),
+    ("plan", "-m --cfg job seed=1,2", "-m runs a sweep, and --cfg and --info run nothing: give one of them"),
     ("plan", "--foo task=crossing", "unknown flag --foo: --help lists flags and options"),
     (
         "plan",

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from cavin_pyro.config import application as command_module
 from cavin_pyro.config.application import PACKAGES, check_packages, guarded
 from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.composition import compose
+from cavin_pyro.config.composition import check_overrides, completed, compose
 from cavin_pyro.config.errors import UserError, at_least, user_input
 from cavin_pyro.storage.files import atomic_write
 from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT
@@ -267,3 +267,10 @@ def test_a_page_for_a_reader_that_stops_early_is_no_bug() -> None:
     done = subprocess.run(line, cwd=ROOT, env=ENVIRONMENT, stdout=writing, stderr=subprocess.PIPE, text=True)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_presets_of_a_users_own_folder_name_the_output_as_any_others_do(tmp_path: Path) -> None:
+    (tmp_path / "planner").mkdir()
+    (tmp_path / "planner" / "mine.yaml").write_text("_target_: planning.RandomPlanner\nmodel_free: true\n")
+    config = completed("plan", check_overrides("plan", ["planner=mine"], str(tmp_path)))
+    assert config.output == "runs/plan/crossing-sparse-3-mine-0"

@@ -160,6 +160,23 @@ def test_an_interrupted_download_resumes(site: Site, assets: Callable, tmp_path:
     assert list(known) == [Path(path).name for path in ARCHIVES]
 
 
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"LARGEST": 100}, "is refused: it has over 100 bytes"),
+        ({"SLOWEST": 10**15, "PATIENCE": 0}, "bytes a second: run"),
+    ],
+)
+def test_a_download_without_end_is_given_up(
+    limits: dict, said: str, site: Site, assets: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in limits.items():
+        monkeypatch.setattr(download, name, value)
+    status, _, line = assets("ycb", "--to", tmp_path, "--source", site.address)
+    assert status == 2 and said in line
+    assert len(site.asked) == 1 and not (tmp_path / "ycb").exists()
+
+
 def test_finished_pieces_are_not_fetched_again(site: Site, assets: Callable, tmp_path: Path) -> None:
     content = site.files.pop(CAN)
     status, _, said = assets("ycb", "--to", tmp_path, "--source", site.address)
