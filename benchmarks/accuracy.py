@@ -11,7 +11,8 @@ graze   within all of it and the tool's radius
 miss    farther off, or the push ends before the object
 
 The floor has two parts. Hidden: the distance between what happened and the mean of --redraws replays of the same push
-in a second world, from the same poses, with mass and friction drawn anew within their ranges. Camera: the distance
+in a second world, from the same poses, with mass and friction drawn anew within their ranges (those that leave the
+object on the table). Camera: the distance
 between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
 """
 
@@ -43,7 +44,7 @@ from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
 from envs.robots import STICK_RADIUS
-from envs.scene import Scene
+from envs.scene import FALLEN, Scene
 from envs.workspace import push_endpoints
 from models.state import State, Window, stack_steps
 
@@ -187,10 +188,11 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
             moved = float(np.linalg.norm(body))
             kinds = [kind(push.before, push.action, slot) for push in pushes]
             best = min(kinds, key=("hit", "graze", "miss").index)
-            groups = (f"{len(episode.names)} objects", name, best)
+            groups = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
             before, seen = first.before.centers[slot], last.after.centers[slot]
-            hidden = first.replayed[ahead][:, slot].mean(0) - last.end[slot]
-            table["hidden"].add(groups, moved, float(np.linalg.norm(hidden)))
+            stayed = first.replayed[ahead][first.replayed[ahead][:, slot, 2] > FALLEN, slot]
+            if len(stayed):
+                table["hidden"].add(groups, moved, float(np.linalg.norm(stayed.mean(0) - last.end[slot])))
             table["camera"].add(groups, moved, float(np.linalg.norm(seen - before - body)))
             for who, all_of in predicted.items():
                 claimed = float(np.linalg.norm(all_of[number][slot] - before))
@@ -211,7 +213,7 @@ def predictions(path: str, episodes: Sequence[Episode]) -> dict[int, dict[str, l
         features = torch.from_numpy(cloud_features(geometry, clouds[None]))
         return State(torch.from_numpy(seen.centers)[None], features, torch.from_numpy(seen.mask)[None])
 
-    name, found = Path(path).stem if file.parent.name == "checkpoints" else file.parent.name, {}
+    name, found = file.parent.name if file.stem == "checkpoint" else file.stem, {}
     for ahead in (1, T):
         rolled, inferred = [], []
         for _, _, pushes in segments(episodes, ahead):
@@ -252,15 +254,19 @@ def draw(tables: dict[int, Table], path: Path) -> None:
         order = ["all", "hit", "graze", "miss"]
         groups = [*order, *sorted(set(table["hidden"].moved) - set(order))]
         places = np.arange(len(groups))
+        models = list(dict.fromkeys(who.partition(":")[0] for who in table if ":" in who))
         for number, who in enumerate(table):
             means = [100 * float(np.mean(table[who].moved.get(group, [np.nan]))) for group in groups]
-            width = 0.8 / len(table)
-            ax.bar(places + (number - (len(table) - 1) / 2) * width, means, width, label=who, color=f"C{number}")
+            width, (model, _, part) = 0.8 / len(table), who.partition(": ")
+            color = f"C{models.index(model)}" if part else {"hidden": "0.45", "camera": "0.75"}[who]
+            place = places + (number - (len(table) - 1) / 2) * width
+            ax.bar(place, means, width, label=who, color=color, alpha=0.45 if part == "h" else 1.0)
         ax.set_xticks(places, [group.replace("_", " ") for group in groups], rotation=30, ha="right")
         ax.set_ylabel("mean error of moved objects, cm")
         ax.set_title(f"After {ahead} {'push' if ahead == 1 else 'pushes'}", loc="left")
         ax.spines[["top", "right"]].set_visible(False)
-        ax.legend(frameon=False, ncols=len(table))
+        ax.set_ylim(top=1.2 * ax.get_ylim()[1])
+        ax.legend(frameon=False, ncols=len(table), loc="upper center")
     figure.savefig(path, dpi=120)
 
 

@@ -82,7 +82,7 @@ def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any
             f"a and b cannot be compared on the same windows: they have segments of {lengths['a']} and {lengths['b']} "
             f"pushes and hold out the objects {held_out_objects[0]} and {held_out_objects[1]}"
         )
-    starts = [tables[name].starts[_counted(tables[name], tables[name].validation)] for name in tables]
+    starts = [one.table.starts[_counted(one.table, _unseen(one))] for one in both.values()]
     common = starts[0][torch.isin(starts[0], starts[1])].sort().values
     if not len(common):
         raise UserError("no window was held out by both a and b: give other data=, on which neither was trained")
@@ -193,6 +193,14 @@ def sample_windows(
     order = np.random.default_rng(list(seed)).permutation(len(counted))[:count]
     chosen = counted[torch.from_numpy(np.sort(order))]
     return table.batch(chosen), table.episodes[chosen]
+
+
+def _unseen(loaded: Loaded) -> torch.Tensor:
+    """Numbers of the windows that a model was not trained on: the held-out ones, or all of other data."""
+    table, trained = loaded.table, loaded.checkpoint.provenance
+    if all(compare_data(folder, trained)["same"] is False for folder in loaded.folders):
+        return torch.cat((table.training, table.validation))
+    return table.validation
 
 
 def _counted(table: WindowTable, numbers: torch.Tensor) -> torch.Tensor:

@@ -144,7 +144,7 @@ def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
 
 def _text(path: Path) -> str:
     """The text of a file that is a file, and no larger than a layout can be."""
-    if path.exists() and not path.is_file():
+    if path.exists() and not path.is_file() and not path.is_dir():  # of a folder `open` says it better
         raise ValueError("it is no file")
     with open(path, encoding="utf-8") as file:
         text = file.read(LARGEST + 1)

@@ -200,3 +200,27 @@ def test_rows_of_networks_are_counted_for_every_planner_of_a_method() -> None:
     ]  # N samples, K = 10 segments, T = 3
     assert counted["`one_motion`"] == [10240, 10, 30, 10280]
     assert counted["`without_effects`"][0] == 0
+
+
+def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -> None:
+    printed = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", "--picture", str(tmp_path / "a.png"))
+    one_push, three_pushes = printed.split("after 3 pushes")
+    means = {}
+    for part in (one_push, three_pushes):
+        (row,) = re.findall(r"^all +\d+ +(.*)$", part, re.M)
+        means[part] = [float(cell.split(" / ")[0]) for cell in re.split(r" {2,}", row.strip())]
+    hidden, camera, f = means[one_push]
+    assert 0.0 < max(hidden, camera) < f < 3.0  # centimetres
+    assert means[three_pushes][2] > hidden
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("table", "page"),
+    [("reproduction/shipped.parquet", "reproduction.md"), ("accuracy-episodes.parquet", "accuracy.md")],
+)
+def test_the_published_rates_are_those_of_the_published_episodes(table: str, page: str) -> None:
+    folder = ROOT / "docs" / "measurements"
+    printed = run("rates", str(folder / table))
+    assert printed.strip() in (folder / page).read_text(encoding="utf-8")
+    assert printed.strip().replace("98.4%", "98.5%").replace("91.0%", "92.0%") not in (folder / page).read_text()

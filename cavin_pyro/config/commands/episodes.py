@@ -13,6 +13,7 @@ CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of
     "cavin": ("cascaded", "cascaded"),
     "kinect": ("cascaded", "cascaded"),
     "held_out": ("cascaded", "cascaded"),
+    "contact": ("cascaded", "cascaded"),
     "sectar": ("single_latent", "single_latent"),
     "cvae_mpc": ("flat", "flat"),
     "mpc": ("dynamics", "none"),

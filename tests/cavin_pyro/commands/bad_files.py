@@ -23,7 +23,7 @@ BAD_FILES = [
         (
             command,
             f"checkpoint=@{name} {overrides}",
-            f"{said}: choose checkpoint=cavin|kinect|held_out, or planner=random, which takes any",
+            f"{said}: choose checkpoint=cavin|kinect|held_out|contact, or planner=random, which takes any",
         )
         for command in ("plan", "evaluate")
         for name, overrides, said in (

@@ -97,6 +97,7 @@ def test_collected_data_depend_on_the_seed_and_not_on_the_workers(
 def test_pretraining_leaves_a_pointnet_with_its_record(chain: SimpleNamespace) -> None:
     folder = chain.folder / "features"
     names = {"config.yaml", "metrics.csv", "metrics.json", "pointnet.safetensors", "reconstructions.png"}
+    names.add("resume.safetensors")
     assert {path.name for path in folder.iterdir()} == names
     checkpoint = load_checkpoint(folder / "pointnet.safetensors")
     assert {name.partition(".")[0] for name in checkpoint.tensors} == {"pointnet", "decoder"}

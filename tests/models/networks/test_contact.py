@@ -12,7 +12,7 @@ from envs.robots import STICK_RADIUS
 from envs.workspace import push_endpoints
 from models.networks import contact
 from models.networks.contact import MAXIMUM_DISPLACEMENT, ContactDynamics, endpoints
-from models.networks.outline import Outline, outline_features
+from models.networks.outline import PER_OUTLINE, Outline, outline_features, outline_values
 from models.state import State
 
 
@@ -30,6 +30,7 @@ def loud(**sizes: int) -> ContactDynamics:
     torch.manual_seed(0)
     f = ContactDynamics(**{"object_width": 16, "pair_width": 8, **sizes}).double()
     torch.nn.init.normal_(f.head.weight, std=0.5)
+    torch.nn.init.normal_(f.shape_head.weight, std=0.5)
     return f
 
 
@@ -52,7 +53,7 @@ def test_where_the_tool_meets_a_disc_is_where_geometry_says() -> None:
     angles = torch.linspace(0, 2 * np.pi, 257)[:-1]
     disc = radius * torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
     outline = ContactDynamics().double()
-    values = (Outline()(disc)[:-1] / Outline()(disc)[-1])[: contact.PER_OUTLINE].double()
+    values = outline_values(Outline()(disc))[:PER_OUTLINE].double()
     along = torch.tensor([gap + radius + contact.TOOL_RADIUS], dtype=torch.float64)
     found = outline._contact(along, torch.zeros(1).double(), values[None], torch.tensor([0.1]).double())[0]
     enter, chord, rest, driven, normal_x, normal_y, *_ = found.tolist()

@@ -1,0 +1,67 @@
+"""Rates of a table of episodes: `python benchmarks/rates.py docs/measurements/reproduction/shipped.parquet`.
+
+A line per planner, task, reward, number of objects and criterion: success with its 95 % interval (Wilson), why the
+others failed, and the median number of pushes of a success. `--collect NAME=FOLDER ...` writes the table first, from
+folders of `evaluate criterion=published`; NAME stands in the table's column of planners.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections import Counter, defaultdict
+from pathlib import Path
+
+sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
+
+from omegaconf import OmegaConf
+
+from cavin_pyro.evaluation.statistics import wilson
+from cavin_pyro.reproduction.cells import Cell, Evaluation
+from cavin_pyro.reproduction.table import CRITERIA, Row, episode_row, read_table, write_table
+
+KEYS = ("planner", "task", "reward", "objects")
+
+
+def collected(name: str, folder: Path, training_seed: int) -> list[Row]:
+    """Rows of one evaluation."""
+    config = OmegaConf.load(folder / "config.yaml")
+    cell = Cell("cavin", name, config.task._target_.split(".")[-2], config.reward, config.objects)
+    lines = (folder / "episodes.jsonl").read_text().splitlines()
+    return [episode_row(Evaluation(cell, training_seed, config.seed, len(lines)), json.loads(line)) for line in lines]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("table", type=Path)
+    parser.add_argument("--collect", nargs="+", default=[], metavar="NAME=FOLDER")
+    parser.add_argument("--training-seed", type=int, default=0)
+    arguments = parser.parse_args()
+    if arguments.collect:
+        pairs = [one.partition("=")[::2] for one in arguments.collect]
+        write_table(
+            arguments.table,
+            [row for name, folder in pairs for row in collected(name, Path(folder), arguments.training_seed)],
+        )
+    groups: dict[tuple[object, ...], list[Row]] = defaultdict(list)
+    for row in read_table(arguments.table):
+        groups[tuple(row[key] for key in KEYS)].append(row)
+    print("| name | task | objects | criterion | episodes | success | violation | fall | timeout | median pushes |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for (planner, task, _, objects), rows in groups.items():
+        for criterion in CRITERIA:
+            ends = Counter(row[f"{criterion}_outcome"] for row in rows)
+            rate = wilson(ends["success"], len(rows))
+            won = [row[f"{criterion}_steps"] for row in rows if row[f"{criterion}_outcome"] == "success"]
+            failed = " | ".join(str(ends[end]) for end in ("violation", "fall", "timeout"))
+            success = f"{rate['rate']:.1%} ({100 * rate['low']:.1f} to {100 * rate['high']:.1f})"
+            print(
+                f"| `{planner}` | {task} | {objects} | {criterion} | {len(rows)} | {success} | {failed} | "
+                f"{statistics.median(won) if won else '-'} |"
+            )
+
+
+if __name__ == "__main__":
+    main()
