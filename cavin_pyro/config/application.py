@@ -31,6 +31,7 @@ from cavin_pyro.config.errors import UserError
 
 PACKAGES = ("models", "guides", "planning", "envs")
 REPEATING_SECONDS = 1.0
+RESENDING_SECONDS = 0.05  # for a signal whose exception was dropped
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
 
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "calculation overflowed")  # torch's words
@@ -114,12 +115,26 @@ def _interruptions() -> Iterator[None]:
         if latest - earlier > REPEATING_SECONDS:  # schedulers send a signal to a process and to its group
             raise Interruption(signal.Signals(number))
 
+    def resend(lost: sys.UnraisableHookArgs) -> None:
+        """Python drops what is raised in a finalizer or a callback of a weak reference: send the signal again."""
+        nonlocal latest
+        if not isinstance(lost.exc_value, KeyboardInterrupt):
+            return report(lost)
+        number = lost.exc_value.number if isinstance(lost.exc_value, Interruption) else signal.SIGINT
+        latest = -REPEATING_SECONDS
+        again = threading.Timer(RESENDING_SECONDS, os.kill, (os.getpid(), number))
+        again.daemon = True
+        again.start()
+
+    report = sys.unraisablehook
     ours = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) == signal.SIG_DFL]
     for one in ours:
         signal.signal(one, interrupt)
+    sys.unraisablehook = resend
     try:
         yield
     finally:
+        sys.unraisablehook = report
         for one in ours:
             signal.signal(one, signal.SIG_DFL)
 

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -274,3 +275,24 @@ def test_presets_of_a_users_own_folder_name_the_output_as_any_others_do(tmp_path
     (tmp_path / "planner" / "mine.yaml").write_text("_target_: planning.RandomPlanner\nmodel_free: true\n")
     config = completed("plan", check_overrides("plan", ["planner=mine"], str(tmp_path)))
     assert config.output == "runs/plan/crossing-sparse-3-mine-0"
+
+
+def test_a_signal_that_comes_while_python_frees_an_object_is_not_lost(capsys: pytest.CaptureFixture[str]) -> None:
+    """Python drops what is raised in a finalizer, the exception of our handler as well."""
+
+    class Freed:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+
+    def work() -> None:
+        freed = Freed()
+        del freed
+        deadline = time.monotonic() + 5.0
+        while time.monotonic() < deadline:
+            time.sleep(0.01)
+
+    with pytest.raises(SystemExit) as ended:
+        guarded(work)
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "error: interrupted by SIGTERM; rerun the same command to resume, if it can\n"
