@@ -100,16 +100,16 @@ SCALES: dict[str, Scale] = {
         pretraining=("clouds=20000", "steps=2000"),
         training=(*QUICK_TRAINING, "trainer.steps=4000"),
     ),
-    # What two cores do in an afternoon, with trainings long enough to compare the methods.
+    # What two cores do in half a day, with trainings long enough to compare the methods.
     "medium": Scale(
         transitions=200_000,
         training_seeds=(0, 1, 2),
         episodes=60,
         bottom_episodes=30,
-        first_scene=70_000,
+        first_scene=90_000,
         episode_seconds=2.5,
-        training_seconds=500.0,
-        training=(*QUICK_TRAINING, "trainer.steps=12000"),
+        training_seconds=1_000.0,
+        training=(*QUICK_TRAINING, "trainer.steps=36000"),
     ),
     "paper": Scale(
         transitions=500_000,

@@ -16,7 +16,7 @@ class ReproduceConfig:
     scale: str = option(
         "smoke",
         "how large: smoke shows that everything runs (its rates mean nothing), small trains and evaluates little, "
-        "medium is an afternoon on 2 cores, paper takes the paper's 500,000 transitions and 1,000 episodes per cell; "
+        "medium is half a day on 2 cores, paper takes the paper's 500,000 transitions and 1,000 episodes per cell; "
         "minimal is for tests",
         choices="cavin_pyro.reproduction.scales.SCALES",
         group="run",
