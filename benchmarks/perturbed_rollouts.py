@@ -54,7 +54,7 @@ def problems(objects: int, episodes: int, pushes: int) -> list[PlanningProblem]:
             observation, _ = one.env.reset(seed=seed)
             generator, last = torch.Generator().manual_seed(seed), None
             for _ in range(pushes):
-                last = one.planner.plan(observed_state(observation, one.pointnet), [generator], last)
+                last = one.planner.plan(observed_state(observation, one.geometry), [generator], last)
                 observation, _, ended, out_of_time, _ = one.env.step(last.actions[0, 0].numpy())
                 if ended or out_of_time:
                     break

@@ -45,7 +45,7 @@ def runner(objects: int, samples: int, *overrides: str) -> EpisodeRunner:
 
 def scenes(one: EpisodeRunner, count: int) -> State:
     """`count` scenes as the camera sees them: [count, M, ...]."""
-    states = [observed_state(one.env.reset(seed=seed)[0], one.pointnet) for seed in range(count)]
+    states = [observed_state(one.env.reset(seed=seed)[0], one.geometry) for seed in range(count)]
     return State(*(torch.cat(field) for field in zip(*states, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""Gaussian likelihoods with one scale per quantity: f, h and g around their networks' means (paper, section 3.3)."""
+"""Likelihoods of f, h and g around their networks' means: Gaussian, with a scale per quantity (paper, section 3.3)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from models.isotropic_normal import IsotropicNormal
-from models.isotropic_student import IsotropicStudentT
+from models.isotropic import Isotropic, IsotropicNormal, IsotropicStudentT
 from models.state import State
 
 
@@ -31,13 +30,18 @@ class Scales:
         `mask: [..., M]`: objects that count; others (padding) do not contribute. `predicted: [..., M, 2]`, scales of
         centres (metres) and features that the network of the mean predicts; only `PredictedScales` reads them.
         """
-        return _masked_normal(mean.centers, self.center, mask, event_dims)
+        own = None if predicted is None else predicted[..., 0]
+        return self._around(mean.centers, self.center, own).mask(mask).to_event(event_dims)
 
     def features(
         self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
     ) -> TorchDistribution:
         """Observed features around `mean`: event `[M, F]`, or `[T, M, F]` for `event_dims=2`."""
-        return _masked_normal(mean.features, self.feature, mask, event_dims)
+        own = None if predicted is None else predicted[..., 1]
+        return self._around(mean.features, self.feature, own).mask(mask).to_event(event_dims)
+
+    def _around(self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None) -> Isotropic:
+        return IsotropicNormal(mean, scale)
 
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
@@ -69,21 +73,10 @@ class PredictedScales(LikelihoodScales):
 
     degrees_of_freedom: float = 3.0
 
-    def centers(
-        self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
-    ) -> TorchDistribution:
+    def _around(self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None) -> Isotropic:
         if predicted is None:
-            return super().centers(mean, mask, event_dims=event_dims)
-        student = IsotropicStudentT(self.degrees_of_freedom, mean.centers, predicted[..., 0])
-        return student.mask(mask).to_event(event_dims)
-
-    def features(
-        self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
-    ) -> TorchDistribution:
-        if predicted is None:
-            return super().features(mean, mask, event_dims=event_dims)
-        student = IsotropicStudentT(self.degrees_of_freedom, mean.features, predicted[..., 1])
-        return student.mask(mask).to_event(event_dims)
+            return super()._around(mean, scale, predicted)
+        return IsotropicStudentT(self.degrees_of_freedom, mean, predicted)
 
 
 class LearnedScales(Scales, nn.Module):
@@ -107,7 +100,3 @@ class LearnedScales(Scales, nn.Module):
 def _check_positive(name: str, value: float) -> None:
     if not 0 < value < float("inf"):
         raise ValueError(f"scales.{name} must be positive, not {value:g}")
-
-
-def _masked_normal(mean: Tensor, scale: float | Tensor, mask: Tensor, event_dims: int) -> TorchDistribution:
-    return IsotropicNormal(mean, scale).mask(mask).to_event(event_dims)

@@ -19,7 +19,7 @@ class CheckContext:
     """The input of a check.
 
     Attributes:
-        model, guide: trained, in evaluation mode, without gradients. pointnet: makes the features of new clouds.
+        model, guide: trained, in evaluation mode, without gradients. geometry: makes the features of new clouds.
         training: windows `[B]` that the model was trained on. validation: windows `[B]` of held-out episodes. In
             both every window counts for all terms (`sequence_mask` is set everywhere).
         seed: of everything random. world: in which new episodes are made.
@@ -29,7 +29,7 @@ class CheckContext:
 
     model: Model
     guide: Guide
-    pointnet: Geometry
+    geometry: Geometry
     training: Window
     validation: Window
     seed: int = 0

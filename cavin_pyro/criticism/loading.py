@@ -44,7 +44,7 @@ class Loaded(NamedTuple):
     checkpoint: Checkpoint
     model: Model
     guide: Guide
-    pointnet: Geometry
+    geometry: Geometry
     table: WindowTable
     folders: list[Path]
 
@@ -98,26 +98,26 @@ def _load(config: DictConfig, name: str) -> Loaded:
     path = find_checkpoint(name)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
-    pointnet = geometry_of(checkpoint, path)
-    check_fit(model, pointnet, MAXIMUM_OBJECTS)
+    geometry = geometry_of(checkpoint, path)
+    check_fit(model, geometry, MAXIMUM_OBJECTS)
     windows, segment_length, split = trained_windows(checkpoint, path)
     folders = data_folders(config.data)
     for folder in folders:
         compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
-    table = load_windows(folders, pointnet, windows, segment_length=segment_length, seed=split)
-    return Loaded(path, checkpoint, model, guide, pointnet, table, folders)
+    table = load_windows(folders, geometry, windows, segment_length=segment_length, seed=split)
+    return Loaded(path, checkpoint, model, guide, geometry, table, folders)
 
 
 def _context(
     config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: torch.Tensor
 ) -> tuple[CheckContext, dict[str, Any]]:
-    path, checkpoint, model, guide, pointnet, table, folders = loaded
+    path, checkpoint, model, guide, geometry, table, folders = loaded
     training, trained_in = sample_windows(table, table.training, config.windows, seed=[config.seed, 0])
     validation, held_out_in = sample_windows(table, held_out, config.windows, seed=[config.seed, 1])
     context = CheckContext(
         model,
         guide,
-        pointnet,
+        geometry,
         training,
         validation,
         seed=config.seed,

@@ -27,7 +27,7 @@ class Recording(NamedTuple):
 
 
 def record(
-    pointnet: Geometry, world: CollectionConfig, *, episodes: int, steps: int, objects: int, seed: int
+    geometry: Geometry, world: CollectionConfig, *, episodes: int, steps: int, objects: int, seed: int
 ) -> Recording:
     """Simulate `episodes` of up to `steps` pushes with at most `objects` objects, by the policy that collects data."""
     config = replace(world, seed=SEED + seed, steps=steps, maximum_objects=objects)
@@ -41,7 +41,7 @@ def record(
     observed = arrays["visible"] & mask & (made & ~fallen)[..., None]
     state = State(
         torch.from_numpy(arrays["centers"]),
-        torch.from_numpy(cloud_features(pointnet, arrays["clouds"])),
+        torch.from_numpy(cloud_features(geometry, arrays["clouds"])),
         torch.from_numpy(mask.copy()),
     )
     trimmed = State(state.centers[..., :objects, :], state.features[..., :objects, :], state.mask[..., :objects])

@@ -100,7 +100,7 @@ def _rollout(
     context: CheckContext, scene: Scene, number: int, selection: tuple[str, str], objects: int, samples: int
 ) -> SubgoalRollout:
     first = sample_scene(scene, context.world.ranges, context.seed, number, objects)
-    state = observed_state({"centers": first.centers, "clouds": first.clouds, "mask": first.mask}, context.pointnet)
+    state = observed_state({"centers": first.centers, "clouds": first.clouds, "mask": first.mask}, context.geometry)
     goal = _goal(first.centers[0], np.random.default_rng([context.seed, number, 1]))
     plan = plan_segment(context, state, torch.from_numpy(goal), selection, [context.seed, number], samples)
     photograph = scene.photograph(scene.camera.resized(*PHOTOGRAPH))

@@ -18,28 +18,28 @@ from models.networks.geometry import Geometry
 BATCH = 4096  # clouds
 
 
-def pointnet_fingerprint(pointnet: Geometry) -> str:
+def geometry_fingerprint(geometry: Geometry) -> str:
     """Twelve hexadecimal digits that change when any weight does."""
     digest = hashlib.sha256()
-    for name, value in sorted(pointnet.state_dict().items()):
+    for name, value in sorted(geometry.state_dict().items()):
         digest.update(name.encode())
         digest.update(value.contiguous().numpy().tobytes())
     return digest.hexdigest()[:12]
 
 
 @torch.inference_mode()
-def cloud_features(pointnet: Geometry, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
+def cloud_features(geometry: Geometry, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
     """Features [..., 64] of clouds [..., P, 3] metres from their centres."""
     flat = torch.from_numpy(np.ascontiguousarray(clouds)).flatten(0, -3)
-    parts = [pointnet(batch.float()) for batch in flat.split(BATCH)]
+    parts = [geometry(batch.float()) for batch in flat.split(BATCH)]
     return torch.cat(parts).reshape(*clouds.shape[:-2], -1).numpy()
 
 
-def shard_features(folder: Path, number: int, pointnet: Geometry, fingerprint: str) -> NDArray[np.float32]:
-    """Features [E, S+1, M, 64] of one shard, read from beside it if this PointNet made them before.
+def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: str) -> NDArray[np.float32]:
+    """Features [E, S+1, M, 64] of one shard, read from beside it if the same `geometry` made them before.
 
     Args:
-        fingerprint: of this PointNet, see `pointnet_fingerprint`.
+        fingerprint: see `geometry_fingerprint`.
 
     Raises:
         UserError: the shard is corrupt.
@@ -52,7 +52,7 @@ def shard_features(folder: Path, number: int, pointnet: Geometry, fingerprint: s
         except UserError:
             path.unlink()  # a derived file: damaged ones are made again
     shard = read_shard(shard_path(folder, number), ("clouds",), metadata=metadata)
-    features = cloud_features(pointnet, shard["clouds"])
+    features = cloud_features(geometry, shard["clouds"])
     try:
         path.parent.mkdir(exist_ok=True)
         write_shard(path, {"features": features})

@@ -14,7 +14,7 @@ from torch import Tensor
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, check_distinct, check_new, iterate_shards, read_metadata
-from cavin_pyro.data.features import pointnet_fingerprint, shard_features
+from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.storage.progress import progress_bar
 from models.networks.geometry import Geometry
@@ -78,7 +78,7 @@ class WindowTable:
 
 def load_windows(
     folders: Sequence[Path],
-    pointnet: Geometry,
+    geometry: Geometry,
     config: WindowConfig | None = None,
     *,
     segment_length: int = SEGMENT_LENGTH,
@@ -94,7 +94,7 @@ def load_windows(
         UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
     """
     config = config or WindowConfig()
-    fingerprint, shards = pointnet_fingerprint(pointnet), []
+    fingerprint, shards = geometry_fingerprint(geometry), []
     lengths = {folder: read_metadata(folder)["configuration"]["steps"] for folder in folders}
     if len(set(lengths.values())) > 1:
         raise UserError(
@@ -110,7 +110,7 @@ def load_windows(
             needed, seen = (*names, *held_out.required_arrays), set[int]()
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
                 check_new(folder, number, arrays["episode"], seen)
-                arrays["features"] = shard_features(folder, number, pointnet, fingerprint)
+                arrays["features"] = shard_features(folder, number, geometry, fingerprint)
                 shards.append(held_out.filter_episodes(arrays))
                 bar.update()
     where = " and ".join(str(folder) for folder in folders)

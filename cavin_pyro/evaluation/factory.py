@@ -44,7 +44,7 @@ class EpisodeRunner:
 
     env: PushingEnv
     planner: Planner
-    pointnet: Geometry
+    geometry: Geometry
     pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
 
     @property
@@ -59,7 +59,7 @@ class EpisodeRunner:
             UserError: an optimizer of the user's own breaks the interface of optimizers, or the model predicts nothing
                 finite.
         """
-        parts = self.env, self.planner, self.pointnet
+        parts = self.env, self.planner, self.geometry
         try:
             return rollout(*parts, seed=seed, pushes_per_plan=self.pushes_per_plan, **options)
         except (OptimizerError, NoFiniteCandidateError) as error:
@@ -135,11 +135,11 @@ def make_planner(
     """
     path = find_checkpoint(config.checkpoint)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
-    pointnet = geometry_of(checkpoint, path)
+    geometry = geometry_of(checkpoint, path)
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
-        return construct(options), pointnet
+        return construct(options), geometry
     if "model" not in checkpoint.config:
         raise UserError(f"checkpoint {path} holds no model: give one that train has written")
     known = checkpoint.config["model"].get("maximum_objects", MAXIMUM_OBJECTS)
@@ -152,7 +152,7 @@ def make_planner(
     _check_planner(options, model, path)
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
-    return construct(options, model=wrap(model) if wrap else model, reward=reward, **optimizers), pointnet
+    return construct(options, model=wrap(model) if wrap else model, reward=reward, **optimizers), geometry
 
 
 def make_runner(
@@ -170,7 +170,7 @@ def make_runner(
     try:
         with user_input():
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
-        planner, pointnet = make_planner(config, reward, wrap=wrap)
+        planner, geometry = make_planner(config, reward, wrap=wrap)
         if config.pushes_per_plan is not None:
             whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
@@ -181,7 +181,7 @@ def make_runner(
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(env, planner, pointnet, config.pushes_per_plan)
+    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan)
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

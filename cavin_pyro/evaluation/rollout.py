@@ -100,7 +100,7 @@ class Episode:
 
 
 @torch.inference_mode()
-def observed_state(observation: ObservationDict, pointnet: Geometry) -> State:
+def observed_state(observation: ObservationDict, geometry: Geometry) -> State:
     """The planner's state, a batch of one, from an observation, without needless padding.
 
     Args:
@@ -110,7 +110,7 @@ def observed_state(observation: ObservationDict, pointnet: Geometry) -> State:
     centers = torch.from_numpy(observation["centers"][:objects])
     clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
     mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
-    return State(centers[None], pointnet(clouds)[None], mask[None])
+    return State(centers[None], geometry(clouds)[None], mask[None])
 
 
 class EpisodeCallback:
@@ -135,7 +135,7 @@ class EpisodeCallback:
 def rollout(
     env: PushingEnv,
     planner: Planner,
-    pointnet: Geometry,
+    geometry: Geometry,
     *,
     seed: int,
     pushes_per_plan: int | None = None,
@@ -159,7 +159,7 @@ def rollout(
     ended = False
     while not ended:
         began = time.perf_counter()
-        state = observed_state(observation, pointnet)
+        state = observed_state(observation, geometry)
         plan = planner.plan(state, [generator], episode.plan_records[-1].plan if episode.plan_records else None)
         record = PlanRecord(
             step=len(episode.transitions),

@@ -2,48 +2,39 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from models.networks.dynamics import PushOutcome
 from models.networks.layers import fully_connected, relative_positions
 from models.networks.outline import (
-    DIRECTIONS,
     FEATURES,
     HEIGHTS,
-    OUTLINE_UNIT,
     OUTLINES,
     PER_OUTLINE,
     Outline,
     multiples,
     outline_features,
     outline_values,
-    series,
     turned,
 )
+from models.networks.tool_contact import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, ToolContact, endpoints
 from models.state import State
 
-REACH_LOW, REACH_HIGH = (0.30, -0.55), (0.80, 0.55)  # metres; where starts and ends of pushes may lie
-PUSH_UNIT = 0.1  # metres, maximum motion of the tool along an axis
-TOOL_RADIUS = 0.01  # metres
 MAXIMUM_DISPLACEMENT = 0.2  # metres, by one push, along each axis
-DISPLACEMENT_UNIT = 0.05  # metres
 # Typical outlines and heights in 200,000 collected pushes, in units of 0.05 m: layers read inputs of order one.
 OUTLINE_MEAN, OUTLINE_SPREAD = 0.9, 0.3
 ORDER_SPREADS = (0.06, 0.09, 0.02, 0.035, 0.02, 0.02, 0.02, 0.02)  # of coefficients 1 to K
 HEIGHT_MEANS = (-0.8, -0.3, -0.1, 0.1, 0.15, 0.15, 0.2, 0.7, 0.3, 0.3, 0.0, 0.1)
 HEIGHT_SPREADS = (0.4, 0.3, 0.16, 0.1, 0.14, 0.17, 0.18, 0.2, 0.23, 0.24, 0.14, 0.12)
-INPUTS = 4 + (OUTLINES * PER_OUTLINE + HEIGHTS) + 5 + 8
+INPUTS = 4 + (OUTLINES * PER_OUTLINE + HEIGHTS) + 5 + MEASURES
 
 
 class ContactDynamics(PushOutcome):
     """f: mean and scale of the state after one push, from outlines of objects (`models.networks.outline.Outline`).
 
     In the frame of the push, whose origin is its start and whose x axis is its direction:
-    contact_i  = where the tool, as a disc, would enter and leave the half planes around outline i; how far it would
-                 still go; on which side it would meet the object
+    contact_i  = where the tool would meet outline i, and how (`models.networks.tool_contact.ToolContact`)
     object_i   = FC(FC(centre, outline, heights, contact; direction and place on the table))
     relation_i = sum over other real objects j of FC(FC(the same of i, the same of j))
     motion_i, its scale = linear of FC(object_i, relation_i)
@@ -56,15 +47,6 @@ class ContactDynamics(PushOutcome):
 
     typical: Tensor  # [63]
     spread: Tensor
-    entered_normals: Tensor  # [2, N], and [2 K + 1, N] for the extents in their directions
-    entered_series: Tensor
-    entered_slowness: Tensor  # [N]
-    entered_sides: Tensor  # [N, 2]
-    left_normals: Tensor
-    left_slowness: Tensor
-    left_series: Tensor
-    beside_normals: Tensor
-    beside_series: Tensor
 
     geometry = Outline
     reads_encoding = False
@@ -86,6 +68,7 @@ class ContactDynamics(PushOutcome):
         if feature_dimension != FEATURES:
             raise ValueError(f"dynamics=contact reads outlines with {FEATURES} numbers, not {feature_dimension}")
         super().__init__()
+        self.contact = ToolContact()
         self.object = nn.Sequential(fully_connected(INPUTS, object_width), fully_connected(object_width, object_width))
         self.own, self.other = nn.Linear(INPUTS, pair_width), nn.Linear(INPUTS, pair_width, bias=False)
         self.relation = fully_connected(pair_width, pair_width)
@@ -103,19 +86,6 @@ class ContactDynamics(PushOutcome):
         self.register_buffer(
             "spread", torch.cat((each.repeat(OUTLINES), torch.tensor(HEIGHT_SPREADS))), persistent=False
         )
-        angles = torch.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
-        weights = torch.full((PER_OUTLINE,), 2.0)
-        weights[0] = 1.0
-        facing = angles.cos() < -1e-3  # half planes that a push along x can enter; it leaves the opposite ones
-        leaving, beside = facing.roll(DIRECTIONS // 2), angles.cos().abs() < 1e-3
-        terms = (series(angles) * weights).T
-        for name, chosen in (("entered", facing), ("left", leaving), ("beside", beside)):
-            normals = torch.stack((angles.cos(), angles.sin()))[:, chosen]
-            self.register_buffer(f"{name}_normals", normals.clone(), persistent=False)
-            self.register_buffer(f"{name}_series", terms[:, chosen].clone(), persistent=False)
-            # Distance along the push per distance to the half plane.
-            self.register_buffer(f"{name}_slowness", -1.0 / normals[0], persistent=False)
-            self.register_buffer(f"{name}_sides", normals.T.clone(), persistent=False)
 
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor]:
         """The mean and scales of `state: [...]` after `action: [..., 4]`, see `PushOutcome`; `encoded` is ignored."""
@@ -131,7 +101,7 @@ class ContactDynamics(PushOutcome):
         values = outline_values(state.features)
         shape, heights = values.split((OUTLINES * PER_OUTLINE, HEIGHTS), -1)
         shape = turned(shape, cosines, sines)
-        contact = self._contact(along, across, shape[..., :PER_OUTLINE], length)
+        contact = self.contact(along, across, shape[..., :PER_OUTLINE], length)
         place = torch.stack((along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT), -1)
         batch = place.shape[:-1]
         each = torch.cat(
@@ -165,39 +135,6 @@ class ContactDynamics(PushOutcome):
         )
         return State(centers, features, state.mask.expand(centers.shape[:-1])), spread
 
-    def _contact(self, along: Tensor, across: Tensor, outline: Tensor, length: Tensor) -> Tensor:
-        """Where the tool meets the outline: `[..., M]` and `[..., M, 2 K + 1]` -> `[..., M, 8]`."""
-        place = torch.stack((along, across), -1)
-
-        def gap(normals: Tensor, terms: Tensor) -> Tensor:
-            """Metres from the tool's start to each half plane, positive outside."""
-            return -(place @ normals) - OUTLINE_UNIT * (outline @ terms) - TOOL_RADIUS
-
-        entered = gap(self.entered_normals, self.entered_series)
-        left = gap(self.left_normals, self.left_series)
-        times = entered * self.entered_slowness
-        enter = times.amax(-1)
-        leave = (left * self.left_slowness).amin(-1)
-        beside = gap(self.beside_normals, self.beside_series).amax(-1)
-        chord = torch.where(beside > 0, -beside, leave - enter).clamp(-0.2, 0.2)
-        rest = (length - enter).clamp(-0.1, 0.2)
-        hit = ((chord > 0) & (rest > 0)).to(along.dtype)
-        sharp = ((times - enter.unsqueeze(-1)) / 0.004).softmax(-1)  # metres; smooth where two sides meet
-        normal = sharp @ self.entered_sides
-        return torch.stack(
-            (
-                enter.clamp(-0.2, 0.3) / PUSH_UNIT,
-                chord / DISPLACEMENT_UNIT,
-                rest / PUSH_UNIT,
-                rest * hit / PUSH_UNIT,
-                normal[..., 0],
-                normal[..., 1],
-                hit * normal[..., 1],
-                torch.maximum(entered.amax(-1), left.amax(-1)) / PUSH_UNIT,
-            ),
-            -1,
-        )
-
     def _motion(self, each: Tensor, mask: Tensor) -> Tensor:
         own, other = self.own(each), self.other(each)
         objects = each.shape[-2]
@@ -207,14 +144,3 @@ class ContactDynamics(PushOutcome):
         ]
         relation = sum(related) if related else torch.zeros_like(own)
         return self.head(self.second(torch.cat((self.object(each), relation), -1)))
-
-
-def endpoints(action: Tensor) -> tuple[Tensor, Tensor]:
-    """Start and motion `[..., 2]` metres of normalised pushes `[..., 4]`, as the robot executes them."""
-    starts, motions = [], []
-    for axis, (low, high) in enumerate(zip(REACH_LOW, REACH_HIGH, strict=True)):  # numbers, no tensors, for compilers
-        start = low + (action[..., axis].clamp(-1.0, 1.0) + 1.0) * ((high - low) / 2.0)
-        end = (start + PUSH_UNIT * action[..., 2 + axis].clamp(-1.0, 1.0)).clamp(low, high)
-        starts.append(start)
-        motions.append(end - start)
-    return torch.stack(starts, -1), torch.stack(motions, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import ClassVar
 
 from torch import Tensor, nn
@@ -64,7 +65,7 @@ class StateChange(nn.Module):
         return State(centers, features, state.mask.expand(centers.shape[:-1]))
 
 
-class PushOutcome(nn.Module):
+class PushOutcome(nn.Module, ABC):
     """Base class of f, the state after one push.
 
     Attributes:
@@ -80,9 +81,9 @@ class PushOutcome(nn.Module):
         """The mean: `state: [...]`, its features `encoded: [..., M, 3 * width]`, `action: [..., 4]` -> `[...]`."""
         return self.outcome(state, encoded, action)[0]
 
+    @abstractmethod
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor | None]:
         """The mean, and if `predicts_scales` the scales `[..., M, 2]` of its centres (metres) and features."""
-        raise NotImplementedError
 
 
 class Dynamics(PushOutcome):

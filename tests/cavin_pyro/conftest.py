@@ -45,6 +45,13 @@ SMALL_CHECK = [  # options that make a check of all sections a matter of seconds
     *("sizes.growth.episodes=2", "sizes.growth.segments=2", "sizes.consistency.scenes=1"),
     *("sizes.consistency.objects=2", "sizes.consistency.samples=2"),
 ]
+WINDOWS = {  # of a training on `pushes`
+    "validation_fraction": 0.4,
+    "maximum_step": 0.2,
+    "minimum_move": 0.001,
+    "maximum_move": 0.5,
+    "negative_fraction": 0.25,
+}
 PUSHES = CollectionConfig(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
 
 

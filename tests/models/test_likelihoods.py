@@ -6,7 +6,7 @@ import pytest
 import torch
 from pyro import distributions
 
-from models.isotropic_normal import IsotropicNormal
+from models.isotropic import IsotropicNormal
 from models.likelihoods import LikelihoodScales
 from models.state import State
 

@@ -42,7 +42,7 @@ def assess_growth(context: CheckContext, *, episodes: int = 40, segments: int = 
     T = context.validation.segment_length
     known = context.model.maximum_objects
     recording = record(
-        context.pointnet, context.world, episodes=episodes, steps=segments * T, objects=known, seed=context.seed
+        context.geometry, context.world, episodes=episodes, steps=segments * T, objects=known, seed=context.seed
     )
     with seeded(context.seed):
         errors = errors_over_segments(context.model, context.guide, recording, T)

@@ -20,7 +20,7 @@ from cavin_pyro.criticism.sections import fingerprint_of, run_sections
 from cavin_pyro.criticism.statistics.prior.decoded import Difference, compare_decoded
 from cavin_pyro.criticism.statistics.windows import seeded
 from cavin_pyro.criticism.verdicts.verdict import MINIMUM_EPISODES, MINIMUM_WINDOWS
-from cavin_pyro.data.features import pointnet_fingerprint
+from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.storage.run_directory import check_same_run, write_config
 from models.state import Window
 
@@ -75,7 +75,7 @@ def assess_pair(contexts: Mapping[str, CheckContext], samples: int = SAMPLES) ->
     for name, context in contexts.items():
         windows[name], episodes = context.held_out(len(context.validation.actions))
     one, other = contexts["a"], contexts["b"]
-    alike = pointnet_fingerprint(one.pointnet) == pointnet_fingerprint(other.pointnet)
+    alike = geometry_fingerprint(one.geometry) == geometry_fingerprint(other.geometry)
     excluded = () if alike else FEATURES
     sites = [explained_sites(context, windows[name]) for name, context in contexts.items()]
     common = sites[0] if sites[0] == sites[1] else ()

@@ -23,15 +23,8 @@ from cavin_pyro.criticism.section import Section
 from cavin_pyro.data.dataset import content_fingerprint, read_metadata, write_metadata
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
-from tests.cavin_pyro.conftest import SMALL_CHECK
+from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
 
-WINDOWS = {
-    "validation_fraction": 0.4,
-    "maximum_step": 0.2,
-    "minimum_move": 0.001,
-    "maximum_move": 0.5,
-    "negative_fraction": 0.25,
-}
 SMALL = [*SMALL_CHECK, "sizes.consistency.scenes=2"]
 
 
@@ -79,7 +72,7 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
     context, about = load_context(check_config("windows=1000"))
     checkpoint = load_checkpoint(trained)
     windows, segment_length, seed = trained_windows(checkpoint, trained)
-    table = load_windows([pushes], context.pointnet, windows, segment_length=segment_length, seed=seed)
+    table = load_windows([pushes], context.geometry, windows, segment_length=segment_length, seed=seed)
     for name in ("training", "validation"):
         window = getattr(context, name)
         counted = getattr(table, name)[table.sequence_mask[getattr(table, name)]]

@@ -9,15 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from cavin_pyro.criticism.sections import SECTIONS
-from tests.cavin_pyro.conftest import SMALL_CHECK
+from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
 
-WINDOWS = {
-    "validation_fraction": 0.4,
-    "maximum_step": 0.2,
-    "minimum_move": 0.001,
-    "maximum_move": 0.5,
-    "negative_fraction": 0.25,
-}
 SECTIONS_OF_CODES = {
     "guide_error",
     "amortization",

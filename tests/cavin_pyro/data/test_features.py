@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data import features
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path
-from cavin_pyro.data.features import cloud_features, pointnet_fingerprint, sample_clouds, shard_features
+from cavin_pyro.data.features import cloud_features, geometry_fingerprint, sample_clouds, shard_features
 from envs.objects.shapes import BUILTIN_NAMES
 from models.networks.pointnet import PointNet
 
@@ -19,7 +19,7 @@ from models.networks.pointnet import PointNet
 def test_features_are_pointnets_output_for_each_cloud(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(features, "BATCH", 7)  # does not divide the number of clouds
     pointnet = PointNet()
-    found = shard_features(own_pushes, 1, pointnet, pointnet_fingerprint(pointnet))
+    found = shard_features(own_pushes, 1, pointnet, geometry_fingerprint(pointnet))
     clouds = read_shard(shard_path(own_pushes, 1))["clouds"]
     assert found.shape == (*clouds.shape[:3], 64)
     assert found.dtype == np.float32
@@ -31,21 +31,21 @@ def test_features_are_pointnets_output_for_each_cloud(own_pushes: Path, monkeypa
 
 def test_features_are_computed_once(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pointnet = PointNet()
-    first = shard_features(own_pushes, 0, pointnet, pointnet_fingerprint(pointnet))
+    first = shard_features(own_pushes, 0, pointnet, geometry_fingerprint(pointnet))
 
     def computed(*arguments: object) -> None:
         raise AssertionError("computed a second time")
 
     monkeypatch.setattr(features, "cloud_features", computed)
-    np.testing.assert_array_equal(shard_features(own_pushes, 0, pointnet, pointnet_fingerprint(pointnet)), first)
+    np.testing.assert_array_equal(shard_features(own_pushes, 0, pointnet, geometry_fingerprint(pointnet)), first)
     with pytest.raises(AssertionError):
-        shard_features(own_pushes, 1, pointnet, pointnet_fingerprint(pointnet))
+        shard_features(own_pushes, 1, pointnet, geometry_fingerprint(pointnet))
 
 
 def test_features_of_another_pointnet_are_not_used(own_pushes: Path) -> None:
     one, other = PointNet(), PointNet()
-    ones = shard_features(own_pushes, 0, one, pointnet_fingerprint(one))
-    others = shard_features(own_pushes, 0, other, pointnet_fingerprint(other))
+    ones = shard_features(own_pushes, 0, one, geometry_fingerprint(one))
+    others = shard_features(own_pushes, 0, other, geometry_fingerprint(other))
     assert np.abs(ones - others).max() > 0.1
     clouds = read_shard(shard_path(own_pushes, 0))["clouds"]
     np.testing.assert_array_equal(others, cloud_features(other, clouds))
@@ -55,16 +55,16 @@ def test_features_of_another_pointnet_are_not_used(own_pushes: Path) -> None:
 @pytest.mark.parametrize("name", PointNet().state_dict())
 def test_the_fingerprint_changes_with_every_weight_and_with_nothing_else(name: str) -> None:
     pointnet = PointNet()
-    before = pointnet_fingerprint(pointnet)
-    assert pointnet_fingerprint(pointnet) == before
+    before = geometry_fingerprint(pointnet)
+    assert geometry_fingerprint(pointnet) == before
     with torch.no_grad():
         pointnet.state_dict()[name].flatten()[-1].add_(1e-3)
-    assert pointnet_fingerprint(pointnet) != before
+    assert geometry_fingerprint(pointnet) != before
 
 
 def test_damaged_features_are_made_again(own_pushes: Path) -> None:
     pointnet = PointNet()
-    fingerprint = pointnet_fingerprint(pointnet)
+    fingerprint = geometry_fingerprint(pointnet)
     first = shard_features(own_pushes, 0, pointnet, fingerprint)
     (path,) = own_pushes.glob("features-*/*.h5")
     path.write_bytes(path.read_bytes()[:200])
@@ -78,7 +78,7 @@ def test_a_dataset_that_cannot_be_written_to_can_be_read(own_pushes: Path, monke
 
     monkeypatch.setattr(os, "replace", refuse)
     pointnet = PointNet()
-    found = shard_features(own_pushes, 0, pointnet, pointnet_fingerprint(pointnet))
+    found = shard_features(own_pushes, 0, pointnet, geometry_fingerprint(pointnet))
     np.testing.assert_array_equal(found, cloud_features(pointnet, read_shard(shard_path(own_pushes, 0))["clouds"]))
     assert not list(own_pushes.glob("features-*/*"))
 
@@ -87,7 +87,7 @@ def test_a_corrupt_shard_has_no_features(own_pushes: Path) -> None:
     shard_path(own_pushes, 0).write_bytes(b"nothing")
     pointnet = PointNet()
     with pytest.raises(UserError, match=r"episodes-00000\.h5"):
-        shard_features(own_pushes, 0, pointnet, pointnet_fingerprint(pointnet))
+        shard_features(own_pushes, 0, pointnet, geometry_fingerprint(pointnet))
 
 
 @pytest.mark.parametrize("count", [1, 10, 40])

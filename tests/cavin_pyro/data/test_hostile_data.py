@@ -14,7 +14,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.collection import repair
 from cavin_pyro.data.dataset import iterate_shards, read_metadata, read_shard, shard_path, write_metadata, write_shard
 from cavin_pyro.data.declaration import ARRAYS
-from cavin_pyro.data.features import pointnet_fingerprint, sample_clouds, shard_features
+from cavin_pyro.data.features import geometry_fingerprint, sample_clouds, shard_features
 from cavin_pyro.data.windows import load_windows
 from models.networks.pointnet import PointNet
 
@@ -80,7 +80,7 @@ def test_what_is_collected_is_what_is_declared(pushes: Path) -> None:
 
 def test_features_of_another_shape_are_made_again(own_pushes: Path) -> None:
     pointnet = PointNet()
-    fingerprint = pointnet_fingerprint(pointnet)
+    fingerprint = geometry_fingerprint(pointnet)
     good = shard_features(own_pushes, 0, pointnet, fingerprint)
     for bad in (good[1:], good.astype(np.float64), np.full_like(good, np.nan)):
         write_shard(own_pushes / f"features-{fingerprint}" / "episodes-00000.h5", {"features": bad})

@@ -41,7 +41,7 @@ def test_an_earlier_episode_does_not_change_what_is_planned_in_a_later_one(confi
     for earlier in ([], [4, 5]):
         runner = make_runner(configure(*RANDOM))
         for seed in [*earlier, 6]:
-            episode = rollout(runner.env, runner.planner, runner.pointnet, seed=seed)
+            episode = rollout(runner.env, runner.planner, runner.geometry, seed=seed)
         plans.append(episode.plan_records[0].plan)
         runner.env.close()
     for one, other in zip(plans[0], plans[1], strict=True):

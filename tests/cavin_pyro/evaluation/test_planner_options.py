@@ -89,7 +89,7 @@ def test_every_planner_plans_with_every_optimizer(
     planner: str, optimizer: str, make_small_runner: Callable[..., EpisodeRunner], tmp_path: Path
 ) -> None:
     parts = make_small_runner(planner, FITTING[planner], f"planner.optimizer={optimizer}")
-    episode = rollout(parts.env, parts.planner, parts.pointnet, seed=1)
+    episode = rollout(parts.env, parts.planner, parts.geometry, seed=1)
     assert episode.outcome in OUTCOMES
     plan = episode.plan_records[0].plan
     assert plan.actions.shape == (1, 3, 4)
@@ -122,7 +122,7 @@ def test_options_take_effect(planner: str, option: str) -> None:
         name, *own = planner.split()
         overrides = [f"planner={name}", *SMALL, "planner.samples=64", *own, *further, "output=unused"]
         parts = make_runner(compose("evaluate", *overrides))  # the shipped checkpoint knows something
-        plans.append(rollout(parts.env, parts.planner, parts.pointnet, seed=1).plan_records[0].plan)
+        plans.append(rollout(parts.env, parts.planner, parts.geometry, seed=1).plan_records[0].plan)
         parts.env.close()
     returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
     assert not (torch.equal(*returns) and torch.equal(*actions))
@@ -140,7 +140,7 @@ def test_compiled_plans_agree_with_eager_plans(make_small_runner: Callable[..., 
             "task=insertion",
         ]
         parts = make_small_runner("cavin", "cascaded", *overrides)
-        episode = rollout(parts.env, parts.planner, parts.pointnet, seed=1)
+        episode = rollout(parts.env, parts.planner, parts.geometry, seed=1)
         plans.append([record.plan for record in episode.plan_records])
         parts.env.close()
     for eager, compiled in zip(*plans, strict=True):

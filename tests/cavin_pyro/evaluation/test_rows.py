@@ -89,6 +89,6 @@ def test_a_model_that_predicts_nothing_finite_ends_in_one_line(monkeypatch: pyte
         raise NoFiniteCandidateError(0, "none of the 8 returns of effect plans is finite")
 
     monkeypatch.setattr(factory, "rollout", fail)
-    runner: Any = factory.EpisodeRunner(env=None, planner=None, pointnet=None, pushes_per_plan=1)  # type: ignore[arg-type]
+    runner: Any = factory.EpisodeRunner(env=None, planner=None, geometry=None, pushes_per_plan=1)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="none of the 8 returns of effect plans is finite"):
         runner.rollout(3)

@@ -2,17 +2,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.robots import STICK_RADIUS
-from envs.workspace import push_endpoints
-from models.networks import contact
-from models.networks.contact import MAXIMUM_DISPLACEMENT, ContactDynamics, endpoints
-from models.networks.outline import PER_OUTLINE, Outline, outline_features, outline_values
+from models.networks.contact import MAXIMUM_DISPLACEMENT, ContactDynamics
+from models.networks.outline import Outline, outline_features
 from models.state import State
 
 
@@ -36,35 +32,6 @@ def loud(**sizes: int) -> ContactDynamics:
 
 def doubled(state: State) -> State:
     return State(state.centers.double(), state.features.double(), state.mask)
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.floats(-1.5, 1.5), min_size=4, max_size=4))
-def test_pushes_start_and_stop_where_the_robot_starts_and_stops(action: list[float]) -> None:
-    start, motion = endpoints(torch.tensor(action, dtype=torch.float64))
-    expected = push_endpoints(np.array(action))
-    assert np.allclose(start, expected[0], atol=1e-7)
-    assert np.allclose(start + motion, expected[1], atol=1e-7)
-    assert contact.TOOL_RADIUS == STICK_RADIUS
-
-
-def test_where_the_tool_meets_a_disc_is_where_geometry_says() -> None:
-    radius, gap = 0.04, 0.06  # metres
-    angles = torch.linspace(0, 2 * np.pi, 257)[:-1]
-    disc = radius * torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
-    outline = ContactDynamics().double()
-    values = outline_values(Outline()(disc))[:PER_OUTLINE].double()
-    along = torch.tensor([gap + radius + contact.TOOL_RADIUS], dtype=torch.float64)
-    found = outline._contact(along, torch.zeros(1).double(), values[None], torch.tensor([0.1]).double())[0]
-    enter, chord, rest, driven, normal_x, normal_y, *_ = found.tolist()
-    assert enter * contact.PUSH_UNIT == pytest.approx(gap, abs=1e-3)
-    assert chord * contact.DISPLACEMENT_UNIT == pytest.approx(2 * (radius + contact.TOOL_RADIUS), abs=2e-3)
-    assert rest == driven == pytest.approx((0.1 - gap) / contact.PUSH_UNIT, abs=0.02)
-    assert (normal_x, normal_y) == pytest.approx((-1.0, 0.0), abs=0.05)
-    beside = torch.tensor([radius + contact.TOOL_RADIUS + 0.01]).double()
-    missed = outline._contact(along, beside, values[None], torch.tensor([0.1]).double())[0]
-    assert missed[1] < 0
-    assert missed[3] == 0
 
 
 def test_reordering_objects_reorders_the_prediction() -> None:

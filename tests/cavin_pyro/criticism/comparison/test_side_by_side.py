@@ -25,14 +25,7 @@ from cavin_pyro.criticism.section import Section
 from cavin_pyro.criticism.statistics.clusters import Interval
 from cavin_pyro.criticism.verdicts.verdict import Verdict
 from cavin_pyro.storage.checkpoint import save_checkpoint
-
-WINDOWS = {
-    "validation_fraction": 0.4,
-    "maximum_step": 0.2,
-    "minimum_move": 0.001,
-    "maximum_move": 0.5,
-    "negative_fraction": 0.25,
-}
+from tests.cavin_pyro.conftest import WINDOWS
 
 
 def test_a_model_compared_with_itself_shows_no_difference_and_a_worse_one_does(

@@ -4,7 +4,7 @@ import pytest
 import torch
 from pyro import distributions
 
-from models.isotropic_student import IsotropicStudentT
+from models.isotropic import IsotropicStudentT
 
 
 def test_the_density_is_that_of_pyros_multivariate_t() -> None:
