@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.reproduction.cells import FIGURES, VARIANTS
+from cavin_pyro.reproduction.claims import claims, section
 from cavin_pyro.reproduction.episodes.failures import failures, failures_section
 from cavin_pyro.reproduction.episodes.failures_figure import draw_failures
 from cavin_pyro.reproduction.figure import TITLES, draw_figure
@@ -35,7 +36,20 @@ def write_results(home: Path, rows: Sequence[Row], command: str) -> list[Path]:
         draw_figure(home / f"figure-{planner}-{criterion}.png", measured, planner=planner, criterion=criterion)
         draw_failures(home / f"failures-{planner}-{criterion}.png", counted, planner=planner, criterion=criterion)
     sections = [_section(planner, criterion, measured, compared) for planner, criterion in figures]
-    lines = [*_head(rows, command), *sections, *_variants(measured, compared), *failures_section(counted, figures)]
+    checked = [
+        line
+        for planner, criterion in reversed(figures)
+        for line in section(
+            claims(measured, compared, planner=planner, criterion=criterion), planner=planner, criterion=criterion
+        )
+    ]
+    lines = [
+        *_head(rows, command),
+        *checked,
+        *sections,
+        *_variants(measured, compared),
+        *failures_section(counted, figures),
+    ]
     with atomic_write(home / PAGE) as temporary:
         temporary.write_text("\n".join(lines), encoding="utf-8")
     pictures = [home / f"{kind}-{one}-{other}.png" for kind in ("figure", "failures") for one, other in figures]
