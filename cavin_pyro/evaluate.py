@@ -16,6 +16,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
     from cavin_pyro.evaluation.evaluation import evaluate
     from cavin_pyro.evaluation.factory import make_runner, planner_name
+    from cavin_pyro.evaluation.outlook import outlook
     from cavin_pyro.evaluation.statistics import summarize, table
     from cavin_pyro.storage.files import atomic_write, output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
@@ -30,6 +31,8 @@ def main(config: DictConfig) -> None:
         results = summarize(evaluate(config, folder))
         scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
         text = table(results, f"{scene}, {planner_name(config)}")
+        if said := outlook(results["per_episode"], config):
+            text += "\n" + said
         if others:
             comparison = compare(results["per_episode"], others)
             results["comparison"] = record(comparison, Path(config.compare))

@@ -1,0 +1,41 @@
+"""Whether plans reach the goal by the model, in one line: a search that finds no way pushes at random."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig
+
+
+def expects_nothing(config: DictConfig) -> bool:
+    """Whether the planner predicts nothing, so that its plans say nothing about the goal."""
+    return "horizon" not in config.planner
+
+
+def outlook_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
+    """One line about an episode's plans, from its row of results; empty for planners that predict nothing."""
+    if expects_nothing(config) or not row["plans"]:
+        return ""
+    if row["hopeful_plans"]:
+        return f"{row['hopeful_plans']} of {row['plans']} plans reached the goal by the model"
+    return f"no plan reached the goal by the model, so the pushes were not led there: {_advice(config)}"
+
+
+def outlook(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
+    """The same about all episodes; what to try is added if in some of them no plan reached the goal."""
+    plans = sum(row["plans"] for row in rows)
+    if expects_nothing(config) or not plans:
+        return ""
+    hopeful = sum(row["hopeful_plans"] for row in rows)
+    without = [row for row in rows if not row["hopeful_plans"]]
+    line = f"{100 * hopeful / plans:.1f} % of {plans} plans reached the goal by the model"
+    if not without:
+        return f"{line}, some in each episode"
+    failed = sum(row["outcome"] != "success" for row in without)
+    return f"{line}; in {len(without)} of {len(rows)} episodes none did ({failed} failed): {_advice(config)}"
+
+
+def _advice(config: DictConfig) -> str:
+    others = "" if config.reward == "dense" else " or reward=dense"
+    return f"the goal may lie beyond planner.horizon={config.planner.horizon} pushes; try a longer one{others}"

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+from typing import Any
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.evaluation.outlook import outlook, outlook_of_episode
+
+ADVICE = "the goal may lie beyond planner.horizon=30 pushes; try a longer one"
+
+
+def row(plans: int, hopeful: int, outcome: str = "timeout") -> dict[str, Any]:
+    return {"plans": plans, "hopeful_plans": hopeful, "outcome": outcome}
+
+
+def test_an_episode_in_which_no_plan_reached_the_goal_says_so_and_what_to_try() -> None:
+    config = compose("plan", "reward=sparse")
+    said = outlook_of_episode(row(20, 0), config)
+    assert said == f"no plan reached the goal by the model, so the pushes were not led there: {ADVICE} or reward=dense"
+    assert outlook_of_episode(row(20, 3), config) == "3 of 20 plans reached the goal by the model"
+
+
+def test_an_evaluation_counts_the_episodes_without_such_a_plan_and_how_they_ended() -> None:
+    config = compose("evaluate", "reward=dense")
+    rows = [row(20, 0), row(20, 0, "success"), row(10, 10, "success")]
+    said = outlook(rows, config)
+    assert said == f"20.0 % of 50 plans reached the goal by the model; in 2 of 3 episodes none did (1 failed): {ADVICE}"
+    assert outlook(rows[-1:], config) == "100.0 % of 10 plans reached the goal by the model, some in each episode"
+
+
+def test_a_planner_that_predicts_nothing_says_nothing() -> None:
+    assert outlook_of_episode(row(20, 0), compose("plan", "planner=random")) == ""
+    assert outlook([row(20, 0)], compose("evaluate", "planner=random")) == ""
+    assert outlook_of_episode(row(0, 0), compose("plan")) == ""  # an episode without a plan
