@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cavin_pyro import __version__
 
-ORDER = ("demo", "plan", "evaluate", "collect", "pretrain", "train", "check", "reproduce", "assets")
+ORDER = ("demo", "plan", "evaluate", "collect", "data", "pretrain", "train", "check", "reproduce", "assets")
 
 
 def main() -> None:
@@ -24,7 +24,9 @@ def main() -> None:
 
 def purpose(name: str) -> str:
     """The first sentence of a command's docstring."""
-    tree = ast.parse((Path(__file__).parent / f"{name}.py").read_text(encoding="utf-8"))
+    home = Path(__file__).parent
+    file = next(file for file in (home / f"{name}.py", home / name / "__main__.py") if file.exists())
+    tree = ast.parse(file.read_text(encoding="utf-8"))
     (body,) = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "main")
     return " ".join((ast.get_docstring(body) or "").split("\n\n")[0].split()).rstrip(".")
 

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import NoReturn
 
 from cavin_pyro.config.application import guarded
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        from cavin_pyro.config.errors import UserError
-
-        raise UserError(f"{message}; {' '.join(self.format_usage().split())}")
+from cavin_pyro.config.errors import Parser
 
 
 def main() -> None:
@@ -28,7 +20,7 @@ def _run() -> None:
     from cavin_pyro.fetching.ycb import YcbObjects
 
     kinds = {kind.name: kind for kind in (YcbObjects(), SawyerRobot())}
-    parser = _Parser(prog="python -m cavin_pyro.assets", description=main.__doc__)
+    parser = Parser(prog="python -m cavin_pyro.assets", description=main.__doc__)
     parser.add_argument("kind", choices=kinds, help="the ten YCB objects of the paper, or the Sawyer arm")
     parser.add_argument(
         "--to", type=Path, required=True, metavar="DIR", help="folder, in which the kind gets its own subfolder"

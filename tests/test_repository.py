@@ -76,7 +76,7 @@ def pins(lines: list[str]) -> dict[str, str]:
     """Exact versions by name; anything but `name==version`, with or without a marker, is an error."""
     found = {}
     for line in lines:
-        match = re.fullmatch(r"([a-z0-9][a-z0-9-]*)==([0-9][0-9.]*)(; python_version < '3\.11')?", line)
+        match = re.fullmatch(r"([a-z0-9][a-z0-9-]*)==([0-9][0-9.]*)(; python_version (?:<|>=) '3\.11')?", line)
         assert match, f"not an exact pin: {line}"
         found[match[1]] = match[2]
     return found
@@ -118,7 +118,9 @@ def test_every_dependency_is_locked_at_the_version_that_the_project_names() -> N
 def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
     # What an optional extra brings is imported only on request: tests/cavin_pyro/visualization/test_recording.py.
     extras = PROJECT["project"]["optional-dependencies"]
-    declared = pins(PROJECT["project"]["dependencies"] + extras["assets"] + extras["viewer"] + extras["export"])
+    declared = pins(
+        PROJECT["project"]["dependencies"] + extras["assets"] + extras["viewer"] + extras["export"] + extras["minari"]
+    )
     known = {*sys.stdlib_module_names, *PACKAGES}
     strangers = [
         f"{place(file, line)} imports {name}"
@@ -145,9 +147,10 @@ def test_every_folder_of_a_package_is_a_package() -> None:
 
 def test_every_command_is_a_console_script_and_every_console_script_has_its_main() -> None:
     scripts = dict(target.split(":") for target in PROJECT["project"]["scripts"].values())
+    home = ROOT / "cavin_pyro"
     mains = {
-        f"cavin_pyro.{file.stem}"
-        for file in (ROOT / "cavin_pyro").glob("*.py")
+        ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        for file in (*home.glob("*.py"), *home.glob("*/__main__.py"))  # a room may be a command too
         for node in parse(file).body
         if isinstance(node, ast.FunctionDef) and node.name == "main"
     }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 
 class UserError(Exception):
@@ -58,3 +60,11 @@ def one_of(name: str, value: object, choices: Collection[str]) -> None:
     """
     if value not in choices:
         raise UserError(f"unknown {name} {value!r}: choose from {', '.join(choices)}")
+
+
+class Parser(argparse.ArgumentParser):
+    """For commands with words instead of options, such as `assets ycb --to DIR`: a wrong one is a `UserError`."""
+
+    def error(self, message: str) -> NoReturn:
+        """Called by argparse for a wrong command line."""
+        raise UserError(f"{message}; {' '.join(self.format_usage().split())}")

@@ -19,7 +19,7 @@ from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.data.collection import CollectionConfig
-from cavin_pyro.data.dataset import content_fingerprint, read_metadata, with_current_names
+from cavin_pyro.data.dataset import content_records, read_metadata, with_current_names
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.data.world import collecting_world
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
@@ -216,12 +216,23 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         UserError: no dataset.
     """
-    metadata, fingerprint = read_metadata(folder), content_fingerprint(folder)
-    entries = trained.get("data")
-    same, verdict = _verdict(metadata, fingerprint, entries if isinstance(entries, list) else [])
-    seed = metadata["configuration"].get("seed")
-    found = {"folder": str(folder), "transitions": metadata["transitions"], "seed": seed, "fingerprint": fingerprint}
-    return {**found, "same": same, "verdict": verdict}
+    records, trained_on = content_records(folder), trained.get("data")
+    entries = trained_on if isinstance(trained_on, list) else []
+    verdicts = [_verdict(record, record["fingerprint"], entries) for record in records]
+    seeds = [record["configuration"].get("seed") for record in records]
+    (same, verdict), merged = verdicts[0], len(records) > 1
+    if merged:
+        answers = {one for one, _ in verdicts}
+        same = answers.pop() if len(answers) == 1 else None
+        verdict = "; ".join(f"of seed {seed}: {said}" for seed, (_, said) in zip(seeds, verdicts, strict=True))
+    return {
+        "folder": str(folder),
+        "transitions": read_metadata(folder)["transitions"],
+        "seed": seeds if merged else seeds[0],
+        "fingerprint": [record["fingerprint"] for record in records] if merged else records[0]["fingerprint"],
+        "same": same,
+        "verdict": verdict,
+    }
 
 
 def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[Any]) -> tuple[bool | None, str]:

@@ -220,6 +220,8 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
             raise
         (folder / "metadata.json").unlink()
         return _begin(config, folder)
+    if "sources" in metadata:
+        raise UserError(f"{folder} holds a merged dataset, which cannot grow: choose another output=DIR")
     stored = usual | metadata["configuration"]  # older versions lack later options
     stored["ranges"] = usual["ranges"] | stored["ranges"]
     for name, value in wanted.items():

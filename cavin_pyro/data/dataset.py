@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.declaration import check_file, check_values
+from cavin_pyro.data.sources import check_sources, source_of_shards, sources_of
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 from cavin_pyro.storage.run_directory import with_current_keys
 
@@ -124,6 +125,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         )
     metadata["configuration"] = with_current_names(metadata["configuration"])
     _check_counts(path, metadata)
+    check_sources(path, metadata)
     return metadata
 
 
@@ -150,13 +152,25 @@ def with_current_names(configuration: Mapping[str, Any]) -> dict[str, Any]:
     return {RENAMED.get(name, name): value for name, value in configuration.items()}
 
 
-def content_fingerprint(folder: Path) -> str:
-    """Twelve hexadecimal digits of the first shard's bytes: equal for equal configuration, program and simulator.
+def content_records(folder: Path) -> list[dict[str, Any]]:
+    """What identifies a dataset's content: a record for each collection in it, which is one unless it was merged.
+
+    Each has `transitions`, `episodes`, `configuration`, `made_by`, and the `fingerprint` of the first shard's bytes:
+    twelve hexadecimal digits, equal for equal configuration, program and simulator.
 
     Raises:
-        UserError: the shard cannot be read.
+        UserError: no dataset, or one of these shards cannot be read.
     """
-    path = shard_path(folder, 0)
+    metadata, first, records = read_metadata(folder), 0, []
+    for source in sources_of(metadata):
+        names = ("transitions", "episodes", "configuration", "made_by")
+        records.append({**{name: source[name] for name in names}, "fingerprint": _fingerprint(folder, first)})
+        first += source["shards"]
+    return records
+
+
+def _fingerprint(folder: Path, shard: int) -> str:
+    path = shard_path(folder, shard)
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     except OSError as error:
@@ -167,32 +181,44 @@ def check_distinct(folders: Sequence[Path]) -> None:
     """Check that no dataset is given twice, so that no episode counts twice and none is in training and validation.
 
     Raises:
-        UserError: two begin with the same shard.
+        UserError: two begin with the same shard, or have parts that do.
     """
     known: dict[str, Path] = {}
     for folder in folders:
-        read_metadata(folder)  # tells whether there is a dataset at all
-        path = shard_path(folder, 0)
-        fingerprint = content_fingerprint(folder) if path.exists() else str(folder.resolve())
-        if fingerprint in known:
-            raise UserError(f"data names the same episodes twice, {known[fingerprint]} and {folder}: name them once")
-        known[fingerprint] = folder
+        metadata, first = read_metadata(folder), 0  # tells whether there is a dataset at all
+        for source in sources_of(metadata):
+            path = shard_path(folder, first)
+            fingerprint = _fingerprint(folder, first) if path.exists() else str(path.resolve())
+            if fingerprint in known:
+                raise UserError(
+                    f"data names the same episodes twice, {known[fingerprint]} and {folder}: name them once"
+                )
+            known[fingerprint] = folder
+            first += source["shards"]
 
 
-def check_new(folder: Path, number: int, episodes: NDArray[np.int64], seen: set[int]) -> None:
-    """Check that the numbers of a shard's episodes are new in its dataset, and add them to `seen`.
+class EpisodeNumbers:
+    """The numbers of a dataset's episodes, each of which belongs to one episode of a collection."""
 
-    Raises:
-        UserError: an earlier shard has one of them.
-    """
-    repeated = sorted(seen & set(episodes.tolist()))
-    if repeated or len(set(episodes.tolist())) < len(episodes):
-        which = f" {repeated[0]}" if repeated else "s"
-        raise UserError(
-            f"shard {shard_path(folder, number)} repeats episode{which}: "
-            "delete it and collect again with repair=true to rebuild it"
-        )
-    seen |= set(episodes.tolist())
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._sources = folder, source_of_shards(read_metadata(folder))
+        self._seen: dict[int, set[int]] = {}
+
+    def add(self, number: int, episodes: NDArray[np.int64]) -> None:
+        """Add those of a shard.
+
+        Raises:
+            UserError: an earlier shard has one of them.
+        """
+        seen = self._seen.setdefault(self._sources[number], set())
+        repeated = sorted(seen & set(episodes.tolist()))
+        if repeated or len(set(episodes.tolist())) < len(episodes):
+            which = f" {repeated[0]}" if repeated else "s"
+            raise UserError(
+                f"shard {shard_path(self._folder, number)} repeats episode{which}: "
+                "delete it and collect again with repair=true to rebuild it"
+            )
+        seen |= set(episodes.tolist())
 
 
 def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:

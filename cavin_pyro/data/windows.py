@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import Arrays, check_distinct, check_new, iterate_shards, read_metadata
+from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, check_distinct, iterate_shards, read_metadata
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.storage.progress import progress_bar
@@ -107,9 +107,9 @@ def load_windows(
     held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     with progress_bar("reading", total=total, unit="file") as bar:
         for folder, held_out in zip(folders, held_out_of, strict=True):
-            needed, seen = (*names, *held_out.required_arrays), set[int]()
+            needed, known = (*names, *held_out.required_arrays), EpisodeNumbers(folder)
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
-                check_new(folder, number, arrays["episode"], seen)
+                known.add(number, arrays["episode"])
                 arrays["features"] = shard_features(folder, number, geometry, fingerprint)
                 shards.append(held_out.filter_episodes(arrays))
                 bar.update()

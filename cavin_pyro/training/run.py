@@ -14,7 +14,7 @@ from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
-from cavin_pyro.data.dataset import content_fingerprint, read_metadata
+from cavin_pyro.data.dataset import content_records
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.storage.checkpoint import save_checkpoint, verify_checkpoint
 from cavin_pyro.storage.files import output_folder, write_json
@@ -93,13 +93,9 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
 
 def training_provenance(data: Sequence[Path], geometry: Mapping[str, Any], windows: WindowTable) -> dict[str, Any]:
     """The provenance of a trained model: the run, its data and what `geometry` says of the geometric features."""
-    names = ("transitions", "episodes", "configuration", "made_by")
     return {
         **provenance(),
-        "data": [
-            {**{name: read_metadata(folder)[name] for name in names}, "fingerprint": content_fingerprint(folder)}
-            for folder in data
-        ],
+        "data": [record for folder in data for record in content_records(folder)],
         **geometry,
         "training_windows": len(windows.training),
         "validation_windows": len(windows.validation),

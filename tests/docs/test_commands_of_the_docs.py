@@ -36,7 +36,7 @@ SHORT = {
     "evaluate": f"{EPISODES} episodes=2 workers=1",
     "check": "windows=2 sections=[elbo,consistency] sizes.consistency.scenes=1 sizes.consistency.samples=2",
 }
-WITHOUT_HYDRA = {"assets"}  # its options are those of argparse
+WITHOUT_HYDRA = {"assets", "data"}  # their options are those of argparse
 
 
 def composable(lines: list[Line]) -> list[Line]:

@@ -32,9 +32,10 @@ def test_the_package_lists_its_commands(capsys: pytest.CaptureFixture[str], monk
     monkeypatch.setattr(sys, "argv", ["cavin_pyro"])
     listing.main()
     listed = re.findall(r"python -m cavin_pyro\.([a-z]+) +\S", capsys.readouterr().out)
-    assert sorted(listed) == sorted([*COMMANDS, "assets"])
+    assert sorted(listed) == sorted([*COMMANDS, "assets", "data"])
     folder = Path(listing.__file__).parent
-    assert set(listed) == {file.stem for file in folder.glob("*.py")} - {"__init__", "__main__"}
+    rooms = {file.parent.name for file in folder.glob("*/__main__.py")}
+    assert set(listed) == {file.stem for file in folder.glob("*.py")} - {"__init__", "__main__"} | rooms
 
 
 @pytest.mark.parametrize("main", [listing.main, plan.main])

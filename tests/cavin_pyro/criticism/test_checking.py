@@ -20,7 +20,7 @@ from cavin_pyro.criticism import sections
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.loading import compare_data, load_context, load_programs, sample_windows, trained_windows
 from cavin_pyro.criticism.section import Section
-from cavin_pyro.data.dataset import content_fingerprint, read_metadata, write_metadata
+from cavin_pyro.data.dataset import content_records, read_metadata, write_metadata
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
 from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
@@ -99,7 +99,7 @@ def test_sampled_windows_depend_on_their_seed(check_config: Callable[..., DictCo
 
 
 def test_a_report_says_whether_the_model_was_trained_on_the_data(own_pushes: Path) -> None:
-    metadata, fingerprint = read_metadata(own_pushes), content_fingerprint(own_pushes)
+    metadata, fingerprint = read_metadata(own_pushes), content_records(own_pushes)[0]["fingerprint"]
     entry = {name: metadata[name] for name in ("transitions", "episodes", "configuration")}
 
     def verdict(*entries: dict[str, Any]) -> tuple[bool | None, str]:

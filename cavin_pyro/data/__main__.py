@@ -1,0 +1,62 @@
+"""Look after datasets: `python -m cavin_pyro.data info|verify|merge|export DIR`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cavin_pyro import __version__
+from cavin_pyro.config.application import check_packages, guarded
+from cavin_pyro.config.errors import Parser
+
+
+def main() -> None:
+    """Describe, verify, merge or export datasets from collect."""
+    guarded(_run)
+
+
+def _run() -> None:
+    check_packages()
+    arguments = _parser().parse_args()
+    folders = [Path(folder) for folder in arguments.folders]
+    if arguments.action == "info":
+        from cavin_pyro.data.maintenance.info import describe
+
+        print("\n\n".join(describe(folder) for folder in folders))
+    elif arguments.action == "verify":
+        from cavin_pyro.data.maintenance.verify import verify
+
+        for folder in folders:
+            verify(folder)
+    elif arguments.action == "merge":
+        from cavin_pyro.data.maintenance.merge import merge
+
+        metadata = merge(folders, arguments.to)
+        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
+    else:
+        from cavin_pyro.data.maintenance.export import export
+
+        print(f"{export(folders[0], arguments.to)} episodes in {arguments.to}")
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="python -m cavin_pyro.data", description=main.__doc__)
+    parser.add_argument("--version", action="version", version=f"cavin_pyro {__version__}")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="info|verify|merge|export")
+    for name, how_many, said in (
+        ("info", "+", "pushes, episodes, files, objects, world, and how full the episodes are"),
+        ("verify", "+", "read every file and name each defect in a line; exit status 2 if there is one"),
+        ("merge", "+", "join datasets of one world and of different seeds into a new one"),
+        ("export", 1, "write a dataset in Minari's format; needs the extra .[minari]"),
+    ):
+        action = actions.add_parser(name, help=said, description=said)
+        action.add_argument("folders", nargs=how_many, metavar="DIR", help="dataset folder from collect")
+        if name in ("merge", "export"):
+            where = (
+                "folder for the result" if name == "merge" else "folder for the result, named as Minari wants: NAME-v0"
+            )
+            action.add_argument("--to", type=Path, required=True, metavar="DIR", help=where)
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Export to Minari's format, which agents and libraries for offline reinforcement learning read.
+
+Minari is an optional extra, imported here alone.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cavin_pyro import __version__
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
+from cavin_pyro.data.declaration import ARRAYS
+from cavin_pyro.data.sources import seed_of, source_of_shards, sources_of
+from cavin_pyro.storage.files import output_folder
+from cavin_pyro.storage.progress import progress_bar
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Dict
+    from minari.data_collector import EpisodeBuffer
+
+OBSERVED = ("centers", "clouds", "visible")  # of every state; `mask` is the same in all states of an episode
+TOLD = ("moved", "unsafe", "ineffective", "fallen", "target", "angle")  # of every push, as `infos`
+OBJECTS = ("shape", "scale", "mass", "friction")  # of an episode, among its `options`
+DESCRIPTION = (
+    "Random pushes of objects on a table by a heuristic policy. An observation has the objects' centres in metres, "
+    "their clouds in metres from the centre, whether the camera saw them, and which of the slots hold an object. An "
+    "action is a normalised push. No task is pursued, so every reward is 0."
+)
+
+
+def export(folder: Path, target: Path) -> int:
+    """Write a dataset as `target/data`, where `minari.load_dataset` finds it with `target`'s parent as its root.
+
+    Returns:
+        How many episodes were written.
+
+    Raises:
+        UserError: Minari is not installed, a name that it does not take, no dataset, a corrupt shard, or `target` holds
+            a dataset.
+    """
+    try:
+        import minari
+        from minari.dataset.minari_storage import MinariStorage
+    except ImportError as error:
+        raise UserError(f"export needs Minari ({error}): pip install -c constraints.txt '.[minari]'") from error
+    if not re.fullmatch(r"[\w-]+-v\d+", target.resolve().name):
+        raise UserError(f"--to {target} must end in a name and a version, as Minari wants: --to {target}-v0")
+    read_metadata(folder)
+    with output_folder(target):
+        written, partial = target / "data", target / ".data.partial"
+        if written.exists():
+            raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
+        shutil.rmtree(partial, ignore_errors=True)  # of a killed run
+        try:
+            storage = MinariStorage.new(
+                partial,
+                observation_space=observation_space(),
+                action_space=_box((4,), np.float32, 1.0),
+                data_format="hdf5",
+            )
+            storage.update_metadata(
+                {
+                    "dataset_id": target.resolve().name,
+                    "minari_version": minari.__version__,
+                    "algorithm_name": "heuristic pushing policy",
+                    "description": DESCRIPTION,
+                    "cavin_pyro": {**read_metadata(folder), "exported_by": f"cavin_pyro {__version__}"},
+                }
+            )
+            storage.update_episodes(_episodes(folder))
+            count = storage.total_episodes
+            partial.rename(written)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    return count
+
+
+def observation_space() -> Dict:
+    """What an observation is, M objects and P points each."""
+    from gymnasium import spaces
+
+    flags = spaces.MultiBinary(MAXIMUM_OBJECTS)
+    return spaces.Dict(
+        {
+            "centers": _box((MAXIMUM_OBJECTS, 3), np.float32),
+            "clouds": _box((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float16),
+            "visible": flags,
+            "mask": flags,
+        }
+    )
+
+
+def _box(shape: tuple[int, ...], dtype: Any, limit: float = np.inf) -> Any:
+    from gymnasium.spaces import Box
+
+    return Box(-limit, limit, shape, dtype)
+
+
+def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
+    """The episodes of a dataset without their padding, a shard in memory at a time."""
+    from minari.data_collector import EpisodeBuffer
+
+    metadata = read_metadata(folder)
+    seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
+    names = tuple(name for name in ARRAYS if name != "features")
+    with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
+        for number, arrays in iterate_shards(folder, names):
+            for index in range(len(arrays["length"])):
+                options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}
+                options |= {name: arrays[name][index] for name in OBJECTS}
+                yield EpisodeBuffer(options=options, **_episode({name: one[index] for name, one in arrays.items()}))
+                bar.update()
+
+
+def _episode(arrays: Arrays) -> dict[str, Any]:
+    pushes = int(arrays["length"])
+    ended = np.arange(pushes) == pushes - 1
+    fallen = arrays["fallen"][:pushes]
+    observations = {name: arrays[name][: pushes + 1] for name in OBSERVED}
+    observations |= {"visible": observations["visible"].astype(np.int8)}
+    observations |= {"mask": np.repeat(arrays["mask"][None].astype(np.int8), pushes + 1, axis=0)}
+    return {
+        "observations": observations,
+        "actions": arrays["actions"][:pushes],
+        "rewards": np.zeros(pushes),
+        "terminations": fallen,
+        "truncations": ended & ~fallen,
+        "infos": {name: arrays[name][:pushes] for name in TOLD},
+    }
