@@ -46,6 +46,12 @@ def check_weight(name: str, value: float) -> None:
         raise ValueError(f"{name} must be zero or a positive number, not {value}")
 
 
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise ValueError unless a value is one of the choices, which it names."""
+    if value not in choices:
+        raise ValueError(f"unknown {name} '{value}': choose {' or '.join(choices)}")
+
+
 def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
     """Raise ValueError unless a number lies between 0 and 1; `positive` excludes 0."""
     if not (0 <= value <= 1) or (positive and value == 0):

@@ -9,6 +9,19 @@ from torch import Tensor
 from models.state import State
 
 
+class Evidence(NamedTuple):
+    """What planning as inference says about its own sample of plans (`planner.optimizer=smc`).
+
+    Z is the expected exp(return / temperature) of a plan from the prior. A low effective sample size says that few
+    plans carry all the weight, so neither Z nor the sample can be relied on.
+    """
+
+    log_evidence: Tensor  # [B] float64: the logarithm of the estimate of Z; -inf if every weight was zero
+    temperature: Tensor  # [B] float64: in units of return, after the last segment
+    effective_samples: Tensor  # [B, K] float64: effective sample size after each segment, before resampling
+    particles: Tensor  # [B] int64: the largest possible effective sample size
+
+
 class Plan(NamedTuple):
     """The chosen plan of every environment, and the candidates (for pictures).
 
@@ -30,3 +43,4 @@ class Plan(NamedTuple):
     candidate_centers: Tensor  # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies
     noise: Tensor  # [B, K, D] of the searched codes or pushes, or [B, 0, 0]; see `extensions.warm_start`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
+    evidence: Evidence | None = None  # of the search by return; None for optimizers that do not sample by weights

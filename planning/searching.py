@@ -119,7 +119,7 @@ class SearchingPlanner:
 
 
 def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
-    """The fields of a `Plan` about its search, from `segments` to `candidate_returns`.
+    """The fields of a `Plan` about its search, from `segments` to `evidence`.
 
     candidates: `[B, N]`, evaluated by cumulative reward. best: `[B]` int64, the number of the chosen one.
     """
@@ -132,4 +132,5 @@ def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
         "noise": chosen_noise(candidates.take(best.unsqueeze(-1))),
         "candidate_centers": candidates.centers,
         "candidate_returns": progress.returns,
+        "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,
     }

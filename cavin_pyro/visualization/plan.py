@@ -22,6 +22,7 @@ from cavin_pyro.visualization.table_map import Map, draw_clouds, mark_axes
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
 from envs.sensors.camera import Camera
 from envs.tasks import Task
+from planning import Plan
 
 PANELS = 5  # plans shown, besides the end
 MARGIN = 8  # pixels around the table
@@ -89,7 +90,9 @@ def draw_plan_record(
     """
     view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)
     draw_overlay(panel, record, task, view, scale, reached)
-    panel.set_title(f"after {counted(record.step)}{_error(record, reached)}", fontsize=10)
+    about = evidence_text(record.plan)
+    title = f"after {counted(record.step)}{_error(record, reached)}"
+    panel.set_title("\n".join([title, about] if about else [title]), fontsize=10)
 
 
 def return_scale(returns: NDArray[np.float32]) -> Normalize | None:
@@ -106,6 +109,15 @@ def draw_return_scale(figure: Figure, scale: Normalize, **place: Any) -> None:
     bar = figure.colorbar(ScalarMappable(scale, RETURNS), **place)
     bar.set_label("return of a candidate", fontsize=9)
     bar.ax.tick_params(labelsize=8)
+
+
+def evidence_text(plan: Plan) -> str:
+    """What planning as inference found, in one line; "" for a plan without it."""
+    if plan.evidence is None:
+        return ""
+    log_z, temperature, sizes, particles = (field[0] for field in plan.evidence)
+    fewest = f"{sizes.min():.0f} of {particles} effective"
+    return f"log Z {log_z:.2f} at temperature {temperature:.3g}, {fewest}"
 
 
 def _error(record: PlanRecord, reached: NDArray[np.float32] | None) -> str:

@@ -23,7 +23,7 @@ from cavin_pyro.visualization.overlay import (
     subgoal_chains,
 )
 from cavin_pyro.visualization.panel import RETURNS
-from cavin_pyro.visualization.plan import return_scale
+from cavin_pyro.visualization.plan import evidence_text, return_scale
 from envs.tasks import Task
 
 CANDIDATES = 1000  # points per plan
@@ -74,7 +74,9 @@ def log_plan(stream: rr.RecordingStream, record: PlanRecord, task: Task) -> None
     stream.log("world/plan/pushes", arrows)
     expected = float(record.plan.expected_return[0])
     expectation = "" if np.isnan(expected) else f", expected return {expected:.0f}"
-    stream.log("log", rr.TextLog(f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}"))
+    about = f", {evidence_text(record.plan)}" if record.plan.evidence is not None else ""
+    line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{about}"
+    stream.log("log", rr.TextLog(line))
 
 
 def log_reached(stream: rr.RecordingStream, record: PlanRecord, reached: NDArray[np.float32]) -> None:

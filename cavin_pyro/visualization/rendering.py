@@ -11,12 +11,13 @@ from typing import Any
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
-from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback
+from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
 from cavin_pyro.visualization.progress import EpisodeProgress
 from cavin_pyro.visualization.video import EpisodeVideo
 
+EVIDENCE_COLUMNS = ("log_z", "temperature", "effective_samples")
 VIEWERS = {"rerun": "rerun"}  # the choices of `viewer=`, and the module that it needs
 
 
@@ -70,13 +71,17 @@ def episode_files(*, video: bool, viewer: str | None = None) -> list[str]:
 
 
 def write_steps(path: Path, episode: Episode) -> None:
-    """One line per push: action, reward, what it did, and the planning time before a plan's first push."""
-    planned = {record.step: record.milliseconds for record in episode.plan_records}
+    """One line per push: action, reward, what it did, and before a plan's first push the planning time.
+
+    A plan by inference (`planner.optimizer=smc`) also has its estimate of log Z, its temperature, and the fewest
+    effective samples after any segment; see `planning.plan.Evidence`.
+    """
+    planned = {record.step: record for record in episode.plan_records}
     with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(
             ["step", "x", "y", "dx", "dy", "reward", "success", "violation", "fall", "unsafe", "ineffective"]
-            + ["subgoal_distance_m", "planning_ms"]
+            + ["subgoal_distance_m", "planning_ms", *EVIDENCE_COLUMNS]
         )
         for transition in episode.transitions:
             flags = (
@@ -91,7 +96,8 @@ def write_steps(path: Path, episode: Episode) -> None:
                 if transition.subgoal_distance != transition.subgoal_distance
                 else f"{transition.subgoal_distance:.4f}"
             )
-            took = planned.get(transition.step - 1)
+            record = planned.get(transition.step - 1)
+            took = "" if record is None else f"{record.milliseconds:.1f}"
             writer.writerow(
                 [
                     transition.step,
@@ -99,5 +105,14 @@ def write_steps(path: Path, episode: Episode) -> None:
                     transition.reward,
                     *(int(flag) for flag in flags),
                 ]
-                + [distance, "" if took is None else f"{took:.1f}"]
+                + [distance, took, *_evidence(record)]
             )
+
+
+def _evidence(record: PlanRecord | None) -> list[str]:
+    """The numbers of `EVIDENCE_COLUMNS`, empty for a plan without them."""
+    if record is None or record.plan.evidence is None:
+        return [""] * len(EVIDENCE_COLUMNS)
+    found = record.plan.evidence
+    fewest = found.effective_samples[0].min()
+    return [f"{found.log_evidence[0]:.4f}", f"{found.temperature[0]:.4g}", f"{fewest:.1f}"]

@@ -7,6 +7,7 @@ from planning.optimizers.cross_entropy import CrossEntropy
 from planning.optimizers.evolution import Evolution
 from planning.optimizers.improved_cross_entropy import ImprovedCrossEntropy
 from planning.optimizers.path_integral import PathIntegral
+from planning.optimizers.proposals import LastPlan, NoiseProposal, Value
 from planning.optimizers.protocol import Optimizer, search
 from planning.optimizers.registry import OPTIMIZERS, make_optimizer
 from planning.optimizers.sequential_monte_carlo import SequentialMonteCarlo
@@ -17,10 +18,13 @@ __all__ = [
     "CrossEntropy",
     "Evolution",
     "ImprovedCrossEntropy",
+    "LastPlan",
+    "NoiseProposal",
     "Optimizer",
     "PathIntegral",
     "SequentialMonteCarlo",
     "Shooting",
+    "Value",
     "make_optimizer",
     "search",
 ]

@@ -2,7 +2,8 @@
 
 Plans are sampled from p(plan) exp(return / temperature): the learned prior, weighted by their returns (Levine
 2018; Piche et al., ICLR 2019). Resampling and moves as in Del Moral, Doucet and Jasra (2006), moves that leave the
-prior invariant as in Cotter et al. (2013), "preconditioned Crank-Nicolson".
+prior invariant as in Cotter et al. (2013), "preconditioned Crank-Nicolson"; values as in twisted particle filters
+(Whiteley and Lee 2014).
 """
 
 from __future__ import annotations
@@ -14,29 +15,53 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning.inputs import check_fraction, check_positive
-from planning.optimizers.weights import adapt_temperature
+from planning.inputs import OptimizerError, check_choice, check_fraction, check_positive
+from planning.optimizers.proposals import PROPOSALS, NoiseProposal, Value, propose
+from planning.optimizers.weights import adapt_temperature, effective_sample_size, log_mean
+from planning.plan import Evidence
 from planning.rollouts.candidates import Candidates, SearchProblem, join
 from planning.rollouts.sampling import noise_each, uniform_each
+
+SCHEDULES = ("constant", "linear")
 
 
 @dataclass(frozen=True)
 class SequentialMonteCarlo:
     """Extends, weights, resamples and moves particles, a segment at a time.
 
-    effective_sample_size: the temperature after a segment is the lowest at which the weights' effective sample size is
-    this fraction of the particles that have not failed. moves: of every particle after every segment. block:
-    last segments that a move changes. step: of a move, in (0, 1]; 1 samples independently of the current value.
+    After segment k of K the particles stand for p(codes) exp((return so far + value) / temperature_k). A segment's
+    weight is the ratio of this to the one before, times prior / proposal. Z is the normalising constant after segment
+    K: the prior's expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight
+    since the last resampling, is in the plan's `evidence`.
+
+    With a `temperature` the estimate of Z is unbiased for any number of particles, any proposal and any value. Without
+    one, every temperature is chosen by the weights that it gives. The estimate is then biased, its Z is of that
+    temperature, and failed particles count as impossible while others have not failed.
+
+    effective_sample_size: without a `temperature`, the one after a segment is the lowest at which the weights'
+    effective sample size is this fraction of the particles that have not failed. moves: of every particle after every
+    segment. block: last segments that a move changes. step: of a move, in (0, 1]; 1 samples independently of the
+    current value. temperature: in units of return; None adapts it. schedule: with a `temperature`, `constant` has it
+    after every segment, `linear` has K / k times as much after segment k. resample_below: resample if the effective
+    sample size is at most this fraction of the particles, and after the last segment; 1 resamples after every segment.
+    proposal: of codes, `prior`, `last_plan` or a `NoiseProposal`. value: a `Value` of states that leads particles
+    before the last segment; None has none.
 
     Extending n particles over K segments and moving their last ones costs as much as N samples of shooting.
 
-    Raises ValueError for a block below 1, fewer than 0 moves and fractions outside of their range.
+    Raises ValueError for a block below 1, fewer than 0 moves, a temperature that is not positive, fractions outside of
+    their range, unknown names, and a schedule without a temperature.
     """
 
     effective_sample_size: float = 0.3
     moves: int = 1
     block: int = 2
     step: float = 0.4
+    temperature: float | None = None
+    schedule: str = "constant"
+    resample_below: float = 1.0
+    proposal: str | NoiseProposal = "prior"
+    value: Value | None = None
 
     def __post_init__(self) -> None:
         check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
@@ -44,6 +69,18 @@ class SequentialMonteCarlo:
             raise ValueError(f"moves must be at least 0, not {self.moves}")
         check_positive("block", self.block)
         check_fraction("step", self.step, positive=True)
+        if self.temperature is not None and not (math.isfinite(self.temperature) and self.temperature > 0):
+            raise ValueError(f"temperature must be a positive number or null, not {self.temperature}")
+        check_choice("schedule", self.schedule, SCHEDULES)
+        if self.temperature is None and self.schedule != "constant":
+            raise ValueError(f"schedule={self.schedule} needs a temperature: without one, it adapts")
+        check_fraction("resample_below", self.resample_below, positive=True)
+        if isinstance(self.proposal, str):
+            check_choice("proposal", self.proposal, list(PROPOSALS))
+        elif isinstance(self.proposal, type) or not isinstance(self.proposal, NoiseProposal):
+            raise ValueError(f"proposal must be {', '.join(PROPOSALS)} or a NoiseProposal, not {self.proposal!r}")
+        if self.value is not None and (isinstance(self.value, type) or not callable(self.value)):
+            raise ValueError(f"value must be a Value or null, not {self.value!r}")
 
     def particles(self, samples: int, segments: int) -> int:
         """n, for which extending and moving costs at most N = `samples` whole plans; at least 1."""
@@ -53,20 +90,41 @@ class SequentialMonteCarlo:
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; at most N = `samples` candidates are whole."""
         count = self.particles(samples, problem.segments)
+        proposal = PROPOSALS[self.proposal] if isinstance(self.proposal, str) else self.proposal
         particles = problem.begin(count)
-        tempered = torch.zeros_like(particles.returns).double()  # log weights of the last resampling
+        tempered = torch.zeros_like(particles.returns).double()  # log density over the prior's, after moves
+        weights = torch.zeros_like(tempered)  # logarithms, since the last resampling; their mean weight is 1
+        evidence, sizes = torch.zeros_like(tempered[:, 0]), []
         for number in range(1, problem.segments + 1):
-            particles = particles.extend(noise_each((count, problem.dimension), problem.generators))
-            returns = active_returns(particles)
-            inverse, logarithms = adapt_temperature(returns, self.effective_sample_size, before=tempered)
+            noise, ratios = propose(proposal, particles)
+            particles = particles.extend(noise)
+            scores, before = self._scores(particles), tempered - ratios - weights
+            inverse, relative = self._tempered(scores, before, number / problem.segments)
+            logarithms = inverse.unsqueeze(-1) * scores.double() - before
+            factor = log_mean(logarithms)
+            evidence = evidence + factor
+            sizes.append(effective_sample_size(logarithms))
             if number == problem.segments:
                 problem.consider(particles)
-            particles = particles.take(_resample(logarithms, problem.generators))
+            always = self.resample_below == 1 or number == problem.segments
+            due = (sizes[-1] <= self.resample_below * count) | always
+            particles = particles.take(_resample(relative, problem.generators, due))
+            kept = ~due & torch.isfinite(factor)
+            weights = torch.where(kept.unsqueeze(-1), logarithms - factor.unsqueeze(-1), 0.0)
             for _ in range(self.moves):
                 particles, proposed = self._move(particles, inverse)
                 if number == problem.segments:
                     problem.consider(proposed)
-            tempered = inverse.unsqueeze(-1) * active_returns(particles).nan_to_num(neginf=0.0)
+            tempered = inverse.unsqueeze(-1) * self._scores(particles).nan_to_num(neginf=0.0)
+        possible = torch.full_like(evidence, count, dtype=torch.int64)
+        problem.evidence.append(Evidence(evidence, 1.0 / inverse, torch.stack(sizes, -1), possible))
+
+    def _tempered(self, scores: Tensor, before: Tensor, part: float) -> tuple[Tensor, Tensor]:
+        """Inverse temperatures `[B]` after this part of the segments, and log weights `[B, n]` up to a constant."""
+        if self.temperature is None:
+            return adapt_temperature(scores, self.effective_sample_size, before=before)
+        inverse = (1.0 if self.schedule == "constant" else part) / self.temperature
+        return torch.full_like(before[:, 0], inverse), inverse * scores.double() - before
 
     def _move(self, particles: Candidates, inverse: Tensor) -> tuple[Candidates, Candidates]:
         """One Metropolis step of every particle, and the proposals; `inverse: [B]` temperatures."""
@@ -79,12 +137,24 @@ class SequentialMonteCarlo:
         proposed = particles.back(length)
         for segment in noise.unbind(2):
             proposed = proposed.extend(segment)
-        gain = inverse.unsqueeze(-1) * (active_returns(proposed) - active_returns(particles))  # NaN: both failed
+        gain = inverse.unsqueeze(-1) * (self._scores(proposed) - self._scores(particles))  # NaN: both failed
         chance = uniform_each((particles.count,), problem.generators)
         accepted = chance.log() < gain
         own = torch.arange(particles.count, device=inverse.device)
         numbers = torch.where(accepted, own + particles.count, own.expand_as(accepted))
         return join([particles, proposed]).take(numbers), proposed
+
+    def _scores(self, candidates: Candidates) -> Tensor:
+        """Return so far and value `[B, n]`; -inf for candidates of weight zero."""
+        returns = active_returns(candidates) if self.temperature is None else candidates.returns
+        number = len(candidates.segments)
+        if self.value is None or number == candidates.problem.segments:
+            return returns
+        active = candidates.score_state.active
+        value = torch.where(active, self.value(number, candidates.plans), 0.0)
+        if value.shape != returns.shape or not torch.isfinite(value).all():
+            raise OptimizerError(f"a value must be finite, of shape [B, n] = {list(returns.shape)}")
+        return returns + value
 
 
 def active_returns(candidates: Candidates) -> Tensor:
@@ -94,12 +164,12 @@ def active_returns(candidates: Candidates) -> Tensor:
     return torch.where(valid | ~valid.any(-1, keepdim=True), candidates.returns, -torch.inf)
 
 
-def _resample(logarithms: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-    """Ancestors' numbers `[B, n]` by systematic resampling; without finite weights every candidate stays."""
+def _resample(logarithms: Tensor, generators: Sequence[torch.Generator], due: Tensor) -> Tensor:
+    """Ancestors' numbers `[B, n]` by systematic resampling where it is `due: [B]` and a weight is not zero."""
     count = logarithms.shape[-1]
     weights = torch.softmax(logarithms, -1)
     offsets = uniform_each((1,), generators)
     places = (torch.arange(count, device=weights.device) + offsets.double()) / count
     numbers = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)
-    infinite = ~torch.isfinite(weights).all(-1, keepdim=True)
-    return torch.where(infinite, torch.arange(count, device=weights.device), numbers)
+    stay = ~(due.unsqueeze(-1) & torch.isfinite(weights).all(-1, keepdim=True))
+    return torch.where(stay, torch.arange(count, device=weights.device), numbers)

@@ -43,6 +43,11 @@ def effective_sample_size(log_weights: Tensor) -> Tensor:
     return (1.0 / weights.square().sum(-1)).nan_to_num(0.0, posinf=0.0)
 
 
+def log_mean(log_weights: Tensor) -> Tensor:
+    """The logarithm of the mean weight: `[..., n] -> [...]`; -inf if all are zero."""
+    return log_weights.logsumexp(-1) - math.log(log_weights.shape[-1])
+
+
 def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The lowest temperature at which the weights keep `fraction` of the effective sample size, and the log weights.
 

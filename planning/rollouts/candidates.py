@@ -14,6 +14,7 @@ from models.state import State
 from planning import records
 from planning.backends.eager import Backend, eager
 from planning.inputs import OptimizerError
+from planning.plan import Evidence
 from planning.rollouts.extend import extend_segment
 from planning.rollouts.sampling import noise_each, uniform_each
 from planning.rollouts.segment import Objective, SearchSpace, SegmentRecord, SegmentRollout, actions_of
@@ -38,6 +39,7 @@ class SearchProblem:
     best_only: bool = False  # the caller reads only the best candidate
     backend: Backend = eager  # runs the extension of reparameterised candidates
     considered: list[Candidates] = field(default_factory=list, init=False, compare=False)  # whole candidates
+    evidence: list[Evidence] = field(default_factory=list, init=False, compare=False)  # of optimizers that estimate it
 
     def __call__(self, noise: Tensor) -> Tensor:
         """The returns `[B, n]` of the candidates that standard normal `noise: [B, n, K, D]` determines.

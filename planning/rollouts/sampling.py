@@ -25,7 +25,7 @@ def sample_each(
     """
     return torch.stack(
         [
-            _sample(prior(*(_scene(condition, index) for condition in conditions)), generator)
+            sample(prior(*(_scene(condition, index) for condition in conditions)), generator)
             for index, generator in enumerate(generators)
         ]
     )
@@ -101,7 +101,8 @@ def _is_reparameterizable(prior: Distribution) -> bool:
     return isinstance(prior, Normal)
 
 
-def _sample(prior: Distribution, generator: torch.Generator) -> Tensor:
+def sample(prior: Distribution, generator: torch.Generator) -> Tensor:
+    """One sample `[..., D]` for every element of the batch, from this generator alone."""
     if _is_reparameterizable(prior):
         shape = prior.batch_shape + prior.event_shape
         return reparameterize(prior, torch.randn(shape, generator=generator, device=generator.device))

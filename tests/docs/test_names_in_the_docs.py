@@ -10,6 +10,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import compose
+from planning.optimizers import OPTIMIZERS
 from tests.docs.pages import PAGES, ROOT, code_in_prose, links, name
 from tests.test_repository import PACKAGES
 
@@ -34,9 +35,10 @@ def keys(config: DictConfig, prefix: str = "") -> set[str]:
 
 @pytest.fixture(scope="module")
 def options() -> set[str]:
-    """Every option of any command, with any planner and any model."""
+    """Every option of any command, with any planner, any optimizer and any model."""
     found = set().union(*(keys(compose(command)) for command in COMMANDS))
     found |= set().union(*(keys(compose("plan", f"planner={planner}")) for planner in PLANNERS))
+    found |= set().union(*(keys(compose("plan", f"planner.optimizer={optimizer}")) for optimizer in OPTIMIZERS))
     found |= keys(compose("train", "model=single_latent", "guide=single_latent", "objective=iwae"))
     return found | GROUPS
 

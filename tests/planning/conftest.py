@@ -196,6 +196,13 @@ def scenes(positions: Sequence[Sequence[tuple[float, float]]], gains: Sequence[f
     return State(centers, features, torch.ones(planar.shape[:-1], dtype=torch.bool))
 
 
+def tensors(record: Any) -> list[Tensor]:
+    """All tensors of a plan or another record of records, in order."""
+    if isinstance(record, tuple):
+        return [tensor for part in record for tensor in tensors(part)]
+    return [] if record is None else [record]
+
+
 def generators(*seeds: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in seeds]
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from cavin_pyro.visualization.overlay import (
     tile_corners,
 )
 from cavin_pyro.visualization.plan import FAILURE_COLOR, SUCCESS_COLOR, draw_plan
+from cavin_pyro.visualization.rendering import write_steps
 from cavin_pyro.visualization.table_map import Map
 from cavin_pyro.visualization.training import draw_reconstructions, draw_training
 from envs.layouts import load_task
@@ -37,6 +39,7 @@ from envs.workspace import normalised_push, tile_center
 from models.networks.pointnet import PointNetAutoencoder
 from models.state import State
 from planning import Plan, RandomPlanner
+from planning.plan import Evidence
 
 CAMERA = Camera().resized(512, 424)
 OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5
@@ -101,6 +104,31 @@ def test_a_plans_figure_shows_subgoals_and_predictions(task: str, tmp_path: Path
     assert (image[0, 0, :3] == 255).all()
     assert pixels_like(image, SUBGOAL_COLOR) > 100
     assert pixels_like(image, PREDICTION_COLOR) > 10
+
+
+def with_evidence() -> Plan:
+    """A plan by inference, after which 7.5 of 100 particles are effective."""
+    numbers = torch.tensor([-1.234]), torch.tensor([10.0]), torch.tensor([[60.0, 7.5, 30.0, 90.0]])
+    return made_up_plan()._replace(evidence=Evidence(*(number.double() for number in numbers), torch.tensor([100])))
+
+
+def test_a_plan_by_inference_tells_its_evidence_in_its_title_and_in_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(figures_plan, "save_figure", lambda path, figure: drawn.append(figure))
+    run = Episode(7, "timeout", [record(with_evidence()), record(made_up_plan(), step=2)])
+    run.transitions += [push(number) for number in (1, 2, 3)]
+    draw_plan(tmp_path / "plan.png", run, load_task("insertion", 0), CAMERA)
+    titles = [panel.get_title() for panel in drawn[0].axes if panel.get_title()]
+    assert titles[0].endswith("\nlog Z -1.23 at temperature 10, 8 of 100 effective")
+    assert "log Z" not in titles[1]
+    write_steps(tmp_path / "steps.csv", run)
+    rows = list(csv.DictReader((tmp_path / "steps.csv").read_text().splitlines()))
+    assert [row["log_z"] for row in rows] == ["-1.2340", "", ""]
+    assert [row["temperature"] for row in rows] == ["10", "", ""]
+    assert [row["effective_samples"] for row in rows] == ["7.5", "", ""]
+    assert [bool(row["planning_ms"]) for row in rows] == [True, False, True]
 
 
 def test_a_plan_that_predicts_nothing_is_drawn_without_subgoals_and_predictions(tmp_path: Path) -> None:

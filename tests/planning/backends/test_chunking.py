@@ -8,18 +8,17 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from models.state import State
-from planning import CvaeMpcPlanner, Plan, Planner
+from planning import CvaeMpcPlanner, Planner
 from planning.backends import chunking
+from tests.planning.conftest import tensors
 
 MAKERS: dict[str, Callable[[SimpleNamespace], Planner]] = {
     "cavin": lambda toy: toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.4, 0.0)), samples=32, horizon=9),
+    "inference": lambda toy: toy.plain(
+        toy.PointMass(), toy.GoalDisc(goal=(0.4, 0.0)), samples=32, horizon=9, optimizer="smc"
+    ),
     "cvae_mpc": lambda toy: CvaeMpcPlanner(toy.Flat(), toy.GoalDisc(goal=(0.4, 0.0)), samples=32, horizon=9),
 }
-
-
-def tensors(plan: Plan) -> list[torch.Tensor]:
-    return [tensor for field in plan for tensor in (field if isinstance(field, State) else (field,))]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5])

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from models.state import State
-from planning import CvaeMpcPlanner, PerturbedRollouts, Plan
+from planning import CvaeMpcPlanner, PerturbedRollouts
 from planning.backends import chunking
 from planning.backends.compiled import Compiled
 from planning.backends.eager import eager
 from planning.inputs import NoFiniteCandidateError
 from tests.compiler import needs_a_compiler
+from tests.planning.conftest import tensors
 
 
 class Pair(NamedTuple):
@@ -35,10 +35,6 @@ def rounded_product(layer: torch.nn.Linear, numbers: Tensor) -> Tensor:
 
 def branching(numbers: Tensor) -> Tensor:
     return numbers if bool(numbers.any()) else -numbers
-
-
-def tensors(plan: Plan) -> list[Tensor]:
-    return [tensor for field in plan for tensor in (field if isinstance(field, State) else (field,))]
 
 
 @needs_a_compiler
