@@ -45,7 +45,8 @@ class SequentialMonteCarlo:
     after every segment, `linear` has K / k times as much after segment k. resample_below: resample if the effective
     sample size is at most this fraction of the particles, and after the last segment; 1 resamples after every segment.
     proposal: of codes, `prior`, `last_plan` or a `NoiseProposal`. value: a `Value` of states that leads particles
-    before the last segment; None has none.
+    before the last segment; None has none. keep_last_plan: the planner also chooses from the warm start's plans, as
+    with `shooting`; they are no particles, so the estimate does not count them, but they take their share of samples.
 
     Extending n particles over K segments and moving their last ones costs as much as N samples of shooting.
 
@@ -62,6 +63,7 @@ class SequentialMonteCarlo:
     resample_below: float = 1.0
     proposal: str | NoiseProposal = "prior"
     value: Value | None = None
+    keep_last_plan: bool = False
 
     def __post_init__(self) -> None:
         check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
@@ -89,7 +91,10 @@ class SequentialMonteCarlo:
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; at most N = `samples` candidates are whole."""
-        count = self.particles(samples, problem.segments)
+        known = (
+            problem.warm_start[:, : samples // 2] if self.keep_last_plan and problem.warm_start is not None else None
+        )
+        count = self.particles(samples - (0 if known is None else known.shape[1]), problem.segments)
         proposal = PROPOSALS[self.proposal] if isinstance(self.proposal, str) else self.proposal
         particles = problem.begin(count)
         tempered = torch.zeros_like(particles.returns).double()  # log density over the prior's, after moves
@@ -116,6 +121,8 @@ class SequentialMonteCarlo:
                 if number == problem.segments:
                     problem.consider(proposed)
             tempered = inverse.unsqueeze(-1) * self._scores(particles).nan_to_num(neginf=0.0)
+        if known is not None:
+            problem.evaluate(known)  # last, so that a new plan wins among equals
         possible = torch.full_like(evidence, count, dtype=torch.int64)
         problem.evidence.append(Evidence(evidence, 1.0 / inverse, torch.stack(sizes, -1), possible))
 

@@ -55,3 +55,11 @@ def test_conditioned_codes_and_intervened_actions_are_read_by_what_follows(value
         each["next_centers"] if isinstance(each, dict) else each for each in (values["posterior"], values["outcome"])
     ]
     assert not torch.allclose(first[0].mean(0), first[1].mean(0), atol=1e-3)
+
+
+def test_importance_and_our_planner_agree_on_the_evidence_of_plans(values: dict[str, Any]) -> None:
+    theirs, ours = float(values["pyro_log_z"]), values["evidence"]
+    error = (500 / float(values["inferred"].get_ESS()) - 1) ** 0.5 / 500**0.5  # of Z, relative
+    assert error < 0.1
+    assert abs(theirs - float(ours.log_evidence)) < 4 * error + 0.1
+    assert ours.temperature.tolist() == [100.0] and ours.effective_samples.shape == (1, 3)

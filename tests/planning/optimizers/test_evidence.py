@@ -331,6 +331,18 @@ def test_proposals_and_values_of_wrong_shapes_are_refused_in_one_line(toy: Simpl
         )
 
 
+def test_the_last_plan_is_kept_beside_the_particles_and_leaves_the_estimate_alone(toy: SimpleNamespace) -> None:
+    known = warm_start(2)
+    kept, without = (problem_of(toy, runs=2, warm_start=known) for _ in range(2))
+    found = search(SequentialMonteCarlo(temperature=1.0, keep_last_plan=True), kept, SAMPLES + 4)
+    assert torch.equal(found.noise[:, -4:], known)
+    assert found.count == search(SequentialMonteCarlo(temperature=1.0), without, SAMPLES).count + 4
+    for ours, theirs in zip(kept.evidence[0], without.evidence[0], strict=True):
+        assert torch.equal(ours, theirs)
+    few = problem_of(toy, runs=2, warm_start=known)
+    assert search(SequentialMonteCarlo(moves=0, keep_last_plan=True), few, 4).count == 4  # 2 particles, 2 kept
+
+
 def test_without_a_warm_start_the_last_plans_proposal_is_the_prior(toy: SimpleNamespace) -> None:
     problem = problem_of(toy, runs=2)
     with_prior, without = (
