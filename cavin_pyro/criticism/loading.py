@@ -104,7 +104,8 @@ def _load(config: DictConfig, name: str) -> Loaded:
     folders = data_folders(config.data)
     for folder in folders:
         compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
-    table = load_windows(folders, geometry, windows, segment_length=segment_length, seed=split)
+    storage = Path(config.output) if Path(config.output).is_dir() else None
+    table = load_windows(folders, geometry, windows, segment_length=segment_length, seed=split, storage=storage)
     return Loaded(path, checkpoint, model, guide, geometry, table, folders)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,17 +18,20 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, check_distinct, iterate_shards, read_metadata
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
+from cavin_pyro.data.mapped import MappedArray
 from cavin_pyro.storage.progress import progress_bar
 from models.networks.geometry import Geometry
 from models.state import State, Window
 
 SEGMENT_LENGTH = 3  # T
+NEEDED = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")  # arrays of a shard
 
 
 class WindowTable:
     """All states and pushes of a dataset, and where its windows start.
 
-    Batches gather windows on demand, so overlapping windows share their memory.
+    Batches gather windows on demand, so overlapping windows share their memory. States and pushes may be memory maps of
+    a file (`load_windows`); about 35 bytes for each window are held in memory.
 
     Attributes:
         training, validation: numbers of windows, for `batch`. episodes: the episode that each window is from.
@@ -43,8 +48,9 @@ class WindowTable:
         self.episodes = torch.empty(0, dtype=torch.int64)
         self.training = torch.empty(0, dtype=torch.int64)
         self.validation = torch.empty(0, dtype=torch.int64)
-        # Objects up to the last real one, at each position.
-        self._objects = (states.mask * torch.arange(1, states.objects + 1)).amax(-1)
+        # Objects up to the last real one, at each position; piece by piece, since the states may be larger than memory.
+        slots = torch.arange(1, states.objects + 1, dtype=torch.uint8)
+        self._objects = torch.cat([(part * slots).amax(-1) for part in states.mask.split(2**16)])
 
     @cached_property
     def _by_object_count(self) -> dict[int, Tensor]:
@@ -84,17 +90,19 @@ def load_windows(
     segment_length: int = SEGMENT_LENGTH,
     seed: int = 0,
     skip_corrupt: bool = False,
+    storage: Path | None = None,
 ) -> WindowTable:
     """Read one or more datasets, compute missing features, and find the windows.
 
     Args:
         segment_length: T. seed: of the split into training and validation.
+        storage: folder for a temporary file with all states, which need not fit in memory; by default the system's.
 
     Raises:
         UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
     """
     config = config or WindowConfig()
-    fingerprint, shards = geometry_fingerprint(geometry), []
+    fingerprint = geometry_fingerprint(geometry)
     lengths = {folder: read_metadata(folder)["configuration"]["steps"] for folder in folders}
     if len(set(lengths.values())) > 1:
         raise UserError(
@@ -102,73 +110,115 @@ def load_windows(
             + ", ".join(f"{folder} has steps={steps}" for folder, steps in lengths.items())
         )
     check_distinct(folders)
-    names: tuple[str, ...] = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")
     total = sum(read_metadata(folder)["shards"] for folder in folders)
     held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
-    with progress_bar("reading", total=total, unit="file") as bar:
+    where = " and ".join(map(str, folders))
+    with (
+        closing(_Finder(config, segment_length, seed, where, storage)) as found,
+        progress_bar("reading", total=total, unit="file") as bar,
+    ):
         for folder, held_out in zip(folders, held_out_of, strict=True):
-            needed, known = (*names, *held_out.required_arrays), EpisodeNumbers(folder)
+            needed, known = (*NEEDED, *held_out.required_arrays), EpisodeNumbers(folder)
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
                 known.add(number, arrays["episode"])
                 arrays["features"] = shard_features(folder, number, geometry, fingerprint)
-                shards.append(held_out.filter_episodes(arrays))
+                found.add(held_out.filter_episodes(arrays))
                 bar.update()
-    where = " and ".join(str(folder) for folder in folders)
-    try:
-        episodes = {name: np.concatenate([arrays[name] for arrays in shards]) for name in (*names, "features")}
-    except ValueError as error:
-        raise UserError(f"{where}: files with different numbers of objects cannot be joined ({error})") from error
-    return _find_windows(episodes, config, segment_length, seed, where)
+        return found.table()
 
 
-def _find_windows(episodes: Arrays, config: WindowConfig, segment_length: int, seed: int, folder: str) -> WindowTable:
-    positions = episodes["visible"].shape[1]
-    if segment_length >= positions:
-        raise UserError(
-            f"dataset {folder} has {positions - 1} pushes per episode, too few for windows of "
-            f"T={segment_length}: collect with steps of at least that many"
-        )
-    mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
-    visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
-    counts = _transitions_that_count(episodes, visible, config.maximum_step)
+class _Finder:
+    """Finds the windows in one shard after another, and holds no more of them than where they start."""
 
-    T = segment_length
-    first, last = slice(0, positions - T), slice(T, None)
-    moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(axis=-1)
-    flawed = episodes["unsafe"] | episodes["fallen"]
-    safe = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
-    informative = safe & visible[:, first] & visible[:, last]
-    informative &= (moved > config.minimum_move) & (moved < config.maximum_move)
-    exists = np.arange(positions - T)[None] + T <= length[:, None]
+    def __init__(
+        self, config: WindowConfig, segment_length: int, seed: int, where: str, storage: Path | None = None
+    ) -> None:
+        self._config, self._length, self._seed, self._where = config, segment_length, seed, where
+        self._turns = np.random.default_rng(seed)
+        self._positions = {name: MappedArray(storage) for name in ("centers", "features", "mask", "actions", "counts")}
+        self._windows: dict[str, list[NDArray[Any]]] = {"start": [], "counts": [], "episode": [], "validation": []}
+        self._episodes = 0
 
-    # The split depends on the episode's number alone, so more data does not change it.
-    shares = np.array([np.random.default_rng([seed, int(number)]).random() for number in episodes["episode"]])
-    validation = np.broadcast_to((shares < config.validation_fraction)[:, None], exists.shape)
-    turn = np.random.default_rng(seed).random(exists.shape)
-    chosen = exists & (informative | (turn < config.negative_fraction))
+    def add(self, episodes: Arrays) -> None:
+        """Add the episodes of a shard.
 
-    flat = {name: torch.from_numpy(episodes[name]).flatten(0, 1) for name in ("centers", "features")}
-    padded = np.pad(episodes["actions"], ((0, 0), (0, 1), (0, 0)))
-    states = State(flat["centers"], flat["features"], torch.from_numpy(np.repeat(mask, positions, axis=0)))
-    table = WindowTable(
-        states,
-        torch.from_numpy(padded).flatten(0, 1),
-        torch.from_numpy(np.pad(counts, ((0, 0), (0, 1)))).flatten(),
-        segment_length,
-    )
-    episode, start = np.nonzero(chosen)
-    table.starts = torch.from_numpy(episode * positions + start)
-    table.sequence_mask = torch.from_numpy(informative[chosen])
-    table.episodes = torch.from_numpy(episode)
-    table.training = torch.from_numpy(np.flatnonzero(~validation[chosen]))
-    table.validation = torch.from_numpy(np.flatnonzero(validation[chosen]))
-    for name in ("training", "validation"):
-        if not table.sequence_mask[getattr(table, name)].any():
+        Raises:
+            UserError: they are too short, or not shaped as earlier ones.
+        """
+        T, config, positions = self._length, self._config, episodes["visible"].shape[1]
+        if positions <= T:
             raise UserError(
-                f"dataset {folder} has no {name} window in which an object moved more than "
-                f"{config.minimum_move:g} m: collect more transitions"
+                f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
+                f"T={T}: collect with steps of at least that many"
             )
-    return table
+        mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
+        visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
+        counts = _transitions_that_count(episodes, visible, config.maximum_step)
+
+        first, last = slice(0, positions - T), slice(T, None)
+        moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(axis=-1)
+        flawed = episodes["unsafe"] | episodes["fallen"]
+        safe = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
+        informative = safe & visible[:, first] & visible[:, last]
+        informative &= (moved > config.minimum_move) & (moved < config.maximum_move)
+        exists = np.arange(positions - T)[None] + T <= length[:, None]
+
+        # The split depends on the episode's number alone, so more data does not change it.
+        shares = np.array([np.random.default_rng([self._seed, int(number)]).random() for number in episodes["episode"]])
+        validation = np.broadcast_to((shares < config.validation_fraction)[:, None], exists.shape)
+        chosen = exists & (informative | (self._turns.random(exists.shape) < config.negative_fraction))
+
+        episode, start = np.nonzero(chosen)
+        episode += self._episodes
+        found = {"start": episode * positions + start, "counts": informative[chosen]}
+        for name, values in {**found, "episode": episode, "validation": validation[chosen]}.items():
+            self._windows[name].append(values)
+        self._episodes += len(mask)
+        self._store(
+            centers=centers,
+            features=episodes["features"],
+            mask=np.repeat(mask[:, None], positions, axis=1),
+            actions=np.pad(episodes["actions"], ((0, 0), (0, 1), (0, 0))),
+            counts=np.pad(counts, ((0, 0), (0, 1))),
+        )
+
+    def _store(self, **arrays: NDArray[Any]) -> None:
+        """Append arrays [E, S+1, ...]: positions in time, episode after episode."""
+        try:
+            for name, array in arrays.items():
+                self._positions[name].append(array.reshape(-1, *array.shape[2:]))
+        except ValueError as error:
+            raise UserError(
+                f"{self._where}: files with different numbers of objects cannot be joined ({error})"
+            ) from error
+
+    def close(self) -> None:
+        """Close the temporary files; the table keeps what it maps."""
+        for array in self._positions.values():
+            array.close()
+
+    def table(self) -> WindowTable:
+        """All windows that were found.
+
+        Raises:
+            UserError: there is none to train on, or none to validate with.
+        """
+        stored = {name: array.tensor() for name, array in self._positions.items()}
+        states = State(stored["centers"], stored["features"], stored["mask"])
+        table = WindowTable(states, stored["actions"], stored["counts"], self._length)
+        found = {name: np.concatenate(parts) for name, parts in self._windows.items()}
+        table.starts = torch.from_numpy(found["start"])
+        table.sequence_mask = torch.from_numpy(found["counts"])
+        table.episodes = torch.from_numpy(found["episode"])
+        table.training = torch.from_numpy(np.flatnonzero(~found["validation"]))
+        table.validation = torch.from_numpy(np.flatnonzero(found["validation"]))
+        for name in ("training", "validation"):
+            if not table.sequence_mask[getattr(table, name)].any():
+                raise UserError(
+                    f"dataset {self._where} has no {name} window in which an object moved more than "
+                    f"{self._config.minimum_move:g} m: collect more transitions"
+                )
+        return table
 
 
 def _transitions_that_count(episodes: Arrays, visible: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:

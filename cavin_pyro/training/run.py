@@ -56,6 +56,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         segment_length=config.model.segment_length,
         seed=config.seed,
         skip_corrupt=config.skip_corrupt,
+        storage=folder,
     )
     with user_input():
         objective.check(model, guide)

@@ -45,6 +45,14 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
 
 
 @pytest.mark.soak
+def test_training_from_a_file_makes_the_weights_of_training_from_memory() -> None:
+    small, large, steps = run("streaming", "--files", "1", "--turns", "1", "--steps", "2").splitlines()
+    assert small.startswith("500 pushes") and large.startswith("5000 pushes")
+    assert all(re.search(r"[\d.]+ MB held, read in [\d.]+ s$", line) for line in (small, large))
+    assert re.search(r"speed [\d.]+; weights equal$", steps)
+
+
+@pytest.mark.soak
 def test_allocations_of_perturbed_rollouts_are_compared() -> None:
     lines = run(
         "perturbed_rollouts", "--problems", "1", "--episodes", "1", "--pushes", "1", "--truth", "16"

@@ -62,6 +62,9 @@ def find_defects(folder: Path) -> Iterator[str]:
 def _damage(path: Path, names: tuple[str, ...], metadata: Mapping[str, Any], arrays: Arrays) -> Iterator[str]:
     """What is wrong with a file by itself; what can be read of it goes into `arrays`."""
     configuration = metadata["configuration"]
+    if not path.exists():
+        yield "it is missing"
+        return
     try:
         with h5py.File(path, "r") as file:
             check_file(file, steps=configuration.get("steps"), episodes=configuration.get("episodes_per_shard"))

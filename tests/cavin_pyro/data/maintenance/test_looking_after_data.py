@@ -118,7 +118,7 @@ def test_flipped_bytes_lost_files_and_wrong_counts_are_named_together(data: Call
     files = [line.split(": ")[0] for line in output.splitlines()]
     assert status == 2
     assert files == [str(shard_path(own_pushes, 0)), str(shard_path(own_pushes, 1)), str(features)]
-    assert "array clouds" in output
+    assert "array clouds" in output and "00001.h5: it is missing" in output
 
 
 def test_metadata_that_count_other_pushes_are_named(data: Callable, own_pushes: Path) -> None:
