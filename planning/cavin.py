@@ -53,7 +53,7 @@ class CavinPlanner(SearchingPlanner):
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
     idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
         last; 0 keeps g's order (paper).
-    compile: compile the inner functions to native code, which takes one or two minutes.
+    compile: compile the inner functions to native code, which takes one or two minutes once and is kept on disk.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
     `reward_at`, limits out of order, and a `feature_weight` or an `idle_distance` that is negative or not finite.

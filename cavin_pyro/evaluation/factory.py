@@ -87,10 +87,8 @@ def planner_name(config: DictConfig) -> str:
 
 
 def announce_waiting(config: DictConfig) -> None:
-    """Announce on standard error, before the first plan, that plans will take long."""
+    """Announce on standard error, before the first plan, that plans will take long; compilation announces itself."""
     planner = config.planner
-    if planner.get("compile"):
-        print("planner.compile=true: the first plan is compiled, which takes a minute or two", file=sys.stderr)
     target = str((planner.get("optimizer") or {}).get("_target_", "")).rpartition(".")[2]
     if target in SLOW_OPTIMIZERS:
         print(f"planner.optimizer={target}: a plan takes about twice as long as with Shooting", file=sys.stderr)

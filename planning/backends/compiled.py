@@ -1,13 +1,19 @@
-"""Planning's inner functions as native code."""
+"""Planning's inner functions as native code, which is made once and kept on disk."""
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -16,7 +22,10 @@ from torch.distributions import Distribution
 
 from planning import records
 from planning.backends import passes
+from planning.backends.cache import VARIABLE, CodeCache, UnsafeFolderError, default_folder
 from planning.backends.eager import Item, Result, eager
+from planning.backends.fingerprint import UnknownValueError, fingerprint
+from planning.backends.library import PROXY_EXECUTOR, Library
 
 COMPILING = {
     "freezing": True,  # weights become constants, packed for the matrix products
@@ -26,20 +35,30 @@ COMPILING = {
     "unroll_reductions_threshold": 64,  # unrolls minima over a layout's rectangles and reductions over objects
     "compile_threads": 1,  # worker processes would compile no faster and would stay until the end
 }
+# Of this machine, for which loops are divided, in code for any number of threads: a process with one of them finds the
+# code of one with several.
+THREADS = os.cpu_count() or 1
+COUNTS = {"num_logical_cores", "num_physical_cores", "num_sockets"}
 
 
 class Compiled:
-    """Native code, which torch's Inductor writes when a function is first called with its constants and shapes.
+    """Native code, which torch's AOTInductor writes when a function is first called with its constants and shapes.
 
-    This takes 5 to 20 seconds for each of a planner's four or five functions; torch caches on disk what it can reuse.
-    Weights become part of the code: they must not change afterwards.
+    This takes 5 to 20 seconds for each of a planner's four or five functions. The code is kept in a folder of the
+    user's (`planning.backends.cache`), where later processes find it by a key of everything that decides it. Weights
+    become part of the code: they must not change afterwards.
 
     Matrix products of factors rounded to bfloat16 (torch's float32 precision "medium") are computed on tensors of
     bfloat16, so their results are rounded as well; with "highest" everything is float32.
+
+    Without such a folder, or for constants that cannot be digested, code is made for this process only.
     """
 
-    def __init__(self) -> None:
-        """Raises ValueError where there is no C++ compiler."""
+    def __init__(self, folder: Path | None = None) -> None:
+        """`folder`: keeps the code; None is `planning.backends.cache.default_folder`.
+
+        Raises ValueError where there is no C++ compiler.
+        """
         compiler = os.environ.get("CXX", "g++")
         if shutil.which(compiler) is None:
             raise ValueError(
@@ -48,6 +67,12 @@ class Compiled:
             )
         self._versions: dict[Any, _Native] = {}
         self._compiling = Lock()
+        self._cache: CodeCache | None = None
+        try:
+            self._cache = CodeCache(folder or default_folder())
+        except OSError as error:
+            why = error if isinstance(error, UnsafeFolderError) else f"{error.filename}: {error.strerror}"
+            _say(f"native code is made for this process only: {why} ({VARIABLE}=DIR names another folder)")
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Backend`. Raises ValueError for a function that cannot be compiled, saying why."""
@@ -58,7 +83,7 @@ class Compiled:
         version = tuple(signature)
         native = self._versions.get(version)
         if native is None:
-            native = self._first(version, function, rounded, arguments, tensors)
+            native = self._first(version, _FlatFunction(function, rounded, arguments), tensors)
         return native(tensors)
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -72,66 +97,128 @@ class Compiled:
         finally:
             torch.set_num_threads(threads)  # setting it in a worker thread also changes it here
 
-    def _first(
-        self, version: Any, function: Callable[..., Any], rounded: bool, arguments: Any, tensors: list[Tensor]
-    ) -> _Native:
-        with self._compiling:
-            if version not in self._versions:  # another thread may have compiled it
+    def _first(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
+        with self._compiling, _distributions_unchecked():
+            if version not in self._versions:  # another thread may have made it
                 try:
-                    self._versions[version] = _Native(function, rounded, arguments, tensors)
+                    self._versions[version] = self._make(version, function, tensors)
                 except RuntimeError as error:  # the base class of torch's errors of compilation
                     what = str(error).splitlines()[0]
-                    raise ValueError(f"compile=true: {function.__name__} cannot be compiled: {what}") from error
+                    raise ValueError(f"compile=true: {function.name} cannot be compiled: {what}") from error
             return self._versions[version]
+
+    def _make(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
+        library = self._library(version, function, tensors)
+        if library is None:
+            _announce("is made for this process only")
+            code = torch._inductor.compile(_graph(function, tensors), [*tensors], options=COMPILING)
+            return _Native(lambda given: code(*given), function.form())
+        function(*tensors)  # once directly, which tells the form of its result
+        return _Native(library, function.form())
+
+    def _library(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> Library | None:
+        """From the cache, or made and put there; None where there is no cache, or it cannot take this function."""
+        if self._cache is None or any(tensor.device.type != "cpu" for tensor in tensors):
+            return None
+        try:
+            key = fingerprint([*_circumstances(), *version], [__name__])
+        except UnknownValueError:
+            return None
+        if (library := self._cache.load(key)) is not None:
+            return library
+        try:
+            with self._cache.building(key) as folder:
+                if (library := self._cache.load(key)) is not None:  # another process has made it in the meantime
+                    return library
+                _announce(f"is kept in {self._cache.folder}")
+                code = _shared_library(_graph(function, tensors), tensors, folder)
+                if PROXY_EXECUTOR in code:
+                    return None
+                self._cache.store(key, code)
+        except OSError as error:
+            _say(f"native code cannot be kept: {error}")
+        return self._cache.load(key)
 
 
 class _Native:
-    """One compiled function for one signature of its arguments, which is not checked again."""
+    """Native code for one signature of its arguments, which is not checked again."""
 
-    def __init__(
-        self, function: Callable[..., Any], rounded: bool, arguments: tuple[Any, ...], tensors: list[Tensor]
-    ) -> None:
-        """`tensors` are those of the `arguments`, in order."""
-        results: list[Any] = []
-        with _distributions_unchecked():
-            exported = torch.export.export(
-                _FlatFunction(function, rounded, arguments, results.append), tuple(tensors), strict=False
-            )
-        graph = exported.module(check_guards=False)
-        graph.graph.set_codegen(torch.fx.graph.CodeGen())  # inputs and outputs are flat tuples: no pytree handling
-        graph.recompile()
-        passes.rewrite(graph)
-        self._call = torch._inductor.compile(graph, [*tensors], options=COMPILING)
-        self._form = records.apply(results[-1], lambda value: torch.empty(0) if isinstance(value, Tensor) else value)
+    def __init__(self, code: Callable[[list[Tensor]], Sequence[Tensor]], form: Any) -> None:
+        """`form`: the function's result, with anything in the place of tensors."""
+        self._code = code
+        self._form = form
 
     def __call__(self, tensors: list[Tensor]) -> Any:
-        return _unflatten(self._form, iter(self._call(*tensors)))
+        return _unflatten(self._form, iter(self._code(tensors)))
+
+
+def _announce(where: str) -> None:
+    _say(f"compiling for the first plan, which takes a minute or two; native code {where}")
+
+
+@cache
+def _say(line: str) -> None:
+    """On standard error, once in a process."""
+    print(line, file=sys.stderr, flush=True)
+
+
+@cache
+def _circumstances() -> tuple[str, ...]:
+    """What else decides native code: versions, options, and this machine."""
+    processor: Any = sorted((name, value) for name, value in torch.cpu.get_capabilities().items() if name not in COUNTS)
+    with suppress(OSError):  # compilers are told to use all that this machine has, which Linux lists
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        processor.append(next((line for line in lines if line.lower().startswith(("flags", "features"))), ""))
+    given = sorted(pair for pair in os.environ.items() if pair[0].startswith("TORCHINDUCTOR_") and "DIR" not in pair[0])
+    where = platform.system(), platform.machine(), platform.libc_ver(), sys.version_info[:2]
+    versions = torch.__version__, torch.version.git_version, torch.backends.mkldnn.is_available()
+    return tuple(map(repr, (where, versions, COMPILING, THREADS, os.environ.get("CXX"), given, processor)))
+
+
+def _graph(function: _FlatFunction, tensors: list[Tensor]) -> torch.fx.GraphModule:
+    exported = torch.export.export(function, tuple(tensors), strict=False)
+    graph = exported.module(check_guards=False)
+    graph.graph.set_codegen(torch.fx.graph.CodeGen())  # inputs and outputs are flat tuples: no pytree handling
+    graph.recompile()
+    passes.rewrite(graph)
+    return graph
+
+
+def _shared_library(graph: torch.fx.GraphModule, tensors: list[Tensor], folder: Path) -> bytes:
+    options = {**COMPILING, "cpp.threads": THREADS, "aot_inductor.output_path": str(folder / "code.so")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch about torch
+        path = torch._inductor.aot_compile(graph, tuple(tensors), options=options)
+    return Path(str(path)).read_bytes()
 
 
 class _FlatFunction(nn.Module):
-    """A function of tensors that returns a flat tuple of tensors, as torch exports one. `keep` receives its result."""
+    """A function of tensors that returns a flat tuple of tensors, as torch exports one.
 
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        rounded: bool,
-        arguments: tuple[Any, ...],
-        keep: Callable[[Any], None],
-    ) -> None:
+    After a call, `form()` is its result, with empty tensors.
+    """
+
+    def __init__(self, function: Callable[..., Any], rounded: bool, arguments: tuple[Any, ...]) -> None:
+        """`arguments`: with any tensors of the right shapes."""
         super().__init__()
+        self.name = function.__name__
+        self._last = SimpleNamespace(result=None)  # a bare attribute would be taken for a part of the graph
         self._function = function
         self._rounded = rounded
         self._arguments = arguments
-        self._keep = keep
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         arguments = _unflatten(self._arguments, iter(tensors))
         with torch.autocast(tensors[0].device.type, torch.bfloat16, enabled=self._rounded):
             result = records.apply(self._function(*arguments), _in_float32)
-        self._keep(result)
+        self._last.result = result
         results: list[Tensor] = []
         _flatten(result, results, [])
         return tuple(results)
+
+    def form(self) -> Any:
+        """The last result, without its numbers."""
+        return records.apply(self._last.result, lambda value: torch.empty(0) if isinstance(value, Tensor) else value)
 
 
 @contextmanager
