@@ -1,7 +1,8 @@
 """How long a new process takes to its first plan: `python benchmarks/first_plan.py [--starts 2] [OPTION=VALUE ...]`.
 
 Seconds from the start of the process to the first plan, which imports, a world and a depth image precede, and of that
-plan alone; then of a whole episode by `python -m cavin_pyro.plan`. Planned directly, compiled with an empty cache of
+plan alone; processor time up to then, which is what an idle machine would take; then seconds of a whole episode by
+`python -m cavin_pyro.plan`. Planned directly, compiled with an empty cache of
 native code ("cold": minutes, `--no-cold` leaves it out if the given `--cache` is filled), and compiled in later
 processes ("warm"). Options of `plan` come last, by default `task=clearing`. Set OMP_NUM_THREADS for the number of
 threads.
@@ -24,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def first_plan(began: float, options: list[str]) -> None:
-    """Print seconds since `began`, seconds of the plan, and a digest of its bits."""
+    """Print seconds since `began`, seconds of the plan, processor time, and a digest of the plan's bits."""
     import torch
 
     from cavin_pyro.config.composition import compose
@@ -32,13 +33,14 @@ def first_plan(began: float, options: list[str]) -> None:
     from cavin_pyro.evaluation.rollout import observed_state
 
     runner = make_runner(compose("plan", *options, "output=unused"))
-    state = observed_state(runner.env.reset(seed=0)[0], runner.pointnet)
+    state = observed_state(runner.env.reset(seed=0)[0], runner.geometry)
     ready = time.time()
     plan = runner.planner.plan(state, [torch.Generator().manual_seed(0)])
-    now = time.time()
+    now, own = time.time(), os.times()
     runner.env.close()
     digest = hashlib.sha256(plan.actions.numpy().tobytes() + plan.candidate_returns.numpy().tobytes()).hexdigest()
-    print(now - began, now - ready, digest[:12])
+    # Of the compilers, too.
+    print(now - began, now - ready, own.user + own.system + own.children_user + own.children_system, digest[:12])
 
 
 def start(options: list[str], cache: Path) -> str:
@@ -46,7 +48,7 @@ def start(options: list[str], cache: Path) -> str:
     surroundings = {**os.environ, "PYTHONPATH": str(ROOT), "CAVIN_PYRO_CACHE": str(cache)}
     command = [sys.executable, __file__, "--began", str(time.time()), *options]
     printed = subprocess.run(command, cwd=ROOT, env=surroundings, check=True, stdout=subprocess.PIPE, text=True).stdout
-    total, plan, digest = printed.split()
+    *seconds, digest = printed.split()
     with tempfile.TemporaryDirectory() as output:
         episode = [sys.executable, "-m", "cavin_pyro.plan", *options, f"output={output}/episode"]
         began = time.time()
@@ -54,7 +56,8 @@ def start(options: list[str], cache: Path) -> str:
             episode, cwd=ROOT, env=surroundings, check=True, stdout=subprocess.PIPE, text=True
         ).stdout
         took = time.time() - began
-    return f"{float(total):8.1f} {float(plan):8.2f} {took:8.1f}  {digest}  {printed.splitlines()[0]}"
+    numbers = " ".join(f"{float(number):8.2f}" for number in (*seconds, took))
+    return f"{numbers}  {digest}  {printed.splitlines()[0]}"
 
 
 def main() -> None:
@@ -70,7 +73,7 @@ def main() -> None:
         return
     options = arguments.options or ["task=clearing"]
     compiled = [*options, "planner.compile=true"]
-    print("seconds  to the first plan, of it alone, of an episode; digest of the plan; the episode")
+    print("seconds: to the first plan, of it alone, of processors until then, of an episode; the plan; the episode")
     with tempfile.TemporaryDirectory() as temporary:
         cache = arguments.cache or Path(temporary)
         ways = [] if arguments.no_cold else [("cold", compiled)]

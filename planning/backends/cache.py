@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +22,7 @@ from planning.backends.library import Library
 
 VARIABLE = "CAVIN_PYRO_CACHE"  # names another folder
 DIGEST = 32  # bytes, at the end of each file, where loaders of libraries do not look
+ABANDONED = 24 * 3600.0  # seconds
 MOST = 256  # files, of one to two megabytes each; those that were not used for the longest time go first
 
 
@@ -109,9 +112,16 @@ class CodeCache:
 
     def _prune(self) -> None:
         with suppress(OSError):  # another process may do the same
-            libraries = sorted(self.folder.glob("*.so"), key=lambda path: path.stat().st_mtime)
+            ages = sorted((path.stat().st_mtime, path) for path in self.folder.iterdir())
+            libraries = [path for _, path in ages if path.suffix == ".so"]
             for path in libraries[:-MOST]:
                 path.unlink(missing_ok=True)
+            for age, path in ages:  # a killed process leaves what it had begun
+                if path.suffix != ".so" and age < time.time() - ABANDONED:
+                    if path.is_dir():
+                        shutil.rmtree(path, ignore_errors=True)
+                    else:
+                        path.unlink(missing_ok=True)
 
 
 def _digest(key: str, code: bytes) -> bytes:

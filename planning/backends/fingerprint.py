@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, cached_property, partial
 from pathlib import Path
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType, NoneType, SimpleNamespace
 from typing import Any
 
 import torch
@@ -99,6 +99,8 @@ class _Walk:
             return self._add_parts("partial", (function.func, function.args, function.keywords))
         self._write("function", f"{function.__module__}.{function.__qualname__}")
         self.modules.add(function.__module__)
+        if not isinstance(getattr(function, "__self__", None), ModuleType | NoneType):
+            self.add(function.__self__)  # of a built-in method
         if isinstance(function, FunctionType):
             self._write("code", _code(function.__code__))
             cells = [cell.cell_contents for cell in function.__closure__ or ()]
@@ -116,7 +118,7 @@ class _Walk:
             content += sorted(value, key=repr)
         elif isinstance(value, int | str | bytes):  # of a subclass
             content.append(repr(value))
-        elif not hasattr(value, "__dict__") and not _slots(value):
+        elif not _is_readable(value):
             raise UnknownValueError(f"{type(value).__module__}.{type(value).__qualname__}")
         self._add_parts("content", content)
         attributes = {**getattr(value, "__dict__", {}), **_slots(value)}
@@ -128,13 +130,29 @@ class _Walk:
                 self.add(attributes[name])
 
 
+def _is_readable(value: Any) -> bool:
+    """Whether all of an object's state is in attributes and slots, as for classes written in Python."""
+    if type(value) in (object, SimpleNamespace):
+        return type(value) is SimpleNamespace  # a bare object is its identity
+    if type(value).__reduce__ is not object.__reduce__ or type(value).__reduce_ex__ is not object.__reduce_ex__:
+        return False
+    try:
+        object.__reduce_ex__(value, 2)  # refuses objects that are larger than these
+    except TypeError:
+        return False
+    return True
+
+
 def _slots(value: Any) -> dict[str, Any]:
-    names = [name for one in type(value).__mro__ for name in _names(vars(one).get("__slots__", ()))]
-    return {name: getattr(value, name) for name in names if name[:2] != "__" and hasattr(value, name)}
-
-
-def _names(slots: Any) -> Iterable[str]:
-    return (slots,) if isinstance(slots, str) else slots
+    found = {}
+    for one in type(value).__mro__:
+        slots = vars(one).get("__slots__", ())
+        for name in (slots,) if isinstance(slots, str) else slots:
+            private = name.startswith("__") and not name.endswith("__")
+            name = f"_{one.__name__.lstrip('_')}{name}" if private else name
+            if name not in ("__dict__", "__weakref__") and hasattr(value, name):
+                found[name] = getattr(value, name)
+    return found
 
 
 def _code(code: CodeType) -> str:

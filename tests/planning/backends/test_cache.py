@@ -201,3 +201,15 @@ def test_the_oldest_go_first(tmp_path: Path) -> None:
         os.utime(tmp_path / f"{number}.so", (number, number))
     assert len([*tmp_path.iterdir()]) == MOST
     assert not (tmp_path / "1.so").exists() and (tmp_path / f"{MOST + 2}.so").exists()
+
+
+def test_what_a_killed_process_had_begun_goes_after_a_day(tmp_path: Path) -> None:
+    cache = CodeCache(tmp_path)
+    for name in ("old", "new"):
+        (tmp_path / f"{name}.partial").write_bytes(b"half")
+        (tmp_path / f"{name}.made").mkdir()
+        (tmp_path / f"{name}.made" / "code.cpp").write_bytes(b"half")
+    for path in tmp_path.glob("old*"):
+        os.utime(path, (0, 0))
+    cache.store("key", b"code")
+    assert {path.name for path in tmp_path.iterdir()} == {"key.so", "new.partial", "new.made"}

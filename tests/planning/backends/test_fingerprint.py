@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -36,10 +37,15 @@ class Scale:
 
 
 class Slotted:
-    __slots__ = ("number",)
+    __slots__ = ("__secret", "number")
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, secret: int = 0) -> None:
         self.number = number
+        self.__secret = secret
+
+
+class Array(np.ndarray):
+    """Has attributes, and numbers that are none of them."""
 
 
 def network(*, bias: bool = True, seed: int = 0) -> nn.Module:
@@ -69,10 +75,20 @@ DIFFERENT = [
     *(None, True, False, 1, 0, 1.0, 0.0, -0.0, "1", b"1", (), (1,), (1, 2), ((1,), 2), [1], {"a": 1}, {"b": 1}, {1}),
     *(float, int, torch.float32, torch.bfloat16, torch.device("cpu")),
     *(torch.zeros(2), torch.zeros(2, 1), torch.zeros(2).double(), torch.tensor([0.0, 1e-45]), torch.zeros(0)),
-    *(Point(1.0, 2.0), OtherPoint(1.0, 2.0), Point(1.0, 3.0), Scale(1.0), Scale(2.0), Slotted(1), Slotted(2)),
+    *(
+        Point(1.0, 2.0),
+        OtherPoint(1.0, 2.0),
+        Point(1.0, 3.0),
+        Scale(1.0),
+        Scale(2.0),
+        Slotted(1),
+        Slotted(2),
+        Slotted(1, 1),
+    ),
     *(network(), network(bias=False), network(seed=1), changed("weight", 1e-6), changed("factor", 2.0)),
     *(changed("factor", 3.0), nn.Sequential(nn.Linear(3, 4), nn.Tanh())),
     *(times(2.0), times(3.0), plus(2.0), partial(max, 1), partial(max, 2), Point(1.0, 2.0)._asdict, network, times),
+    *([1].append, [2].append, torch.neg, torch.abs),
     *(TaskReward(load_task("crossing", 1)), TaskReward(load_task("crossing", 2)), TaskReward(load_task("clearing", 1))),
     *(TaskReward(load_task("crossing", 1), margin=0.01), TaskReward(load_task("crossing", 1), reward="dense")),
 ]
@@ -104,7 +120,9 @@ def test_a_cycle_ends() -> None:
     assert fingerprint([one]) == fingerprint([other]) != fingerprint([SimpleNamespace(other=one)])
 
 
-@pytest.mark.parametrize("value", [torch.Generator(), iter([1]), object(), torch.eye(2).to_sparse()])
+@pytest.mark.parametrize(
+    "value", [torch.Generator(), iter([1]), object(), torch.eye(2).to_sparse(), np.zeros(2).view(Array)]
+)
 def test_a_state_that_nobody_sees_has_no_fingerprint(value: object) -> None:
     with pytest.raises(UnknownValueError):
         fingerprint([{"inside": value}])
