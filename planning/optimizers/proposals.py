@@ -54,7 +54,8 @@ class LastPlan:
     Around a plan's noise x, the density is N(correlation x, 1 - correlation^2), which has the prior's variance on
     average.
 
-    prior_fraction: of plans that follow the prior; no weight can exceed its inverse by the proposal.
+    prior_fraction: of plans that follow the prior. Without resampling and moves, prior / proposal of a whole plan is at
+        most its inverse.
     correlation: 0 follows the prior only, and near 1 plans stay near the last one.
 
     Raises ValueError for a `prior_fraction` outside of (0, 1] and a `correlation` outside of [0, 1).
