@@ -25,7 +25,7 @@ from cavin_pyro.criticism.checks.simulation import assess_simulation
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section
-from cavin_pyro.storage.files import read_json, write_json
+from cavin_pyro.storage.files import clear_abandoned, read_json, write_json
 from cavin_pyro.storage.provenance import program_fingerprint
 
 # In the order of the report. Each takes the context and the options `sizes.<name>`; long ones show
@@ -79,6 +79,7 @@ def run_sections(
     """
     kept = folder / "sections"
     kept.mkdir(exist_ok=True)
+    clear_abandoned(kept)
     parts = []
     for number, name in enumerate(names, 1):
         print(f"section {number} of {len(names)}: {name}", flush=True)

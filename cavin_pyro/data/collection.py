@@ -18,6 +18,7 @@ from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
 from cavin_pyro.launching.workers import in_workers
+from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
@@ -27,6 +28,8 @@ from envs.randomness import collection_streams
 from envs.scene import PushReport, Scene
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
+TIMING_FILE = "timing.csv"
+TIMING_HEADER = "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
 
 
@@ -67,6 +70,7 @@ def collect(
         WorkerError: a worker was killed or stopped.
     """
     metadata = _begin(config, folder)
+    _cut_times(folder, metadata["shards"])
     with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
         if metadata["transitions"] >= transitions:
             return metadata
@@ -77,8 +81,8 @@ def collect(
                 metadata["shards"] += 1
                 metadata["episodes"] += len(arrays["length"])
                 metadata["transitions"] += made
+                _log_time(folder, metadata["shards"] - 1, made, seconds)  # first: what does not count yet is cut off
                 _write(folder, metadata)
-                _log_time(folder, metadata["shards"] - 1, made, seconds)
                 bar.update(made)
                 if metadata["transitions"] >= transitions:
                     break
@@ -239,11 +243,24 @@ def _write(folder: Path, metadata: dict[str, Any]) -> None:
 
 def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:
     """Log the CPU time of each shard, outside of the data, which must not depend on the machine's speed."""
-    path = folder / "timing.csv"
-    header = "" if path.exists() else "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
+    path = folder / TIMING_FILE
+    header = "" if path.exists() else TIMING_HEADER
     row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "segmentation", "points"))
     with open(path, "a", encoding="utf-8") as file:
         file.write(f"{header}{shard},{transitions},{row}\n")
+
+
+def _cut_times(folder: Path, shards: int) -> None:
+    """Keep the logged times of the shards that count: a killed run may have logged another, or half of a line."""
+    path = folder / TIMING_FILE
+    if not path.exists():
+        return
+    logged = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+    counted = {str(number) for number in range(shards)}
+    kept = [line for line in logged[1:] if line.endswith("\n") and line.partition(",")[0] in counted]
+    if [TIMING_HEADER, *kept] != logged:
+        with atomic_write(path) as temporary:
+            temporary.write_text("".join([TIMING_HEADER, *kept]), encoding="utf-8")
 
 
 def _plain(value: Any) -> Any:

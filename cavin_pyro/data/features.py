@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import check_distinct, read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.held_out import find_held_out
+from cavin_pyro.storage.files import clear_abandoned
 from models.networks.geometry import Geometry
 
 BATCH = 4096  # clouds
+ABANDONED_SECONDS = 3600.0  # a file that another training writes there is younger
 
 
 def geometry_fingerprint(geometry: Geometry) -> str:
@@ -55,6 +57,7 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
     features = cloud_features(geometry, shard["clouds"])
     try:
         path.parent.mkdir(exist_ok=True)
+        clear_abandoned(path.parent, older_than=ABANDONED_SECONDS)
         write_shard(path, {"features": features})
     except OSError:
         pass  # a dataset on a read-only or full disk can still be trained on

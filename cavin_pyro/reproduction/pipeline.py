@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from cavin_pyro.config.commands.reproduction import ReproduceConfig
@@ -22,6 +22,8 @@ from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
 from cavin_pyro.reproduction.table import TABLE, episode_row, write_table
+from cavin_pyro.storage.files import clear_abandoned
+from cavin_pyro.storage.run_directory import write_config
 
 ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
@@ -167,7 +169,8 @@ def _configurations(
         config.seed, config.episodes = one.seed, one.episodes
         config.checkpoint = str(models[one])
         config.output = str(evaluation_folder(home, one))
-        _write_once(evaluation_folder(home, one) / "config.yaml", config)
+        if not (evaluation_folder(home, one) / "config.yaml").exists():
+            write_config(evaluation_folder(home, one), config)
         yield one, config
 
 
@@ -214,10 +217,7 @@ def _whole_progress(
 
 
 def _made(folder: Path) -> Path:
+    """A folder beneath the one that this command holds, without what a killed run left half-written."""
     folder.mkdir(parents=True, exist_ok=True)
+    clear_abandoned(folder)
     return folder
-
-
-def _write_once(path: Path, config: DictConfig) -> None:
-    if not path.exists():
-        OmegaConf.save(config, path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -70,16 +71,26 @@ def output_folder(path: str | Path) -> Iterator[Path]:
             made = _make(folder)
             held.callback(_delete_empty, made)
             held.enter_context(folder_lock(folder))
-            probe = folder / f".probe.{uuid.uuid4().hex[:8]}"
+            probe = folder / f".probe{OURS}{'0' * 8}{PARTIAL}"
             probe.touch()
-            probe.unlink()
-            for abandoned in filter(_is_ours, folder.glob(f".*{OURS}*{PARTIAL}*")):
-                abandoned.unlink(missing_ok=True)
+            clear_abandoned(folder)  # with the probe, and with that of a run that was killed here
         except OSError as error:
             raise UserError(
                 f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
             ) from error
         yield folder
+
+
+def clear_abandoned(folder: Path, *, older_than: float = 0.0) -> None:
+    """Delete what a killed run left half-written in a folder. Nobody else may write there now.
+
+    Args:
+        older_than: seconds; leave younger files, for a folder that others may write into.
+    """
+    for path in filter(_is_ours, folder.glob(f".*{OURS}*{PARTIAL}*")):
+        with suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime >= older_than:
+                path.unlink()
 
 
 def _is_ours(path: Path) -> bool:

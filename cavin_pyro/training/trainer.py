@@ -17,14 +17,13 @@ from pathlib import Path
 import pyro
 import torch
 from torch import Tensor, nn
-from torch.utils.tensorboard import SummaryWriter
 
 from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.storage.progress import progress_bar
+from cavin_pyro.storage.progress import ScalarLog, progress_bar
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
@@ -87,7 +86,7 @@ class Trainer:
             warnings.catch_warnings(),
             unchecked_programs(),
             progress_bar("training", total=config.steps, initial=self.step) as bar,
-            SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step + 1) as board,
+            ScalarLog(self.folder / "tensorboard", self.rows) as board,
         ):
             # Pyro warns many times about one NaN; this loop checks and stops.
             warnings.filterwarnings("ignore", "Encountered", UserWarning)
@@ -133,7 +132,7 @@ class Trainer:
             "look at the data, or lower trainer.learning_rate"
         )
 
-    def _validate(self, training_loss: float, windows_per_second: float, board: SummaryWriter) -> None:
+    def _validate(self, training_loss: float, windows_per_second: float, board: ScalarLog) -> None:
         terms, loss = self._validation_terms()
         if not math.isfinite(loss):
             self._stop_at(next((name for name, value in terms.items() if not math.isfinite(value)), "loss"))
@@ -141,8 +140,7 @@ class Trainer:
         row |= {f"validation_{name}": value for name, value in terms.items()}
         row |= {"learning_rate": self.config.rate(self.step), "windows_per_second": windows_per_second}
         self.rows.append(row)
-        for name, value in row.items():
-            board.add_scalar(name, value, self.step)
+        board.add(row)
         if loss < self.best:
             self.best, self.best_step, self.stale = loss, self.step, 0
             self._save(self.step, row)

@@ -3,12 +3,14 @@
 Reads jobs, a line of JSON each, and prints the exit status of each. A job has `folder`, `output` and `errors` (files),
 and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder, or
 `cases`, which run in turn in one process, each from its own `folder`, with their answers as JSON in `output`.
-With `file_limit`, no file can grow beyond so many bytes.
+With `file_limit`, no file can grow beyond so many bytes; after `limit` seconds a job ends by SIGALRM. With `faults`, a
+part of the environment, the disk fails at a chosen call (faults/shim.py), and stages of `reproduce` are forked as well.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import importlib
 import io
@@ -23,6 +25,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+from PIL import Image
+
+from tests.cavin_pyro.faults.forked_stages import fork_stages
+
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
     "cavin_pyro.criticism.loading",
@@ -31,9 +38,14 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.data.collection",
     "cavin_pyro.evaluation.comparison",
     "cavin_pyro.evaluation.evaluation",
+    "cavin_pyro.reproduction.episodes.picture",
+    "cavin_pyro.reproduction.results",
     "cavin_pyro.training.pretraining",
     "cavin_pyro.training.run",
+    "cavin_pyro.visualization.data_summary",
     "cavin_pyro.visualization.rendering",
+    "cavin_pyro.visualization.training",
+    "torch._dynamo",  # which torch's optimizers import
 )
 LIMIT = 300  # seconds per job
 
@@ -52,8 +64,8 @@ def main() -> None:
 
 
 def run(job: dict[str, Any]) -> None:
-    signal.alarm(LIMIT)
-    writing = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+    signal.alarm(job.get("limit", LIMIT))
+    writing = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if job.get("append") else os.O_TRUNC)
     for number, (path, flags) in enumerate(
         [(os.devnull, os.O_RDONLY), (job["output"], writing), (job["errors"], writing)]
     ):
@@ -61,6 +73,13 @@ def run(job: dict[str, Any]) -> None:
     os.chdir(job["folder"])
     if job.get("file_limit"):  # as inherited by a command that a user starts under `ulimit -f`
         resource.setrlimit(resource.RLIMIT_FSIZE, (job["file_limit"], resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    if "faults" in job:
+        os.environ.update(job["faults"])
+        if ctypes.CDLL(None).fault_arm() != 0:
+            raise RuntimeError(f"the disk cannot fail so: {job['faults']}")
+        Figure.savefig = save_blank  # how pictures reach the disk is tested, not what they show
+        if job["command"] == "reproduce":
+            fork_stages(run)
     if "cases" in job:
         sys.path[0] = ""  # the folder of each case
         print(json.dumps([run_case(**case) for case in job["cases"]]))
@@ -68,6 +87,11 @@ def run(job: dict[str, Any]) -> None:
     sys.path[0] = job["folder"]  # as `python -m` has it
     sys.argv = [job["command"], *job["overrides"]]
     runpy.run_module(f"cavin_pyro.{job['command']}", run_name="__main__", alter_sys=True)
+
+
+def save_blank(figure: Figure, target: Any, **_: Any) -> None:
+    """Write an empty picture of a figure's size: drawing takes longer than all else in a small run."""
+    Image.new("RGB", tuple(map(int, figure.get_size_inches() * figure.dpi))).save(target, format="PNG")
 
 
 def run_case(command: str, overrides: Sequence[str], folder: str) -> dict[str, Any]:

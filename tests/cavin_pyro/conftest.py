@@ -5,8 +5,6 @@ from __future__ import annotations
 import atexit
 import functools
 import json
-import os
-import re
 import shutil
 import subprocess
 import sys
@@ -29,9 +27,8 @@ from cavin_pyro.storage.checkpoint import save_checkpoint
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
 from models.networks.pointnet import PointNet
+from tests.cavin_pyro.shell import ENVIRONMENT, ROOT, Answer, complaints
 
-ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SMALL_CHECK = [  # options that make a check of all sections a matter of seconds
     *("windows=5", "sizes.guide_error.inner_windows=3", "sizes.guide_error.inner_particles=2"),
     *("sizes.amortization.steps=2", "sizes.amortization.particles=2", "sizes.amortization.samples=20"),
@@ -53,26 +50,6 @@ WINDOWS = {  # of a training on `pushes`
     "negative_fraction": 0.25,
 }
 PUSHES = CollectionConfig(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
-
-
-@dataclass(frozen=True)
-class Answer:
-    """How a command ended."""
-
-    status: int
-    output: str
-    errors: str
-
-    @property
-    def complaints(self) -> list[str]:
-        """The lines on stderr, apart from progress bars."""
-        return complaints(self.errors)
-
-
-def complaints(errors: str) -> list[str]:
-    """The lines of stderr, apart from progress bars."""
-    lines = errors.replace("\r", "\n").split("\n")
-    return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+(%\|| \w+ \[)", line)]
 
 
 @dataclass(frozen=True)

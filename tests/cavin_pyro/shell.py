@@ -1,0 +1,31 @@
+"""How tests start commands, and how those end: without the imports of the commands themselves."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How a command ended."""
+
+    status: int
+    output: str
+    errors: str
+
+    @property
+    def complaints(self) -> list[str]:
+        """The lines on stderr, apart from progress bars."""
+        return complaints(self.errors)
+
+
+def complaints(errors: str) -> list[str]:
+    """The lines of stderr, apart from progress bars."""
+    lines = errors.replace("\r", "\n").split("\n")
+    return [line for line in lines if line.strip() and not re.match(r"\w+: +\d+(%\|| \w+ \[)", line)]
