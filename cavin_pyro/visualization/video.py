@@ -175,6 +175,6 @@ def _open_writer(path: Path, fps: int) -> Any:
         "pixelformat": "yuv420p",  # the only one that all browsers play
         "macro_block_size": 2,
         "output_params": ["-movflags", "+faststart"],
-        "ffmpeg_log_level": "error",
+        "ffmpeg_log_level": "quiet",  # what fails is told in our own line
     }
     return imageio.get_writer(path, mode="I", **options)

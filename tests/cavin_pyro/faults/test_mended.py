@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
@@ -19,9 +21,11 @@ from cavin_pyro.reproduction.cells import evaluations
 from cavin_pyro.reproduction.scales import SCALES
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import ScalarLog
+from cavin_pyro.visualization import video
 from models.networks.pointnet import PointNet
 from tests.cavin_pyro.faults.comparison import results
 
+needs_dev_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a full disk")
 ABANDONED = ".elbo.cavin-0123abcd.partial.json"
 
 
@@ -65,6 +69,7 @@ def test_scalars_are_on_disk_at_once_and_a_resumed_run_shows_those_that_were_los
     assert shown["whole"]["validation_loss at 4"] == [6.0]
 
 
+@needs_dev_full
 def test_a_full_disk_under_tensorboards_file_is_an_error_of_the_disk(tmp_path: Path) -> None:
     with open("/dev/full", "ab", buffering=0) as full, ScalarLog(tmp_path) as log:
         os.dup2(full.fileno(), log._file.fileno())
@@ -72,6 +77,18 @@ def test_a_full_disk_under_tensorboards_file_is_an_error_of_the_disk(tmp_path: P
             log.add({"step": 1.0})
         assert caught.value.errno == errno.ENOSPC
         os.dup2(os.open(os.devnull, os.O_WRONLY), log._file.fileno())  # which can be closed
+
+
+@needs_dev_full
+def test_ffmpeg_leaves_it_to_the_command_to_tell_of_a_full_disk(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "full.mp4").symlink_to("/dev/full")
+    writer = video._open_writer(tmp_path / "full.mp4", 10)
+    with suppress(OSError):  # or it ends only when it is closed
+        writer.append_data(np.zeros((64, 64, 3), np.uint8))
+    writer.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_run_that_is_killed_as_it_begins_leaves_nothing_behind(

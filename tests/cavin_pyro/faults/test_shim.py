@@ -119,6 +119,7 @@ def write_results(
     folder.mkdir()
     (folder / "episodes.jsonl").write_text("".join(EPISODE % (seed, milliseconds) for seed in seeds))
     (folder / "data.h5").write_bytes(weights)
+    (folder / "results.txt").write_text(f"steps        {len(seeds)}\nplanning_ms  {milliseconds}.5  1.0 ms\n")
 
 
 @pytest.mark.parametrize(
@@ -129,11 +130,19 @@ def write_results(
         ({"weights": b"v"}, ["data.h5 differs"]),
         (
             {"seeds": (1,)},
-            ["episodes.jsonl has lost or doubled episodes: [1], not [1, 2]", "episodes.jsonl differs"],
+            [
+                "episodes.jsonl has lost or doubled episodes: [1], not [1, 2]",
+                "episodes.jsonl differs",
+                "results.txt differs",
+            ],
         ),
         (
             {"seeds": (1, 2, 2)},
-            ["episodes.jsonl has lost or doubled episodes: [1, 2, 2], not [1, 2]", "episodes.jsonl differs"],
+            [
+                "episodes.jsonl has lost or doubled episodes: [1, 2, 2], not [1, 2]",
+                "episodes.jsonl differs",
+                "results.txt differs",
+            ],
         ),
     ],
 )
