@@ -27,7 +27,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.factory import make_environment, make_runner
 from envs.physics.bullet import connect, pybullet
 
-SMALL = ("task=crossing", "objects=3", "planner.samples=64", "planner.horizon=6", "maximum_steps=1", "output=-")
+SMALL = ("task=crossing", "objects=2", "planner.samples=32", "planner.horizon=3", "maximum_steps=1", "output=-")
 CLIENTS = 1024  # the most that PyBullet can have
 QUANTITIES = ("memory_mb", "files", "clients", "turn_ms")
 
@@ -112,7 +112,7 @@ def _leak(names: Sequence[str]) -> list[object]:
     """What a leak of each kind holds after a turn."""
     held: list[object] = []
     if "memory_mb" in names:
-        held.append(np.ones(2**17))  # 1 MB
+        held.append(np.ones(2**20))  # 8 MB
     if "files" in names:
         held.append(os.open(os.devnull, os.O_RDONLY))
     if "clients" in names:

@@ -42,11 +42,11 @@ def test_a_quantity_that_rises_is_told_from_noise(rising: str | None, long_runs:
 
 
 def test_turns_stay_flat_and_leaks_on_purpose_do_not(long_runs: ModuleType) -> None:
-    """In so few turns only large slopes can be told: a leak is of 1 MB, a file and a simulation a turn."""
-    flat = long_runs.slopes(list(long_runs.measure(32, 2)), memory_limit=200.0, time_limit=2.0)
+    """In so few turns only large slopes can be told: a leak is of 8 MB, a file and a simulation a turn."""
+    flat = long_runs.slopes(list(long_runs.measure(16, 1)), memory_limit=3000.0, time_limit=2.0)
     assert not [str(one) for one in flat if one.rises]
     leak = ("memory_mb", "files", "clients")
-    leaking = long_runs.slopes(list(long_runs.measure(16, 2, leak=leak)), memory_limit=200.0, time_limit=2.0)
+    leaking = long_runs.slopes(list(long_runs.measure(12, 1, leak=leak)), memory_limit=3000.0, time_limit=2.0)
     assert [one.name for one in leaking if one.rises] == list(leak)
 
 
@@ -54,7 +54,7 @@ def test_turns_stay_flat_and_leaks_on_purpose_do_not(long_runs: ModuleType) -> N
 def test_the_command_ends_with_1_when_something_rises_and_goes_on_after_its_log(tmp_path: Path) -> None:
     line = [sys.executable, str(FILE), "--every", "2", "--log", str(tmp_path / "log.jsonl")]
     flat = subprocess.run(
-        [*line, "--turns", "16", "--memory-limit", "500", "--time-limit", "5"], capture_output=True, text=True
+        [*line, "--turns", "16", "--memory-limit", "3000", "--time-limit", "5"], capture_output=True, text=True
     )
     assert flat.returncode == 0, flat.stdout + flat.stderr
     assert "16 turns" in flat.stdout and "RISES" not in flat.stdout

@@ -13,7 +13,7 @@ from tests.cavin_pyro.faults.shim import needs_faults
 from tests.cavin_pyro.faults.trials import REPLAY, Trials
 
 SEED = 24
-EACH = {"collect": 5, "pretrain": 5, "train": 6, "evaluate": 6, "plan": 3, "check": 4, "reproduce": 2}  # faults
+EACH = {"collect": 3, "pretrain": 3, "train": 3, "evaluate": 3, "plan": 2, "check": 3, "reproduce": 1}  # faults
 
 
 @pytest.fixture(scope="module")
