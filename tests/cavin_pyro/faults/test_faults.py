@@ -14,6 +14,7 @@ from tests.cavin_pyro.faults.trials import REPLAY, Trials
 
 SEED = 24
 EACH = {"collect": 3, "pretrain": 3, "train": 3, "evaluate": 3, "plan": 2, "check": 3, "reproduce": 1}  # faults
+LONG = ("plan", "reproduce")  # these take as long as all others; `make soak` tries them
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,9 @@ def chosen(trials: Trials, name: str) -> list[Plan]:
 
 
 @needs_faults
-@pytest.mark.parametrize("name", SUBJECTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.soak) if name in LONG else name for name in SUBJECTS]
+)
 def test_a_command_that_met_a_fault_resumes_to_the_results_of_an_unbroken_run(name: str, trials: Trials) -> None:
     wrong = {}
     for _, faults in chosen(trials, name):
