@@ -14,7 +14,7 @@ from typing import Any
 
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-TIMES = ("date", "planning_ms", "windows_per_second")  # keys and columns
+TIMES = ("date", "revision", "planning_ms", "windows_per_second")  # keys and columns; a commit may come in between
 
 
 def results(folder: Path) -> dict[str, Any]:
