@@ -20,6 +20,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.data.collection import collect, repair
     from cavin_pyro.data.summary import summarize_data
     from cavin_pyro.data.world import collecting_world
+    from cavin_pyro.launching.launcher import Launcher
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.visualization.data_summary import draw_data
     from envs.workspace import MAXIMUM_OBJECTS
@@ -36,7 +37,8 @@ def main(config: DictConfig) -> None:
     with output_folder(config.output) as folder:
         if config.repair:
             print(f"{repair(collection, folder)} files collected again")
-        metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
+        launcher = Launcher(config.launcher, config.workers, config.address)
+        metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)
         summary = summarize_data(folder)
         write_json(folder / "statistics.json", summary.figures())
         draw_data(folder / "statistics.png", summary)

@@ -14,7 +14,7 @@ def main(config: DictConfig) -> None:
     from pathlib import Path
 
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
-    from cavin_pyro.evaluation.evaluation import evaluate
+    from cavin_pyro.evaluation.evaluation import NOT_COMPARED, evaluate, merge, seeds_of
     from cavin_pyro.evaluation.factory import make_runner, planner_name
     from cavin_pyro.evaluation.outlook import outlook
     from cavin_pyro.evaluation.statistics import summarize, table
@@ -25,10 +25,11 @@ def main(config: DictConfig) -> None:
     with output_folder(config.output) as folder:
         runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
         runner.env.close()
+        seeds_of(config)
         others = earlier_rows(Path(config.compare), config) if config.compare else []
-        check_same_run(folder, config, ignore=("output", "episodes", "workers", "compare"))
+        check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
-        results = summarize(evaluate(config, folder))
+        results = summarize((merge if config.merge else evaluate)(config, folder))
         scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
         text = table(results, f"{scene}, {planner_name(config)}")
         if said := outlook(results["per_episode"], config):

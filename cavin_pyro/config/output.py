@@ -13,13 +13,14 @@ from cavin_pyro.config.composition import preset_defaults
 
 # The folder of a run without overrides, and the options that never decide which folder it is: runs that differ only in
 # these are the same run.
+LAUNCH = ("workers", "launcher", "address")
 FOLDERS = {
-    "collect": ("data/pushes", ("transitions", "workers", "repair")),
+    "collect": ("data/pushes", ("transitions", "repair", *LAUNCH)),
     "pretrain": ("runs/pretrain", ()),
     "train": ("runs/train", ()),
     "check": ("runs/check", ("sections",)),
     "plan": ("runs/plan/{task}-{reward}-{objects}-{planner}-{seed}", ("video", "viewer")),
-    "evaluate": ("runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}", ("episodes", "workers", "compare")),
+    "evaluate": ("runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}", ("episodes", "compare", "merge", *LAUNCH)),
     "demo": ("runs/demo", ()),
     "reproduce": ("runs/reproduce/{scale}", ("workers", "merge")),
 }

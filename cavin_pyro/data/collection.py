@@ -17,7 +17,7 @@ from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptio
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
-from cavin_pyro.launching.workers import in_workers
+from cavin_pyro.launching.launcher import Launcher, as_launcher
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.object_sets import load_object_set
@@ -55,12 +55,15 @@ def collect(
     folder: Path,
     *,
     transitions: int = CollectConfig.transitions,
-    workers: int = CollectConfig.workers,
+    workers: int | Launcher = CollectConfig.workers,
 ) -> dict[str, Any]:
     """Collect whole shards until at least `transitions` pushes are on disk; resume an earlier run.
 
     Shards are computed in parallel, but committed in order by this process alone: the metadata count a shard only
     once its file is in place. A killed run therefore resumes after the last shard that counts.
+
+    Args:
+        workers: processes of this machine, or a launcher.
 
     Returns:
         The dataset's metadata.
@@ -193,13 +196,14 @@ def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str,
 
 
 def _shards(
-    config: CollectionConfig, *, first: int, workers: int
+    config: CollectionConfig, *, first: int, workers: int | Launcher
 ) -> Generator[tuple[Arrays, dict[str, float]], None, None]:
     numbers = (first + number for number in range(10**9))
-    if workers == 1:
+    launcher = as_launcher(workers)
+    if launcher.here:
         yield from (_collect_shard((config, number)) for number in numbers)
         return
-    with closing(in_workers(_collect_shard, ((config, number) for number in numbers), workers, ordered=True)) as made:
+    with closing(launcher.run(_collect_shard, ((config, number) for number in numbers), ordered=True)) as made:
         yield from (shard for _, shard in made)
 
 

@@ -12,15 +12,21 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
-from cavin_pyro.launching.workers import in_workers
+from cavin_pyro.launching.launcher import Launcher, as_launcher, of_shard
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
+from cavin_pyro.storage.run_directory import check_same_run
 
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
+NOT_COMPARED = (  # options that may differ between runs of one evaluation
+    *("output", "episodes", "compare", "shard", "merge"),
+    *("workers", "launcher", "address"),
+)
 
 
 def evaluate(config: DictConfig, folder: Path) -> list[Row]:
@@ -29,13 +35,14 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     Each finished episode is one line of that file. Rerun the same command to resume a killed evaluation; an incomplete
     last line is dropped and its episode run again.
     """
-    rows = begin(folder)
-    missing = missing_seeds(config, rows)
+    rows, seeds = begin(folder), seeds_of(config)
+    missing = [seed for seed in seeds if seed not in rows]
+    launcher = Launcher(config.launcher, config.workers, config.address)
     if missing:
         announce_waiting(config)
     with (
-        closing(run_jobs([(config, seed) for seed in missing], config.workers)) as finished,
-        progress_bar("evaluating", total=config.episodes, initial=len(rows), unit="episode") as bar,
+        closing(run_jobs([(config, seed) for seed in missing], launcher)) as finished,
+        progress_bar("evaluating", total=len(seeds), initial=len(seeds) - len(missing), unit="episode") as bar,
     ):
         for _, row in finished:
             rows[row["seed"]] = row
@@ -43,7 +50,43 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
             bar.update()
             successes = sum(one["outcome"] == "success" for one in rows.values())
             bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
-    return [rows[seed] for seed in range(config.seed, config.seed + config.episodes)]
+    return [rows[seed] for seed in seeds]
+
+
+def seeds_of(config: DictConfig) -> Sequence[int]:
+    """The seeds of an evaluation's episodes, or of those in its shard.
+
+    Raises:
+        UserError: the shard is not of the form i/n, or has no episode.
+    """
+    seeds = of_shard(range(config.seed, config.seed + config.episodes), config.shard)
+    if not seeds:
+        raise UserError(f"shard={config.shard} has none of {config.episodes} episodes: choose a smaller n")
+    return seeds
+
+
+def merge(config: DictConfig, folder: Path) -> list[Row]:
+    """Join the episodes of finished shards (`merge=[a,b]`), write them in the order of their seeds and return them.
+
+    Raises:
+        UserError: a folder holds no evaluation or one of other options, or episodes are missing.
+    """
+    rows: dict[int, Row] = {}
+    for shard in map(Path, config.merge):
+        if not (shard / EPISODES_FILE).is_file():
+            raise UserError(f"merge={shard} holds no {EPISODES_FILE}: give the folder of a shard")
+        check_same_run(shard, config, ignore=NOT_COMPARED)
+        rows |= finished_episodes(shard / EPISODES_FILE)
+    seeds = range(config.seed, config.seed + config.episodes)
+    missing = [seed for seed in seeds if seed not in rows]
+    if missing:
+        raise UserError(
+            f"the folders of merge lack {len(missing)} of {len(seeds)} episodes, the first with seed {missing[0]}: "
+            "give the folder of every shard, each finished"
+        )
+    with atomic_write(folder / EPISODES_FILE) as temporary:
+        temporary.write_text("".join(json.dumps(rows[seed]) + "\n" for seed in seeds), encoding="utf-8")
+    return [rows[seed] for seed in seeds]
 
 
 def begin(folder: Path) -> dict[int, Row]:
@@ -95,24 +138,25 @@ def episode_row(episode: Episode) -> Row:
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process
 
 
-def run_jobs(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Row], None, None]:
+def run_jobs(jobs: Sequence[Job], workers: int | Launcher) -> Generator[tuple[int, Row], None, None]:
     """Run episodes, one per job; yields a job's number and its row, in any order.
 
     A process keeps environment and planner until a job has another configuration, so jobs that share one should follow
-    one another. Close the iterator when leaving it early.
+    one another. Close the iterator when leaving it early. `workers`: processes of this machine, or a launcher.
 
     Raises:
         WorkerError: a worker was killed or stopped.
     """
     if not jobs:
         return
-    if workers == 1:
+    launcher = as_launcher(workers)
+    if launcher.here:
         try:
             yield from ((number, _episode(job)) for number, job in enumerate(jobs))
         finally:
             _close()
         return
-    with closing(in_workers(_episode, jobs, workers)) as rows:
+    with closing(launcher.run(_episode, jobs)) as rows:
         yield from rows
 
 

@@ -17,6 +17,7 @@ from cavin_pyro.config.commands.reproduction import ReproduceConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
+from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import SCALES, Scale
@@ -88,18 +89,6 @@ def as_typed(config: DictConfig) -> str:
             value = config[name]
             words.append(f"{name}={value if isinstance(value, int | str) else '[' + ','.join(value) + ']'}")
     return shlex.join(["python", "-m", "cavin_pyro.reproduce", *words])
-
-
-def of_shard(stages: list[Stage], shard: str) -> list[Stage]:
-    """The trainings of `i/n`: the i-th, counted from 1, and every n-th after it.
-
-    Raises:
-        UserError: it is not of that form.
-    """
-    number, _, count = shard.partition("/")
-    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise UserError(f"shard must be i/n with 1 <= i <= n, such as 2/3, not {shard}")
-    return stages[int(number) - 1 :: int(count)]
 
 
 def _models(config: DictConfig, home: Path, own: Sequence[Evaluation]) -> dict[Evaluation, Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import WorldConfig, collection_world
 from cavin_pyro.config.options import option, seed_option
 from envs.workspace import MAXIMUM_OBJECTS
@@ -34,7 +35,7 @@ class CollectionOptions:
 
 
 @dataclass
-class CollectConfig(CollectionOptions):
+class CollectConfig(LaunchOptions, CollectionOptions):
     """Options of `python -m cavin_pyro.collect`."""
 
     defaults: list[Any] = field(default_factory=lambda: ["_self_", {"env/ranges": "paper"}, "base"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
 from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
 from envs.workspace import MAXIMUM_OBJECTS
@@ -99,7 +100,7 @@ class PlanConfig(EpisodeConfig):
 
 
 @dataclass
-class EvaluateConfig(EpisodeConfig):
+class EvaluateConfig(LaunchOptions, EpisodeConfig):
     """Options of `python -m cavin_pyro.evaluate`."""
 
     output: str | None = option(
@@ -118,6 +119,8 @@ class EvaluateConfig(EpisodeConfig):
     compare: str | None = option(
         None, "folder of another evaluation of the same scenes, to compare episode by episode", group="run"
     )
+    shard: str = option("1/1", "i/n: the i-th of every n episodes, so that n machines share the work", group="run")
+    merge: list[str] = option([], "folders of finished shards, [a,b], whose episodes are joined", group="run")
 
 
 @dataclass

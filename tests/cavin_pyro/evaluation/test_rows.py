@@ -68,11 +68,14 @@ def test_a_line_that_is_no_episode_is_named(row: Any, said: str, tmp_path: Path)
     assert f"episodes.jsonl, line 2 is no episode ({said})" in str(refused.value)
 
 
+LOCAL = {"launcher": "local", "workers": 1, "address": None}
+
+
 def test_an_episode_that_nobody_asked_for_displaces_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [{**ROW, "seed": seed} for seed in (3, 10, 11, 12)]
     written(tmp_path, *rows)
     monkeypatch.setattr(evaluation, "run_jobs", lambda jobs, workers: (job for job in ()))
-    config = OmegaConf.create({"seed": 10, "episodes": 3, "workers": 1})
+    config = OmegaConf.create({**LOCAL, "seed": 10, "episodes": 3, "shard": "1/1"})
     assert evaluate(config, tmp_path) == rows[1:]
 
 

@@ -6,9 +6,10 @@ import pytest
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale, of_shard
+from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale
 from cavin_pyro.reproduction.scales import SCALES
 from cavin_pyro.reproduction.stages import trainings
 from tests.cavin_pyro.conftest import ROOT

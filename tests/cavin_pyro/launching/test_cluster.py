@@ -1,0 +1,120 @@
+"""`launcher=ray`: a cluster of two nodes on this machine does what local processes do, also when it loses a node."""
+
+from __future__ import annotations
+
+import builtins
+import itertools
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.collection import collect
+from cavin_pyro.evaluation.evaluation import run_jobs
+from cavin_pyro.launching.cluster import in_cluster
+from cavin_pyro.launching.launcher import Launcher
+from tests.cavin_pyro.conftest import contents
+from tests.cavin_pyro.launching.work import act
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray leaves files and processes to the garbage collector
+NODE = {"num_cpus": 1, "object_store_memory": 80_000_000}
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two nodes of one processor each, without Ray's dashboard."""
+    pytest.importorskip("ray", reason="Ray is not installed: it comes with the extra ray")
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_agent_register_timeout_ms": "120000"}  # of a busy machine
+    from ray.cluster_utils import Cluster
+
+    two = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
+    two.add_node(**NODE)
+    yield two
+    two.shutdown()
+
+
+@pytest.fixture
+def ray(cluster: Any) -> Launcher:
+    return Launcher("ray", address=cluster.address)
+
+
+def test_every_job_is_done_once_and_in_order_if_asked(ray: Launcher) -> None:
+    found = dict(ray.run(act, [("sleep", 0.1)] * 5))
+    assert sorted(found) == [0, 1, 2, 3, 4]
+    assert os.getpid() not in found.values()
+    endless = (("sleep", 0.3 if number == 0 else 0.0) for number in itertools.count())
+    with closing(ray.run(act, endless, ordered=True)) as results:
+        assert [next(results)[0] for _ in range(6)] == list(range(6))
+
+
+def test_a_bug_in_a_job_is_raised_as_it_is(ray: Launcher) -> None:
+    with pytest.raises(ZeroDivisionError, match="^a bug$"):
+        list(ray.run(act, [("fail", 0.0)]))
+
+
+def test_a_job_whose_process_is_killed_is_run_again(ray: Launcher, tmp_path: Path) -> None:
+    mark = tmp_path / "begun"
+    assert dict(ray.run(_killed_once, [str(mark)])) == {0: "done"}
+    assert mark.exists()
+
+
+def _killed_once(mark: str) -> str:
+    if not Path(mark).exists():
+        Path(mark).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(60)
+    return "done"
+
+
+def test_collected_bytes_are_those_of_local_processes(ray: Launcher, pushes: Path, small: Any, tmp_path: Path) -> None:
+    collect(small.pushes, tmp_path, transitions=60, workers=ray)
+    ours, theirs = contents(tmp_path), contents(pushes)
+    names = {"metadata.json", *(f"episodes-{number:05d}.h5" for number in range(3))}
+    assert names <= set(ours)
+    assert all(ours[name] == theirs[name] for name in names)
+
+
+def test_a_lost_node_loses_no_episode(
+    ray: Launcher, cluster: Any, configure: Callable[..., DictConfig], small: SimpleNamespace
+) -> None:
+    config = configure("planner=random", "episodes=8")
+    jobs = [(config, seed) for seed in range(8)]
+    local = dict(run_jobs(jobs, 1))
+    found, third = {}, cluster.add_node(**NODE)
+    with closing(run_jobs(jobs, replace(ray))) as finished:
+        for number, row in finished:
+            found[number] = row
+            if third is not None:
+                cluster.remove_node(third, allow_graceful=False)
+                third = None
+    assert sorted(found) == list(range(8))
+    for number, row in found.items():
+        assert {**row, "planning_ms": 0} == {**local[number], "planning_ms": 0}
+
+
+def test_no_cluster_at_an_address_is_one_line() -> None:
+    pytest.importorskip("ray", reason="Ray is not installed: it comes with the extra ray")
+    with pytest.raises(UserError, match="no Ray cluster at address=127.0.0.1:1 "):
+        list(in_cluster(act, [("sleep", 0.0)], "127.0.0.1:1"))
+
+
+def test_without_ray_one_line_tells_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    imported = builtins.__import__
+
+    def without(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "ray":
+            raise ImportError("no module named ray")
+        return imported(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(UserError, match=r"launcher=ray needs Ray .*pip install -c constraints.txt '\.\[ray\]'"):
+        list(Launcher("ray").run(act, [("sleep", 0.0)]))

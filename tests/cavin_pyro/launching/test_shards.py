@@ -1,0 +1,61 @@
+"""`shard=i/n` and `merge=[...]` of evaluate, for those who have only a shell and many machines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.evaluation import evaluate, merge, seeds_of
+from cavin_pyro.launching.launcher import of_shard
+from cavin_pyro.storage.run_directory import write_config
+
+SHORT = ("maximum_steps=2", "workers=1", "episodes=5", "objects=2", "planner=random", "seed=7")
+
+
+def run(folder: Path, *overrides: str) -> list[dict[str, Any]]:
+    folder.mkdir()
+    config = compose("evaluate", *SHORT, *overrides, f"output={folder}")
+    write_config(folder, config)
+    rows = evaluate(config, folder)
+    assert sorted(map(json.dumps, rows)) == sorted((folder / "episodes.jsonl").read_text().splitlines())
+    return without_times(rows)
+
+
+def without_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{name: value for name, value in row.items() if name != "planning_ms"} for row in rows]
+
+
+def test_merged_shards_are_the_whole_evaluation(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole")
+    parts = [run(tmp_path / f"part-{number}", f"shard={number}/3") for number in (1, 2, 3)]
+    assert [[row["seed"] for row in part] for part in parts] == [[7, 10], [8, 11], [9]]
+
+    def joined(*names: str, options: tuple[str, ...] = ()) -> list[dict[str, Any]]:
+        folders = ",".join(str(tmp_path / name) for name in names)
+        return merge(compose("evaluate", *SHORT, f"merge=[{folders}]", *options, "output=unused"), tmp_path)
+
+    rows = joined("part-3", "part-1", "part-2")
+    assert without_times(rows) == whole
+    assert list(map(json.dumps, rows)) == (tmp_path / "episodes.jsonl").read_text().splitlines()
+    with pytest.raises(UserError, match="lack 2 of 5 episodes, the first with seed 8: give the folder of every shard"):
+        joined("part-1", "part-3")
+    with pytest.raises(UserError, match="holds a run with maximum_steps=2, not 3"):
+        joined("part-1", "part-2", "part-3", options=("maximum_steps=3",))
+    with pytest.raises(UserError, match=r"nowhere holds no episodes\.jsonl"):
+        joined("nowhere")
+
+
+def test_a_shard_without_an_episode_is_refused() -> None:
+    with pytest.raises(UserError, match="shard=6/6 has none of 5 episodes: choose a smaller n"):
+        seeds_of(compose("evaluate", *SHORT, "shard=6/6"))
+
+
+@pytest.mark.parametrize("shard", ["0/3", "4/3", "3", "a/b", "1/0", "-1/3", "1/3/5"])
+def test_a_shard_is_i_of_n(shard: str) -> None:
+    with pytest.raises(UserError, match="shard must be i/n with 1 <= i <= n, such as 2/3, not"):
+        of_shard(range(9), shard)
