@@ -7,7 +7,9 @@ alone.
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Generator, Iterable
 from itertools import islice
@@ -79,6 +81,7 @@ def _connected(address: str | None) -> Any:
     except ImportError as error:
         raise UserError(f"launcher=ray needs Ray ({error}): pip install -c constraints.txt '.[ray]'") from error
     if not ray.is_initialized():
+        handler = signal.getsignal(signal.SIGTERM)
         try:
             host, _, port = (address or "").rpartition(":")
             if port.isdecimal() and "/" not in host:  # Ray itself tries for minutes
@@ -87,6 +90,9 @@ def _connected(address: str | None) -> Any:
         except Exception as error:  # Ray has no class of its own for what can be wrong with a machine or an address
             where = f"no Ray cluster at address={address}" if address else "Ray did not start"
             raise UserError(f"{where} ({' '.join(str(error).split())[:200]})") from error
+        finally:
+            if threading.current_thread() is threading.main_thread():  # Ray takes SIGTERM, which ends us in one line
+                signal.signal(signal.SIGTERM, handler)
     return ray
 
 

@@ -9,9 +9,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -47,13 +45,24 @@ def ray(cluster: Any) -> Launcher:
     return Launcher("ray", address=cluster.address)
 
 
+@pytest.fixture
+def spare(cluster: Any) -> Any:
+    """A third node, to be lost. This process is connected before it comes, so not through it."""
+    import ray
+
+    ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+    return cluster.add_node(**NODE)
+
+
 def test_every_job_is_done_once_and_in_order_if_asked(ray: Launcher) -> None:
     found = dict(ray.run(act, [("sleep", 0.1)] * 5))
     assert sorted(found) == [0, 1, 2, 3, 4]
     assert os.getpid() not in found.values()
     endless = (("sleep", 0.3 if number == 0 else 0.0) for number in itertools.count())
+    handler = signal.getsignal(signal.SIGTERM)
     with closing(ray.run(act, endless, ordered=True)) as results:
         assert [next(results)[0] for _ in range(6)] == list(range(6))
+        assert signal.getsignal(signal.SIGTERM) is handler
 
 
 def test_a_bug_in_a_job_is_raised_as_it_is(ray: Launcher) -> None:
@@ -83,14 +92,49 @@ def test_collected_bytes_are_those_of_local_processes(ray: Launcher, pushes: Pat
     assert all(ours[name] == theirs[name] for name in names)
 
 
-def test_a_lost_node_loses_no_episode(
-    ray: Launcher, cluster: Any, configure: Callable[..., DictConfig], small: SimpleNamespace
+def test_a_job_that_was_running_on_a_lost_node_is_run_again_on_another(
+    ray: Launcher, cluster: Any, spare: Any, tmp_path: Path
+) -> None:
+    """All processors are taken, so that some job waits on the node that is lost."""
+    lost, found = spare, {}
+    with closing(ray.run(_waiting_on_node, [(str(tmp_path), lost.node_id, number) for number in range(6)])) as results:
+        for number, node in results:
+            found[number] = node
+            begun = tmp_path / "begun"
+            for _ in range(600):
+                if lost is None or begun.exists():
+                    break
+                time.sleep(0.1)
+            if lost is not None:
+                assert begun.exists()  # a job is on the node
+                cluster.remove_node(lost, allow_graceful=False)
+                name, lost = lost.node_id, None
+    assert sorted(found) == list(range(6))
+    assert name not in found.values()
+    assert int((tmp_path / "begun").read_text()) in found
+
+
+def _waiting_on_node(job: tuple[str, str, int]) -> str:
+    """The node that this runs on; on the node to be lost, wait for that."""
+    import ray
+
+    folder, lost, number = job
+    node = str(ray.get_runtime_context().get_node_id())
+    if node == lost:
+        (Path(folder) / "begun").write_text(str(number))
+        time.sleep(600)
+    time.sleep(1.0)  # so that one node does not do everything
+    return node
+
+
+def test_episodes_are_those_of_this_process_also_when_a_node_is_lost(
+    ray: Launcher, cluster: Any, spare: Any, configure: Callable[..., DictConfig]
 ) -> None:
     config = configure("planner=random", "episodes=8")
     jobs = [(config, seed) for seed in range(8)]
     local = dict(run_jobs(jobs, 1))
-    found, third = {}, cluster.add_node(**NODE)
-    with closing(run_jobs(jobs, replace(ray))) as finished:
+    found, third = {}, spare
+    with closing(run_jobs(jobs, ray)) as finished:
         for number, row in finished:
             found[number] = row
             if third is not None:
