@@ -28,7 +28,7 @@ def sleep_loss(model: Program, guide: Program, window: Window) -> Tensor:
     """-log q(codes | simulated window), in nats, mean over windows simulated from the first states of windows `[B]`."""
     codes, simulated = simulate(model, window)
     trace: poutine.Trace = poutine.trace(substitute(guide, codes)).get_trace(simulated)
-    return -trace.log_prob_sum() / len(window.actions)
+    return -torch.as_tensor(trace.log_prob_sum()) / len(window.actions)
 
 
 def wake_loss(model: Program, guide: Program, window: Window) -> Tensor:
