@@ -8,19 +8,7 @@ from pathlib import Path
 
 from cavin_pyro import __version__
 
-ORDER = (
-    "demo",
-    "plan",
-    "evaluate",
-    "collect",
-    "data",
-    "pretrain",
-    "train",
-    "check",
-    "calibrate",
-    "reproduce",
-    "assets",
-)
+ORDER = ("demo", "plan", "evaluate", "collect", "data", "pretrain", "train", "check", "reproduce", "assets")
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from tests.docs.pages import PAGES, ROOT, code_in_prose, links, name
 from tests.test_repository import PACKAGES
 
 FOLDERS = (*PACKAGES, "tests", "benchmarks", "checkpoints", "docs", "notebooks")
-COMMANDS = ("calibrate", "check", "collect", "demo", "evaluate", "plan", "pretrain", "reproduce", "train")
+COMMANDS = ("check", "collect", "demo", "evaluate", "plan", "pretrain", "reproduce", "train")
 PLANNERS = ("cavin", "cavin_without_effects", "sectar", "cvae_mpc", "mpc", "random")
 GROUPS = {"env/ranges", "model", "guide", "prior", "objective", "scales", "planner"}
 TOO_GENERAL = re.compile(r"NAME|TASK_N|\*")
@@ -39,6 +39,7 @@ def options() -> set[str]:
     found = set().union(*(keys(compose(command)) for command in COMMANDS))
     found |= set().union(*(keys(compose("plan", f"planner={planner}")) for planner in PLANNERS))
     found |= set().union(*(keys(compose("plan", f"planner.optimizer={optimizer}")) for optimizer in OPTIMIZERS))
+    found |= keys(compose("plan", "task=rearrange"))
     found |= keys(compose("train", "model=single_latent", "guide=single_latent", "objective=iwae"))
     return found | GROUPS
 
