@@ -6,6 +6,7 @@ With `--models` instead of methods: all of its trainings, for `reproduce models=
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from cavin_pyro.storage.files import atomic_write, read_json, write_json
 
 BASELINES = ("sectar", "cvae_mpc", "mpc")
 PARTS = ("model", "guide", "pointnet", "geometry")
+PRETRAINED = re.compile(r"output=(\S+)/pretrain\b")
 PUBLIC_HOME = "runs/reproduce"  # in shipped files, instead of the folder of the machine that trained
 
 
@@ -98,10 +100,15 @@ def _parameters(checkpoint: Checkpoint, part: str) -> int:
 
 
 def _public(record: Mapping[str, Any], checkpoint: Checkpoint) -> dict[str, Any]:
-    """A record without the path of the reproduction on the machine that trained: its `output` is HOME/train/NAME."""
-    home = Path(checkpoint.config["output"]).parent.parent
+    """A record without the paths of the reproduction on the machine that trained: its `output` is HOME/train/NAME.
+
+    The PointNet may be another reproduction's, with `output=HOME/pretrain`.
+    """
     text = json.dumps(record)
-    found: dict[str, Any] = json.loads(text.replace(f"{home}/", f"{PUBLIC_HOME}/") if home.name else text)
+    homes = {Path(checkpoint.config["output"]).parent.parent, *map(Path, PRETRAINED.findall(text))}
+    for home in homes:
+        text = text.replace(f"{home}/", f"{PUBLIC_HOME}/") if home.name else text
+    found: dict[str, Any] = json.loads(text)
     return found
 
 

@@ -12,6 +12,7 @@ from cavin_pyro.reproduction.table import TABLE, Row, read_table
 from tests.docs.pages import ROOT
 
 PUBLISHED = ROOT / "docs" / "measurements" / "reproduction"
+FOLDERS = (PUBLISHED, PUBLISHED / "12000-steps")
 
 
 @pytest.fixture(scope="module")
@@ -19,14 +20,15 @@ def rows() -> list[Row]:
     return read_table(PUBLISHED / TABLE)
 
 
-def test_the_page_of_results_is_what_the_table_of_episodes_says(rows: list[Row], tmp_path: Path) -> None:
-    page = (PUBLISHED / PAGE).read_text()
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_page_of_results_is_what_the_table_of_episodes_says(folder: Path, tmp_path: Path) -> None:
+    rows, page = read_table(folder / TABLE), (folder / PAGE).read_text()
     (command,) = re.findall(r"^    (python -m cavin_pyro\.reproduce .*)$", page, re.M)
-    assert command == f"python -m cavin_pyro.reproduce table={(PUBLISHED / TABLE).relative_to(ROOT)}"
+    assert command == f"python -m cavin_pyro.reproduce table={(folder / TABLE).relative_to(ROOT)}"
     written = write_results(tmp_path, rows, command)
     assert (tmp_path / PAGE).read_text() == page
     pictures = {path.name for path in written if path.suffix == ".png"}
-    assert pictures <= {path.name for path in PUBLISHED.glob("*.png")}
+    assert pictures <= {path.name for path in folder.glob("*.png")}
 
 
 def test_another_outcome_would_change_the_page(rows: list[Row], tmp_path: Path) -> None:
@@ -41,3 +43,13 @@ def test_another_outcome_would_change_the_page(rows: list[Row], tmp_path: Path) 
 def test_every_episode_is_of_another_scene_training_or_cell(rows: list[Row]) -> None:
     names = ("method", "planner", "task", "reward", "objects", "training_seed", "seed")
     assert len({tuple(row[name] for name in names) for row in rows}) == len(rows)
+
+
+def test_the_prose_about_the_claims_quotes_the_page_of_results() -> None:
+    prose = (PUBLISHED.parent / "reproduction.md").read_text()
+    (claims,) = re.findall(r"^## What reproduced.*?(?=^## )", prose, re.M | re.S)
+    measured = [row.split("|")[2] for row in claims.splitlines() if row.startswith("| ") and row.count("|") >= 4]
+    quoted = {number for cell in measured for number in re.findall(r"\d+\.\d", cell)}
+    page = (PUBLISHED / PAGE).read_text()
+    assert len(quoted) > 10
+    assert not {number for number in quoted if not re.search(rf"(?<![\d.]){re.escape(number)}(?!\d)", page)}
