@@ -28,6 +28,10 @@ class SceneContext(nn.Module):
 
         Raises `ValueError` for a missing or an unexpected effect code.
         """
+        return self.parts(state, effect_code)[1]
+
+    def parts(self, state: State, effect_code: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Features of each object `[..., M, width]`, zero for padding, and of the scene `[..., width]`."""
         hidden = self.from_object(torch.cat((relative_positions(state.centers), state.features), -1))
         if self.from_code is not None and effect_code is not None:
             hidden = hidden + self.from_code(effect_code).unsqueeze(-2)
@@ -35,4 +39,4 @@ class SceneContext(nn.Module):
             wanted = "takes no effect code" if effect_code is not None else "needs the effect code"
             raise ValueError(f"this prior {wanted}: effect_dimension says whether it is p(z | s, c) or p(c | s)")
         objects = self.objects(hidden.relu_()) * state.mask.unsqueeze(-1)
-        return self.scene(objects.sum(-2))
+        return objects, self.scene(objects.sum(-2))
