@@ -11,12 +11,13 @@ from torch import nn
 from models.cascaded import CascadedModel
 from models.priors.conditional import ConditionalPrior
 from models.priors.flow import FlowPrior
+from models.priors.mixture import ObjectMixturePrior
 from models.priors.standard import StandardPrior
 from models.state import State
 from planning import CavinPlanner
 from planning.rollouts.sampling import noise_each, reparameterize_each, sample_each
 
-each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior])
+each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior, ObjectMixturePrior])
 
 
 def model_with(kind: type) -> CascadedModel:
@@ -90,7 +91,7 @@ def test_an_environment_does_not_see_the_others(kind: type, toy: SimpleNamespace
     assert torch.allclose(both.actions[1], alone.actions[0], atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior])
+@pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior, ObjectMixturePrior])
 def test_what_the_prior_has_learned_is_what_is_considered(kind: type, toy: SimpleNamespace) -> None:
     """A prior trained on codes near 2 proposes codes near 2."""
     plan = planner(toy, kind)

@@ -66,7 +66,7 @@ def assess_aggregate(context: CheckContext, *, windows: int = 1000, permutations
         grade(excess, excess, good=SMALL_DISTANCE, bad=LARGE_DISTANCE),
         f"The largest distance beyond chance: good up to {SMALL_DISTANCE:g}, bad from {LARGE_DISTANCE:g}. Good is no "
         "licence to sample from the prior: the section prior decides that.",
-        "The prior's spread is wrong for every state: train with prior=conditional or prior=flow.",
+        "The prior's spread is wrong for every state: train with prior=mixture or prior=conditional.",
         windows=len(episodes),
         episodes=episodes,
     )

@@ -202,8 +202,8 @@ def _verdict(
         "over episodes is on the good side, bad if the whole is on the bad one; a large p counts for nothing."
     )
     advice = (
-        "Have the planner choose among many samples instead of trusting one; train with prior=conditional or "
-        "prior=flow, or for longer, and check again."
+        "Have the planner choose among many samples instead of trusting one; train with prior=mixture, or for "
+        "longer, and check again."
     )
     return conclude(worst(levels) if levels else LOOK, rule, advice, windows=len(episodes), episodes=episodes)
 

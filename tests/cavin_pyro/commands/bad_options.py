@@ -41,7 +41,7 @@ BAD_OPTIONS = [
     ("plan", "env.ranges.names=mug", "env.ranges.names must be a list, not mug"),
     ("train", "model=nonsense", "unknown model 'nonsense': choose from cascaded"),
     ("train", "guide=nonsense", "unknown guide 'nonsense': choose from auto_iaf, auto_low_rank, auto_normal, cascaded"),
-    ("train", "prior=nonsense", "unknown prior 'nonsense': choose from conditional, flow, standard"),
+    ("train", "prior=nonsense", "unknown prior 'nonsense': choose from conditional, flow, mixture, standard"),
     (
         "train",
         "objective=nonsense",

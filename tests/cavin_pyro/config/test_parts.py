@@ -35,7 +35,7 @@ def test_a_model_gets_a_prior_of_its_own_size_for_each_code(small: SimpleNamespa
     assert model.width == 8
 
 
-@pytest.mark.parametrize("prior", ["standard", "conditional", "flow"])
+@pytest.mark.parametrize("prior", ["standard", "conditional", "flow", "mixture"])
 @pytest.mark.parametrize("guide", ["cascaded", "flow"])
 def test_presets_of_priors_and_guides_build_what_a_checkpoint_builds_again(
     prior: str, guide: str, tmp_path: Path

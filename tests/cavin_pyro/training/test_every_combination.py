@@ -106,7 +106,7 @@ def losses(config: DictConfig, table: WindowTable, folder: Path) -> tuple[float,
 def test_every_preset_is_covered() -> None:
     assert set(MODELS) == set(FITTING)
     assert set(GUIDES) == set().union(*FITTING.values())
-    assert {"standard", "conditional", "flow"} <= set(PRIORS)
+    assert {"standard", "conditional", "flow", "mixture"} <= set(PRIORS)
     assert {"trace_elbo", "mean_field_elbo", "trace_graph_elbo", "trace_enum_elbo"} <= set(OBJECTIVES)
     assert {"iwae", "renyi", "counterfactual"} <= set(OBJECTIVES)
 

@@ -12,7 +12,7 @@ from torch.distributions import kl_divergence
 
 from models.priors.conditional import ConditionalPrior
 from models.priors.flow import FlowPrior
-from models.priors.mixture import GaussianMixture, ObjectMixturePrior
+from models.priors.mixture import ObjectMixturePrior
 from models.state import State
 
 SIZES = {"dimension": 4, "feature_dimension": 6, "width": 8}
