@@ -17,15 +17,18 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
-    from cavin_pyro.visualization.rendering import check_viewer, episode_files, render_episode
+    from cavin_pyro.visualization.rendering import check_goal, check_viewer, episode_files, render_episode, write_goal
 
     check_viewer(config.viewer)
+    check_goal(config.save_goal)
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "video", "viewer"))
+        check_same_run(folder, config, ignore=("output", "video", "viewer", "save_goal"))
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
         announce_waiting(config)
         row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
+        if config.save_goal is not None:
+            write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
         print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from envs.objects.asset import plain_name
 from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import Area, ObjectRanges
 from envs.observation import Observation
-from envs.randomness import layout_stream, next_scene_stream
+from envs.randomness import goal_stream, layout_stream, next_scene_stream
 from envs.scene import Scene
 from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
@@ -38,9 +39,9 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is
     the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
 
-    `info` of a reset: `steps`, which is 0, and the episode's `task` in its layout. `info` of a step: `steps` so far,
-    `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable", not begun;
-    "blocked" by an obstacle; contact with the "table"; "" if it did not), `success`, `violation`, `fall`,
+    `info` of a reset: `steps`, which is 0, and the episode's `task` in its layout and with its goal. `info` of a step:
+    `steps` so far, `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable", not
+    begun; "blocked" by an obstacle; contact with the "table"; "" if it did not), `success`, `violation`, `fall`,
     `terms`, the named terms of the reward, and `strict`, the same step by `criterion="strict"`: `success`, `violation`,
     `fall` and `reward`. An episode terminates at success, violation or fall, and is truncated
     after `maximum_steps`.
@@ -55,7 +56,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         object_set: a key of `envs.objects.object_sets.OBJECT_SETS`.
         camera, segmentation: see `envs.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
-        maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table.
+        maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table, and the
+            objects' places.
 
     Raises:
         ValueError: an argument is out of its range, a function of the user's task returns another type or shape than
@@ -135,11 +137,13 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
         self.task, self.reward = self.tasks[number], self._rewards[number]
         self._strict_reward = self._strict_rewards[number]
-        self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
         target = _areas(self.task.target_start, TARGET_JITTER)
         obstacle = _areas(self.task.obstacle_start, OBSTACLE_JITTER)
         areas = [target, *[obstacle] * (self.objects - 1)]
-        self._observation = self.scene.sample(areas, self.ranges, scene_generator, acceptable=self._can_start)
+        can_start = partial(self._can_start, self.task, goal_stream(scene_generator))
+        self._observation = self.scene.sample(areas, self.ranges, scene_generator, acceptable=can_start)
+        self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
+        self.scene.places = self.task.object_places() if self.show_tiles else ()
         self._steps = 0
         return _as_dict(self._observation), {"steps": 0, "task": self.task}
 
@@ -182,7 +186,13 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         """Free the simulator."""
         self.scene.close()
 
-    def _can_start(self, observation: Observation) -> bool:
+    def _can_start(self, layout: Task, generator: np.random.Generator, observation: Observation) -> bool:
+        """Take the task of the episode that would begin so; whether it has not already ended."""
+        task = layout.of_episode(observation, generator)
+        if task is not layout:
+            kind = "dense" if self.reward.dense else "sparse"
+            self.task, self.reward = task, TaskReward(task, reward=kind, criterion=self.reward.criterion)
+            self._strict_reward = TaskReward(task, reward=kind)
         outcome = _judged(self._strict_reward, observation, observation)
         return not bool(outcome.success | outcome.failure)
 

@@ -8,6 +8,7 @@ planners and policies are compared on equal scenes.
 | --- | --- | --- | --- |
 | scene | one reset of an environment, the k-th since it was seeded | `seed` | `(k,)` |
 | layout | of that reset, where the layout is random | `seed` | `(k, LAYOUT)` |
+| goal | of that reset, where the goal is random | `seed` | `(k, GOAL)` |
 | scene | one collected episode: how many objects, and where | `[seed, episode]` | `(0,)` |
 | policy | of that episode: the heuristic's pushes | `[seed, episode]` | `(1,)` |
 | objects | the a-th scene sampled until one is acceptable: shapes, masses, poses | as its scene | `(*scene, 2 a)` |
@@ -15,7 +16,7 @@ planners and policies are compared on equal scenes.
 | sensor | of that scene: the camera's pose and noise | as its scene | `(*points, SENSOR)` |
 | planner | one episode: its first number seeds torch's generator | `[seed, 1]` | none |
 
-`LAYOUT` and `SENSOR` are larger than any number that `Generator.spawn` counts to, so they change
+`LAYOUT`, `SENSOR` and `GOAL` are larger than any number that `Generator.spawn` counts to, so they change
 neither the spawned streams nor their order. Published success rates and collected data depend on this table:
 you may add purposes, but must not change the derivation of the existing ones.
 """
@@ -24,7 +25,7 @@ from __future__ import annotations
 
 import numpy as np
 
-LAYOUT, SENSOR = 2**31, 2**31 + 1  # last entries of spawn keys
+LAYOUT, SENSOR, GOAL = 2**31, 2**31 + 1, 2**31 + 2  # last entries of spawn keys
 _PLANNER = 1  # last word of the planner's entropy
 
 
@@ -48,6 +49,11 @@ def next_scene_stream(environment: np.random.Generator) -> np.random.Generator:
 def layout_stream(scene: np.random.Generator) -> np.random.Generator:
     """The stream for a scene's random layout."""
     return named_stream(scene, LAYOUT)
+
+
+def goal_stream(scene: np.random.Generator) -> np.random.Generator:
+    """The stream for a scene's random goal."""
+    return named_stream(scene, GOAL)
 
 
 def next_sample_streams(scene: np.random.Generator) -> tuple[np.random.Generator, np.random.Generator]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from envs.filming import FrameHook, film
-from envs.markings import LEVEL, TileGroup, paint_tiles
+from envs.markings import LEVEL, Place, TileGroup, paint_places, paint_tiles
 from envs.objects.object_sets import BuiltinObjects, ObjectSet
 from envs.objects.sampling import Area, ObjectParameters, ObjectRanges, sample_objects
 from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
@@ -86,6 +86,7 @@ class Scene:
         self.on_frame = on_frame
         self.world = PhysicsWorld()
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
+        self.places: Sequence[Place] = ()  # of the objects in their order, which photographs show as well
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
         # CPU time by purpose, in seconds.
@@ -234,14 +235,15 @@ class Scene:
         self.bodies = ordered
 
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
-        """A colour image [height, width, 3] of the scene with the `markings` on the table, for people."""
+        """A colour image [height, width, 3] of the scene with the `markings` and `places` on the table, for people."""
         rendering = self.world.render(camera)
-        if not self.markings:
+        if not self.markings and not self.places:
             return rendering.color
         rows, columns = np.nonzero(~np.isin(rendering.bodies, self.bodies))
         points = camera.points(rendering.depth, rows, columns)
         top = np.abs(points[:, 2]) < LEVEL
-        return paint_tiles(rendering.color, rows[top], columns[top], points[top, :2], self.markings)
+        pixels = rows[top], columns[top], points[top, :2]
+        return paint_places(paint_tiles(rendering.color, *pixels, self.markings), *pixels, self.places, COLORS)
 
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""

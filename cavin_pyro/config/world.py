@@ -37,7 +37,7 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
         raise UserError(f"task._target_={target} cannot be imported: {' '.join(str(error).split())}") from error
     if not issubclass(kind, Task):
         raise UserError(f"task._target_={target} is no task: derive it from envs.tasks.Task")
-    return kind, fields | section
+    return kind, fields | {name: value for name, value in section.items() if value is not None}
 
 
 def check_world(env: DictConfig) -> None:

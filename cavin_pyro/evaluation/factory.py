@@ -78,6 +78,11 @@ def check_options(config: DictConfig) -> None:
             "planner.compile=true compiles for one layout, and layout=random samples another in every episode: "
             "choose planner.compile=false"
         )
+    if config.planner.get("compile") and task_of(config)[0].goal_varies:
+        raise UserError(
+            "planner.compile=true compiles for one goal, and this task has another in every episode: "
+            "choose planner.compile=false"
+        )
 
 
 def planner_name(config: DictConfig) -> str:

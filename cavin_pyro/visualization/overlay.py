@@ -52,10 +52,16 @@ def table_box(view: View) -> tuple[float, float, float, float]:
     return float(left), float(top), float(right), float(bottom)
 
 
-def circle(center: NDArray[np.floating], view: View) -> tuple[tuple[float, float], float]:
-    """Centre and radius of a circle on the table around a point [3] metres, to mark the target with."""
+def circle(
+    center: NDArray[np.floating], view: View, radius: float = TARGET_RADIUS
+) -> tuple[tuple[float, float], float]:
+    """Centre and radius of a circle on the table around a point [3] metres, by default to mark the target with.
+
+    Args:
+        radius: metres.
+    """
     column, row = view.project(center)
-    edge = on_table(np.array([[0.0, 0.0], [0.0, TARGET_RADIUS]]), view)
+    edge = on_table(np.array([[0.0, 0.0], [0.0, radius]]), view)
     return (float(column), float(row)), float(np.linalg.norm(edge[1] - edge[0]))
 
 

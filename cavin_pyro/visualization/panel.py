@@ -31,6 +31,8 @@ from cavin_pyro.visualization.overlay import (
     subgoal_chains,
     tile_corners,
 )
+from envs.markings import PLACE_RADIUS
+from envs.scene import COLORS
 from envs.tasks import Task
 
 CANDIDATES = 150  # dots per panel
@@ -53,6 +55,7 @@ _OBSTACLES: Style = {**_SUBGOALS, "marker": "s", "markersize": 4.5, "color": OBS
 _PREDICTED: Style = {"marker": "x", "markersize": 4, "color": PREDICTION_COLOR, "linewidth": 1.2}
 _REACHED: Style = {"marker": "D", "markersize": 3, "color": REACHED_COLOR, "linewidth": 1.2}
 _PUSH: Style = {"arrowstyle": "-|>", "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4}
+_PLACE: Style = {"fill": False, "linewidth": 2.4}
 _TARGET: Style = {"color": PUSH_COLOR, "linestyle": "--", "linewidth": 1.5}
 
 
@@ -82,6 +85,7 @@ def draw_overlay(
     if reached is not None:
         draw_paths(panel, reached_paths(record, reached, view))
     draw_objects(panel, record.centers, record.mask, view)
+    draw_places(panel, task, view)
 
 
 def draw_paths(panel: Axes, paths: Mapping[int, Pixels]) -> None:
@@ -108,12 +112,22 @@ def draw_objects(panel: Axes, centers: NDArray[np.float32], mask: NDArray[np.boo
         panel.add_patch(Circle(center, radius, fill=False, path_effects=_HALO, zorder=6, **_TARGET))
 
 
+def draw_places(panel: Axes, task: Task, view: View) -> None:
+    """Draw a ring in each object's colour around the place where it has to go, if the task has places."""
+    for (x, y), color in zip(task.object_places(), COLORS, strict=False):
+        center, radius = circle(np.array([x, y, 0.0]), view, PLACE_RADIUS)
+        panel.add_patch(Circle(center, radius, color=color, path_effects=_HALO, zorder=5, **_PLACE))
+
+
 def legend(task: Task, plan_records: Sequence[PlanRecord], *, candidates: bool) -> list[Line2D | Patch]:
     """Legend entries for exactly what `draw_overlay` draws of an episode."""
     entries: list[Line2D | Patch] = [
         Patch(facecolor=to_rgba(group.color, group.opacity), edgecolor=group.color, label=group.name)
         for group in task.tile_groups()
     ]
+    if task.object_places():
+        ring: Style = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": ""}
+        entries.append(Line2D([], [], label="places, in the objects' colours", color=COLORS[0], **ring))
     entries.append(Line2D([], [], label="target", **_TARGET))
     entries.append(Line2D([], [], label="observed", **_OBSERVED))
     if candidates:

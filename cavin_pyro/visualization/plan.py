@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord
 from cavin_pyro.visualization.overlay import TABLE_COLOR, View, reached_paths, table_box
-from cavin_pyro.visualization.panel import RETURNS, counted, draw_objects, draw_overlay, draw_paths, draw_tiles, legend
+from cavin_pyro.visualization.panel import (
+    RETURNS,
+    counted,
+    draw_objects,
+    draw_overlay,
+    draw_paths,
+    draw_places,
+    draw_tiles,
+    legend,
+)
 from cavin_pyro.visualization.table_map import Map, draw_clouds, mark_axes
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
 from envs.sensors.camera import Camera
@@ -139,6 +148,7 @@ def draw_end(panel: Axes, episode: Episode, task: Task, camera: Camera | None) -
     )
     draw_paths(panel, reached_paths(first, centers, view))
     draw_objects(panel, centers[-1] if len(centers) else last.centers, last.mask, view)
+    draw_places(panel, task, view)
     won = episode.outcome == "success"
     panel.set_title(
         f"end, after {counted(len(episode.transitions))}: {'success' if won else f'failure ({episode.outcome})'}",

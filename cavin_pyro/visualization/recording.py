@@ -20,6 +20,7 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.recording_plan import log_plan, log_reached, object_name, vivid
 from cavin_pyro.visualization.video import FRAMES_PER_SECOND, PAUSE
 from envs.appearance import parts_of
+from envs.markings import PLACE_RADIUS
 from envs.pushing import ObservationDict, PushingEnv
 from envs.scene import COLORS
 from envs.tasks import Task
@@ -100,6 +101,12 @@ class EpisodeRecording(EpisodeCallback):
             strips = [np.column_stack([loop, np.full(len(loop), TILE_HEIGHT)]) for loop in loops]
             lines = rr.LineStrips3D(strips, colors=vivid(to_rgb(group.color)), radii=0.002)
             self._stream.log(f"world/tiles/{group.name.replace(' ', '_')}", lines, static=True)
+        for number, place in enumerate(self._task.object_places()):
+            angles = np.linspace(0.0, 2.0 * np.pi, 33)
+            ring = np.array(place) + PLACE_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+            strip = np.column_stack([ring, np.full(len(ring), TILE_HEIGHT)])
+            lines = rr.LineStrips3D([strip], colors=vivid(COLORS[number]), radii=0.002)
+            self._stream.log(f"world/places/{object_name(number)}", lines, static=True)
 
     def _link_path(self, body: int, link: int) -> str:
         if body in self._scene.bodies:

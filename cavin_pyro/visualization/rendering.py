@@ -16,6 +16,8 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
 from cavin_pyro.visualization.progress import EpisodeProgress
 from cavin_pyro.visualization.video import EpisodeVideo
+from envs.goals import SUFFIXES, goal_bytes
+from envs.scene import Scene
 
 EVIDENCE_COLUMNS = ("log_z", "temperature", "effective_samples")
 VIEWERS = {"rerun": "rerun"}  # the choices of `viewer=`, and the module that it needs
@@ -38,6 +40,33 @@ def check_viewer(viewer: object) -> None:
             f"viewer={viewer} needs an optional part that is not installed ({error}): "
             "run python -m pip install --constraint constraints.txt '.[viewer]' in the repository"
         ) from error
+
+
+def check_goal(path: str | None) -> None:
+    """Check the option `save_goal`, before anything is written.
+
+    Raises:
+        UserError: a suffix that no goal has, or no folder to write into.
+    """
+    if path is None:
+        return
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise UserError(f"save_goal={path} must end in {', '.join(SUFFIXES)}")
+    if not Path(path).parent.is_dir():
+        raise UserError(f"save_goal={path}: there is no folder {Path(path).parent}")
+
+
+def write_goal(path: str, scene: Scene) -> None:
+    """Write a scene as it is now to a file for `task.goal`, atomically.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    try:
+        with atomic_write(Path(path)) as temporary:
+            temporary.write_bytes(goal_bytes(Path(path).suffix, scene))
+    except OSError as error:
+        raise UserError(f"save_goal={path} cannot be written: {error.strerror}") from error
 
 
 def render_episode(

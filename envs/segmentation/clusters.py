@@ -34,8 +34,7 @@ class ClusterSegmenter:
             ValueError: the image shows no table.
         """
         heights = map_heights(image)
-        regions = [part for region in find_regions(heights) for part in split_at_necks(region)]
-        regions.sort(key=lambda region: -int(region.sum()))
+        regions = find_objects(heights)
         first = _confirmed(regions, image, target)
         others = [region for number, region in enumerate(regions) if number != first]
         kept = [None if first is None else regions[first], *others][:MAXIMUM_OBJECTS]
@@ -54,6 +53,12 @@ class ClusterSegmenter:
             if track is not None:
                 self._tracks[number] = track
         return pixels_of([None if track is None else track.region for track in found], heights)
+
+
+def find_objects(heights: HeightMap) -> list[Mask]:
+    """The regions [I, J] of all objects on a height map, the largest first."""
+    regions = [part for region in find_regions(heights) for part in split_at_necks(region)]
+    return sorted(regions, key=lambda region: -int(region.sum()))
 
 
 def _confirmed(regions: list[Mask], image: DepthImage, target: tuple[int, int] | None) -> int | None:

@@ -13,10 +13,12 @@ from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, fields
 from typing import ClassVar, Literal, NamedTuple, get_type_hints
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from envs.markings import TileGroup
+from envs.markings import Place, TileGroup
+from envs.observation import Observation
 from envs.tasks.step import Step
 from envs.tasks.tiles import TileSet, parse_tiles
 from envs.workspace import Tile
@@ -50,6 +52,7 @@ class Task(ABC):
         markings: how pictures show the layout; later ones lie on top of earlier ones.
         about: the objects whose subgoals pictures show: the `target` (object 0), or `all`.
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
+        goal_varies: whether `of_episode` returns another task in every episode, which planners must not compile.
         target_start, obstacle_start: tiles on which objects start.
 
     Raises:
@@ -60,6 +63,7 @@ class Task(ABC):
     markings: ClassVar[tuple[Marking, ...]] = ()
     about: ClassVar[Literal["target", "all"]] = "target"
     maximum_return: ClassVar[float] = GOAL_REWARD + TIME_REWARD
+    goal_varies: ClassVar[bool] = False
 
     target_start: TileSet
     obstacle_start: TileSet
@@ -126,6 +130,21 @@ class Task(ABC):
             "time": torch.full_like(progress, TIME_REWARD),
             "progress": progress,
         }
+
+    def of_episode(self, observation: Observation, generator: np.random.Generator) -> Task:
+        """The task of one episode: this one, or a copy with the goal of that episode.
+
+        The environment calls it with every scene that may become an episode, and the planner's reward is that of the
+        returned task. A task that returns a copy sets `goal_varies`.
+
+        Args:
+            observation: the episode's first. generator: for the goal alone, so that scenes do not depend on the task.
+        """
+        return self
+
+    def object_places(self) -> tuple[Place, ...]:
+        """Where on the table each object has to go, in the order of objects, for pictures; by default nowhere."""
+        return ()
 
     @classmethod
     def random_layouts(cls) -> tuple[Task, ...]:

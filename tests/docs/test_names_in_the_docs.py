@@ -39,6 +39,7 @@ def options() -> set[str]:
     found = set().union(*(keys(compose(command)) for command in COMMANDS))
     found |= set().union(*(keys(compose("plan", f"planner={planner}")) for planner in PLANNERS))
     found |= set().union(*(keys(compose("plan", f"planner.optimizer={optimizer}")) for optimizer in OPTIMIZERS))
+    found |= keys(compose("plan", "task=rearrange"))
     found |= keys(compose("train", "model=single_latent", "guide=single_latent", "objective=iwae"))
     return found | GROUPS
 

@@ -144,12 +144,11 @@ def test_a_scene_in_which_the_target_has_rolled_off_the_bridge_is_sampled_anew(
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_the_reward_is_the_task_reward_of_the_observations(make: Make, task: str, kind: str) -> None:
     env = make(task=task, objects=4, reward=kind, ranges=ObjectRanges(clearance=0.1))
-    imagined = TaskReward(env.task, reward=kind)
     policy = HeuristicPushingPolicy(np.random.default_rng(1))
     changed = 0
     observed, _ = env.reset(seed=2)
     for _ in range(10):
-        before = observed
+        before, imagined = observed, TaskReward(env.task, reward=kind)
         observed, reward, terminated, _, info = env.step(policy.act(observation(observed)).astype(np.float32))
         outcome = imagined(
             torch.from_numpy(before["centers"]),

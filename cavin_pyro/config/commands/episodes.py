@@ -94,6 +94,12 @@ class PlanConfig(EpisodeConfig):
 
     output: str | None = option(None, "folder for the results; by default a separate one in runs/plan", group="run")
     video: bool = option(True, "write a video of the episode", group="run")
+    save_goal: str | None = option(
+        None,
+        "file for the episode's last scene, as a goal for task=rearrange: a depth image (.png, .npy) or point clouds "
+        "(.safetensors)",
+        group="run",
+    )
     viewer: str | None = option(
         None, "rerun also writes a recording in 3D, episode.rrd; needs the extra .[viewer]", group="run"
     )

@@ -92,6 +92,12 @@ BAD_FILES = [
     ("plan", "tiles.goal=5", "goal must be a list of tiles such as [[2, 3], [2, 4]], not 5"),
     ("plan", "objects=5 env.ranges.clearance=1", "no room for 5 objects at least 1 m apart"),
     ("collect", "env.ranges.clearance=2 minimum_objects=5", "no room for 5 objects at least 2 m apart"),
+    # Goals.
+    ("plan", "task=rearrange task.goal=@nothing.png", "nothing.png cannot be read: No such file or directory"),
+    ("plan", "task=rearrange task.goal=@noise", "must be a file that ends in .png, .npy, .safetensors"),
+    ("evaluate", "task=rearrange task.goal=@no_yaml.yaml", "must be a file that ends in .png, .npy, .safetensors"),
+    ("plan", "save_goal=@nothing/goal.png", "there is no folder"),
+    ("plan", "save_goal=goal.pkl", "save_goal=goal.pkl must end in .png, .npy, .safetensors"),
     # Places that cannot be written to; a folder below a file is refused to every user alike.
     *(
         (
