@@ -127,7 +127,7 @@ def legend(task: Task, plan_records: Sequence[PlanRecord], *, candidates: bool) 
     ]
     if task.object_places():
         ring: Style = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": ""}
-        entries.append(Line2D([], [], label="places, in the objects' colours", color=COLORS[0], **ring))
+        entries.append(Line2D([], [], label="places", color=COLORS[0], **ring))
     entries.append(Line2D([], [], label="target", **_TARGET))
     entries.append(Line2D([], [], label="observed", **_OBSERVED))
     if candidates:

@@ -10,14 +10,14 @@ from envs.goals.goal import Goal
 from envs.markings import Place
 from envs.observation import Observation
 
-SHAPE_WEIGHT = 20.0  # metres of way that one metre of difference in shape is worth
+SHAPE_WEIGHT = 100.0  # metres of way that one metre of difference in shape is worth; docs/measurements/success.md
 
 
 def assign(observation: Observation, goal: Goal) -> tuple[Place, ...]:
     """A place (x, y) in metres for each object of an episode's first observation, in the objects' order.
 
     The assignment of least cost, where an object and a place cost the way between them, plus `SHAPE_WEIGHT` times the
-    difference of their `outlines`. A centimetre of height or length so outweighs 20 cm of way; objects that look
+    difference of their `outlines`. A millimetre of height or length so outweighs 10 cm of way; objects that look
     the same take the nearest places.
 
     Args:

@@ -42,7 +42,7 @@ class Rearrange(Task):
         places: (x, y) metres of each object, in order; empty takes those of `goal`. Episodes have it.
     """
 
-    markings = (Marking("region", "places", "#F2C200", 0.12),)
+    markings = (Marking("region", "region of places", "#F2C200", 0.12),)
     about = "all"
     goal_varies = True
 

@@ -106,6 +106,17 @@ def test_a_plans_figure_shows_subgoals_and_predictions(task: str, tmp_path: Path
     assert pixels_like(image, PREDICTION_COLOR) > 10
 
 
+def test_a_plans_figure_shows_each_objects_place_in_its_colour(tmp_path: Path) -> None:
+    places = [[0.85, 0.45], [0.85, 0.25]]
+    with_places, without = load_task("rearrange", 0, {"places": places}), load_task("rearrange", 0)
+    found = []
+    for task in (with_places, without):
+        draw_plan(tmp_path / "plan.png", episode(made_up_plan(), made_up_plan()), task, CAMERA)
+        image = imageio.imread(tmp_path / "plan.png")
+        found.append([pixels_like(image, colors.to_hex(color)) for color in COLORS[:2]])
+    assert (np.array(found[0]) > np.array(found[1]) + 100).all()
+
+
 def with_evidence() -> Plan:
     """A plan by inference, after which 7.5 of 100 particles are effective."""
     numbers = torch.tensor([-1.234]), torch.tensor([10.0]), torch.tensor([[60.0, 7.5, 30.0, 90.0]])
