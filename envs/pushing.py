@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from envs.layouts import possible_tasks
+from envs.layouts import GENERATED, generate_task, possible_tasks
 from envs.objects.asset import plain_name
 from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import Area, ObjectRanges
@@ -21,7 +21,7 @@ from envs.randomness import goal_stream, layout_stream, next_scene_stream
 from envs.scene import Scene
 from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
-from envs.tasks import TASKS, Outcome, Task, TaskReward, TileSet
+from envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
 from envs.tasks.contract import check_functions
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
 
@@ -49,6 +49,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     Args:
         task, layout, tiles: see `envs.layouts.possible_tasks`; `tiles` replaces fields of the layout.
             `layout="random"` is sampled at every reset. A `Task` object has its own layout.
+        generated: what is wanted of `layout="generated"`, which is generated at every reset, unless it has a seed.
         reward: dense or sparse. criterion: what ends an episode as a violation, see `envs.tasks.TaskReward`. Scenes and
             observations do not depend on it.
         objects: how many, 1 to 5. ranges: object parameters.
@@ -72,6 +73,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         task: str | type[Task] | Task = "crossing",
         layout: int | str | Path = 0,
         tiles: Mapping[str, Any] | None = None,
+        generated: GeneratedLayouts | None = None,
         reward: str = "sparse",
         criterion: str = "strict",
         objects: int = 3,
@@ -93,12 +95,19 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         if isinstance(task, Task) and (layout != 0 or tiles):
             raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
-        self.tasks = (task,) if isinstance(task, Task) else possible_tasks(task, layout, tiles)
+        self._generate: Callable[[np.random.Generator], Task] | None = None
+        if isinstance(task, Task):
+            self.tasks: tuple[Task, ...] = (task,)
+        elif layout == GENERATED:
+            wanted = generated or GeneratedLayouts()
+            self.tasks = (generate_task(task, wanted, None, tiles),)
+            self._generate = partial(generate_task, task, wanted)
+        else:
+            self.tasks = possible_tasks(task, layout, tiles)
         if type(self.tasks[0]) not in TASKS.values():
             check_functions(self.tasks[0], int(objects))
-        self._rewards = [TaskReward(one, reward=reward, criterion=criterion) for one in self.tasks]
-        self._strict_rewards = [TaskReward(one, reward=reward) for one in self.tasks]
-        self.task, self.reward, self._strict_reward = self.tasks[0], self._rewards[0], self._strict_rewards[0]
+        self._rules = reward, criterion
+        self._begin(self.tasks[0])
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
@@ -135,8 +144,9 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         number = (options or {}).get("layout", sampled)
         if number not in range(len(self.tasks)):
             raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
-        self.task, self.reward = self.tasks[number], self._rewards[number]
-        self._strict_reward = self._strict_rewards[number]
+        if self._generate is not None:
+            self.tasks = (self._generate(layout_stream(scene_generator)),)
+        self._begin(self.tasks[number])
         target = _areas(self.task.target_start, TARGET_JITTER)
         obstacle = _areas(self.task.obstacle_start, OBSTACLE_JITTER)
         areas = [target, *[obstacle] * (self.objects - 1)]
@@ -186,13 +196,17 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         """Free the simulator."""
         self.scene.close()
 
+    def _begin(self, task: Task) -> None:
+        """Use a task and its rewards."""
+        reward, criterion = self._rules
+        self.task, self.reward = task, TaskReward(task, reward=reward, criterion=criterion)
+        self._strict_reward = TaskReward(task, reward=reward)
+
     def _can_start(self, layout: Task, generator: np.random.Generator, observation: Observation) -> bool:
         """Take the task of the episode that would begin so; whether it has not already ended."""
         task = layout.of_episode(observation, generator)
         if task is not layout:
-            kind = "dense" if self.reward.dense else "sparse"
-            self.task, self.reward = task, TaskReward(task, reward=kind, criterion=self.reward.criterion)
-            self._strict_reward = TaskReward(task, reward=kind)
+            self._begin(task)
         outcome = _judged(self._strict_reward, observation, observation)
         return not bool(outcome.success | outcome.failure)
 

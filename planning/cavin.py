@@ -11,6 +11,7 @@ from torch import Tensor
 from models.state import State
 from planning.backends.chunking import chunked
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
+from planning.extensions.guidance import guided_tracking
 from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import most_robust
 from planning.inputs import check_positive, check_weight
@@ -53,6 +54,8 @@ class CavinPlanner(SearchingPlanner):
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
     idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
         last; 0 keeps g's order (paper).
+    guidance: our addition to lines 7 and 10: `layout` prefers, among plans that miss the goal, those that leave the
+        shortest way to it along allowed places; `none` in the paper.
     compile: compile the inner functions to native code, which takes one or two minutes once and is kept on disk.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
@@ -112,6 +115,8 @@ class CavinPlanner(SearchingPlanner):
         # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
         ends = effects.score_state.segments.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
         tracking_cost: Objective = TrackingCost(subgoals, ends, self.feature_weight)
+        reached = effects.score_state.succeeded.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
+        tracking_cost = guided_tracking(tracking_cost, self.way, reached)
         if self.avoid_failures:
             tracking_cost = AvoidFailures(tracking_cost, ends, reward)
         motions = self.search(

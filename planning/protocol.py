@@ -170,6 +170,25 @@ class PathReward(RewardFunction, Protocol):
         """
 
 
+class WayToGoal(Protocol):
+    """The way that is left to the goal, for guidance beyond the horizon."""
+
+    def __call__(self, centers: Tensor, mask: Tensor, /) -> Tensor:
+        """Metres left: `[...]`, from `centers: [..., M, 3]` metres and `mask: [..., M]` bool; 0 at the goal."""
+
+    def longest(self, mask: Tensor, /) -> Tensor:
+        """An upper bound on the metres left with the objects in `mask: [..., M]`: `[...]`."""
+
+
+@runtime_checkable
+class GuidingReward(RewardFunction, Protocol):
+    """A reward function that knows the way to the goal."""
+
+    @property
+    def way(self) -> WayToGoal:
+        """The way, the same object in every call."""
+
+
 class Planner(Protocol):
     """Turns observed states into pushes."""
 

@@ -11,12 +11,13 @@ from torch import Tensor
 from models.state import State
 from planning.backends.compiled import Compiled
 from planning.backends.eager import Backend, eager
+from planning.extensions.guidance import check_guidance, guided_return, way_of
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
 from planning.plan import Plan
-from planning.protocol import DynamicsModel, EpisodicReward, ModelRequirements, RewardFunction
+from planning.protocol import DynamicsModel, EpisodicReward, ModelRequirements, RewardFunction, WayToGoal
 from planning.rollouts.candidates import Candidates, SearchProblem
 from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
 from planning.rollouts.segment import Objective, SearchSpace
@@ -46,18 +47,20 @@ class SearchingPlanner:
         warm_start: bool = True,
         robustness: PerturbedRollouts | None = ROBUSTNESS,
         idle_distance: float = 0.01,
+        guidance: str = "none",
         compile: bool = False,
     ) -> None:
         """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names, no compiler."""
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
         check_weight("idle_distance", idle_distance)
+        check_guidance(guidance)
         self.optimizer = make_optimizer(optimizer, samples=samples)
-        self.model, self._reward = model, reward
+        self.model, self._reward, self.guidance = model, reward, guidance
         self.reward_at, self.stride_limits = reward_at, stride_limits
         self.backend: Backend = Compiled() if compile else eager
         self.reparameterized = warm_start or compile
-        self.cumulative_reward()  # refuses bad options now, not in the first plan
+        _ = self.cumulative_reward(), self.way  # refuse bad options now, not in the first plan
         self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
@@ -71,6 +74,11 @@ class SearchingPlanner:
     def reward(self) -> RewardFunction:
         """The task's reward, in this episode."""
         return self._reward.current if isinstance(self._reward, EpisodicReward) else self._reward
+
+    @property
+    def way(self) -> WayToGoal | None:
+        """The way to the goal, in this episode; None without guidance."""
+        return way_of(self.guidance, self.reward)
 
     def cumulative_reward(self) -> CumulativeReward:
         """The objective of effect codes and pushes, in this episode."""
@@ -115,22 +123,23 @@ class SearchingPlanner:
     ) -> Candidates:
         """Candidates `[B, N]` of K segments, searched by cumulative reward, with a warm start from `previous`."""
         warm_start = warm_start_noise(previous, generators) if self.warm_start else None
-        return self.search(space, self.cumulative_reward(), state, generators, warm_start=warm_start, best_only=True)
+        objective = guided_return(self.cumulative_reward(), self.way)
+        return self.search(space, objective, state, generators, warm_start=warm_start, best_only=True)
 
 
 def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
     """The fields of a `Plan` about its search, from `segments` to `evidence`.
 
-    candidates: `[B, N]`, evaluated by cumulative reward. best: `[B]` int64, the number of the chosen one.
+    candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, number of the chosen one.
     """
     progress = candidates.score_state
     environments = torch.arange(len(best), device=best.device)
     return {
         "segments": progress.segments[environments, best],
-        "expected_return": progress.returns[environments, best],
+        "expected_return": progress.earned[environments, best],
         "expected_success": progress.succeeded[environments, best],
         "noise": chosen_noise(candidates.take(best.unsqueeze(-1))),
         "candidate_centers": candidates.centers,
-        "candidate_returns": progress.returns,
+        "candidate_returns": progress.earned,
         "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,
     }

@@ -21,6 +21,7 @@ SAME_SCENES = (
     "task",
     "layout",
     "tiles",
+    "generated",
     "criterion",
     "objects",
     "maximum_steps",

@@ -35,10 +35,9 @@ class EpisodeReward:
     """
 
     def __init__(self, env: TaskSource, *, reward: str, margin: float) -> None:
-        self._env = env
-        self._rewards = [TaskReward(task, reward=reward, margin=margin) for task in env.tasks]
-        self._own: TaskReward | None = None  # of a goal that only this episode has
+        self._env, self._kind = env, reward
         self.dense, self.margin = reward == "dense", margin
+        self._rewards = {id(task): self._reward_of(task) for task in env.tasks}
 
     @property
     def task(self) -> Task:
@@ -48,12 +47,12 @@ class EpisodeReward:
     @property
     def current(self) -> TaskReward:
         """The reward of the current episode: a pure function of tensors."""
-        task = self.task
-        if task in self._env.tasks:
-            return self._rewards[self._env.tasks.index(task)]
-        if self._own is None or self._own.task != task:
-            self._own = TaskReward(task, reward="dense" if self.dense else "sparse", margin=self.margin)
-        return self._own
+        if id(self.task) not in self._rewards:  # a layout or a goal that only this episode has
+            self._rewards = {id(self.task): self._reward_of(self.task)}
+        return self._rewards[id(self.task)]
+
+    def _reward_of(self, task: Task) -> TaskReward:
+        return TaskReward(task, reward=self._kind, margin=self.margin)
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
         """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool."""

@@ -22,8 +22,9 @@ from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
+from envs.layouts import GENERATED, RANDOM
 from envs.pushing import PushingEnv
-from envs.tasks import Task
+from envs.tasks import GeneratedLayouts, Task
 from envs.workspace import MAXIMUM_OBJECTS
 from models.model import Model
 from models.networks.geometry import Geometry
@@ -73,10 +74,11 @@ def check_options(config: DictConfig) -> None:
         UserError: a number or name out of its range.
     """
     check_world(config.env)
-    if config.layout == "random" and config.planner.get("compile"):
+    changing = config.layout == RANDOM or (config.layout == GENERATED and config.generated.seed is None)
+    if changing and config.planner.get("compile"):
         raise UserError(
-            "planner.compile=true compiles for one layout, and layout=random samples another in every episode: "
-            "choose planner.compile=false"
+            f"planner.compile=true compiles for one layout, and layout={config.layout} samples another in every "
+            "episode: choose planner.compile=false"
         )
     if config.planner.get("compile") and task_of(config)[0].goal_varies:
         raise UserError(
@@ -111,6 +113,7 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
             task=task,
             layout=config.layout,
             tiles=tiles,
+            generated=GeneratedLayouts(**config.generated),
             reward=config.reward,
             criterion=config.criterion,
             objects=config.objects,

@@ -38,4 +38,6 @@ def outlook(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
 
 def _advice(config: DictConfig) -> str:
     others = "" if config.reward == "dense" else " or reward=dense"
-    return f"the goal may lie beyond planner.horizon={config.planner.horizon} pushes; try a longer one{others}"
+    guided = config.planner.get("guidance", "none") != "none"
+    what = "a longer one" if guided else "planner.guidance=layout, a longer one"
+    return f"the goal may lie beyond planner.horizon={config.planner.horizon} pushes; try {what}{others}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 from cavin_pyro.storage.lock import LOCK_NAME
-from envs.tasks import TASKS
+from envs.tasks import TASKS, GeneratedLayouts
 
 # It only decides `checkpoint`, which is compared; older versions did not know it.
 NEVER_COMPARED = ("planner.default_checkpoint",)
@@ -62,6 +63,10 @@ def stored_options(path: Path) -> dict[str, Any]:
         options["task._target_"] = f"{task.__module__}.{task.__qualname__}"
     if "reward" in options:
         options.setdefault("criterion", "strict")  # older versions knew no other
+        for name, default in asdict(GeneratedLayouts()).items():
+            options.setdefault(f"generated.{name}", default)
+    if "planner.horizon" in options:
+        options.setdefault("planner.guidance", "none")
     return options
 
 

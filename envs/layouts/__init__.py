@@ -17,12 +17,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
-from envs.tasks import TASKS, Task
+from envs.tasks import TASKS, GeneratedLayouts, Task
 from envs.tasks.contract import check_fields
 
-RANDOM = "random"
+RANDOM, GENERATED = "random", "generated"
 LARGEST = 100_000  # characters of a layout; ours have 200
 _FOLDER = Path(__file__).parent
 
@@ -66,14 +67,38 @@ def possible_tasks(
     """
     if layout != RANDOM:
         return (load_task(task, layout, tiles),)
-    if any(one is not None for one in (tiles or {}).values()):
-        numbers = ", ".join(map(str, layout_numbers(task)))
-        raise ValueError(f"tiles replace fields of one layout: give layout={numbers} or a YAML file, not random")
+    _refuse_tiles(task, RANDOM, tiles)
     kind = task_class(task)
     sampled = kind.random_layouts() or tuple(load_task(kind, number) for number in layout_numbers(kind))
     if not sampled:
         raise ValueError(f"task {kind.name} has no layouts to sample from: give layout=FILE.yaml, not random")
     return sampled
+
+
+def generate_task(
+    task: str | type[Task],
+    wanted: GeneratedLayouts,
+    generator: np.random.Generator | None = None,
+    tiles: Mapping[str, Any] | None = None,
+) -> Task:
+    """A task in a generated layout: that of `wanted.seed`, or without one a new one.
+
+    Args:
+        generator: for a new one; None generates that of seed 0. tiles: none may be given, as of `possible_tasks`.
+
+    Raises:
+        ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
+    """
+    _refuse_tiles(task, GENERATED, tiles)
+    if wanted.seed is not None or generator is None:
+        generator = np.random.default_rng(wanted.seed or 0)
+    return task_class(task).generate(wanted, generator)
+
+
+def _refuse_tiles(task: str | type[Task], layout: str, tiles: Mapping[str, Any] | None) -> None:
+    if any(one is not None for one in (tiles or {}).values()):
+        numbers = ", ".join(map(str, layout_numbers(task)))
+        raise ValueError(f"tiles replace fields of one layout: give layout={numbers} or a YAML file, not {layout}")
 
 
 def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None) -> Task:
@@ -163,6 +188,11 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def _choices(kind: type[Task]) -> str:
-    """`0, 1, 2, random or the path of a YAML file`."""
+    """`0, 1, 2, random, generated or the path of a YAML file`, as far as the task has them."""
     numbers = [str(number) for number in layout_numbers(kind)]
-    return f"{', '.join([*numbers, RANDOM])} or the path of a YAML file" if numbers else "the path of a YAML file"
+    names = [*numbers, *([RANDOM] if numbers else []), *([GENERATED] if _generates(kind) else [])]
+    return f"{', '.join(names)} or the path of a YAML file" if names else "the path of a YAML file"
+
+
+def _generates(kind: type[Task]) -> bool:
+    return getattr(kind.generate, "__func__", None) is not getattr(Task.generate, "__func__", None)

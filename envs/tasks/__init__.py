@@ -7,6 +7,7 @@ import pkgutil
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from envs.tasks.generated import GeneratedLayouts
 from envs.tasks.reward import CRITERIA, REWARD_NAMES, Outcome, TaskReward
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task
@@ -26,6 +27,7 @@ __all__ = [
     "GOAL_MARKING",
     "REWARD_NAMES",
     "TASKS",
+    "GeneratedLayouts",
     "Marking",
     "Outcome",
     "Step",

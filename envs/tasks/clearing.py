@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from envs.tasks.generated import GeneratedLayouts, blocks, paths
 from envs.tasks.step import Step
 from envs.tasks.task import Marking, Task, check_inside
 from envs.tasks.tiles import TileSet, table_distance
@@ -39,3 +41,10 @@ class Clearing(Task):
         """Virtual goals lie at the table's edges: minus the sum, over objects in the region, of the distance to one."""
         remaining = self.region.contains(positions) & mask
         return -torch.where(remaining, table_distance(positions), 0.0).sum(dim=-1)
+
+    @classmethod
+    def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
+        """A strip of any shape or a rectangle, in which all objects start."""
+        by_shape = {**paths(wanted.tiles), "block": blocks(wanted.tiles)}
+        tiles = TileSet(sorted(wanted.sample("region", by_shape, generator)))
+        return cls(region=tiles, target_start=tiles, obstacle_start=tiles)

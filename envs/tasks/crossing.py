@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from torch import Tensor
 
+from envs.tasks.generated import GeneratedLayouts, paths, reachable_tiles
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart, check_inside
 from envs.tasks.tiles import TileSet
@@ -48,3 +50,16 @@ class Crossing(Task):
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the target's distance to the nearest centre of a goal tile."""
         return -self.goal.distance_to_nearest_center(positions[..., 0, :])
+
+    @classmethod
+    def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
+        """A bridge without shortcuts, from its first tile to its last; obstacles start on reachable tiles."""
+        bridge = wanted.sample("bridge", paths(wanted.tiles), generator)
+        anywhere = reachable_tiles()
+        beside = [tile for tile in anywhere if tile not in bridge]
+        return cls(
+            region=TileSet(sorted(bridge)),
+            goal=TileSet(bridge[-1:]),
+            target_start=TileSet(bridge[:1]),
+            obstacle_start=TileSet(beside if wanted.obstacles == "beside" else anywhere),
+        )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from envs.tasks.generated import ANY_SHAPE, GeneratedLayouts, neighbours, reachable_tiles
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart
 from envs.tasks.tiles import TileSet
@@ -61,6 +63,37 @@ class Insertion(Task):
         """
         short = [_slot_in_short_side(place, mirrored) for mirrored in (False, True) for place in range(1, _ROWS - 1)]
         return (*short, *(_slot_in_far_side(place) for place in range(1, _COLUMNS - 2)))
+
+    @classmethod
+    def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
+        """A slot as of `random_layouts`, and a start as many tiles away from it as wanted; obstacles start anywhere."""
+        found = []
+        for slot in cls.random_layouts():
+            assert isinstance(slot, Insertion)
+            ways = _ways(slot)
+            if starts := [tile for tile in reachable_tiles() if ways.get(tile) == wanted.tiles]:
+                found.append((slot, starts))
+        if not found or wanted.shape != ANY_SHAPE:
+            raise ValueError(
+                "ways to a slot have 4 to 8 tiles and any shape: choose generated.tiles=4 to 8 generated.shape=any"
+            )
+        slot, starts = found[generator.integers(len(found))]
+        start = starts[generator.integers(len(starts))]
+        free = [tile for tile in reachable_tiles() if tile in _ways(slot) and tile not in slot.goal]
+        return replace(slot, target_start=TileSet([start]), obstacle_start=TileSet(free))
+
+
+def _ways(slot: Insertion) -> dict[Tile, int]:
+    """Tiles of the shortest way from each free tile to the slot, both included."""
+    ways = dict.fromkeys(slot.goal, 1)
+    edge = list(slot.goal)
+    for tile in edge:
+        for other in neighbours(tile):
+            on_table = 0 <= other[0] < _ROWS and 0 <= other[1] < _COLUMNS
+            if on_table and other not in ways and other not in slot.region.tiles:
+                ways[other] = ways[tile] + 1
+                edge.append(other)
+    return ways
 
 
 def _slot_in_short_side(place: int, mirrored: bool) -> Insertion:

@@ -45,6 +45,7 @@ class Rearrange(Task):
     markings = (Marking("region", "region of places", "#F2C200", 0.12),)
     about = "all"
     goal_varies = True
+    goal_is_shared = False
 
     region: TileSet
     goal: str | None = None

@@ -7,7 +7,7 @@ and appendix "Task Details"). Pure functions on tensors with any leading dimensi
 from __future__ import annotations
 
 import math
-from functools import reduce
+from functools import cached_property, reduce
 from operator import add
 from typing import NamedTuple
 
@@ -16,6 +16,8 @@ from torch import Tensor
 
 from envs.tasks.step import Step, off_table
 from envs.tasks.task import Task
+from envs.tasks.way import WayField, grid
+from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 REWARD_NAMES = ("dense", "sparse")
 CRITERIA = ("strict", "published")
@@ -46,6 +48,36 @@ class Outcome(NamedTuple):
             field[..., index] for field in (self.reward, self.success, self.violation, self.fall)
         )
         return Outcome(reward, {name: term[..., index] for name, term in self.terms.items()}, success, violation, fall)
+
+
+class WayToGoal:
+    """The way that is left to a task's goal: of the target, or of all objects together, as the task is `about`.
+
+    It comes from the task's own rules for a single object: it may be where no rule is broken, and it has arrived
+    where the task is solved. Other objects are not in its way. Where each object has a goal of its own, it is the
+    distance that the task's `potential` tells.
+    """
+
+    def __init__(self, reward: TaskReward) -> None:
+        self._all = reward.task.about == "all"
+        self._own_goals = None if reward.task.goal_is_shared else reward.task
+        if self._own_goals is not None:
+            return
+        outcome = _alone(reward, grid())
+        self._field = WayField(~outcome.failure, outcome.success)
+
+    def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
+        """Metres left: [...], from centers [..., M, 3] metres and mask [..., M] bool; object 0 is the target."""
+        if self._own_goals is not None:
+            return -self._own_goals.potential(centers[..., :2], mask)
+        if not self._all:
+            return self._field(centers[..., 0, :2])
+        return torch.where(mask, self._field(centers[..., :2]), 0.0).sum(-1)
+
+    def longest(self, mask: Tensor) -> Tensor:
+        """An upper bound on the metres left with the objects in mask [..., M] bool: [...]."""
+        longest = math.dist(TABLE_LOW, TABLE_HIGH) if self._own_goals is not None else self._field.longest
+        return longest * (mask.sum(-1) if self._all else torch.ones_like(mask[..., 0], dtype=torch.int64))
 
 
 class TaskReward:
@@ -105,7 +137,18 @@ class TaskReward:
         reward = reduce(add, terms.values())
         return Outcome(reward.to(states.dtype), terms, success, violation, fall)
 
+    @cached_property
+    def way(self) -> WayToGoal:
+        """The way that is left to the goal, for planners; the margin counts. Takes about 0.1 s, once."""
+        return WayToGoal(self)
+
     @property
     def maximum_return(self) -> float:
         """Upper bound on the return of any episode; infinite where progress counts."""
         return math.inf if self.dense else self.task.maximum_return
+
+
+def _alone(reward: TaskReward, points: Tensor) -> Outcome:
+    """The outcome for a single object, the target, that rests at points [..., 2] metres: [...]."""
+    centers = torch.cat([points, torch.zeros_like(points[..., :1])], -1).unsqueeze(-2)
+    return reward(centers, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))

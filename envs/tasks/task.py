@@ -19,6 +19,7 @@ from torch import Tensor
 
 from envs.markings import Place, TileGroup
 from envs.observation import Observation
+from envs.tasks.generated import GeneratedLayouts
 from envs.tasks.step import Step
 from envs.tasks.tiles import TileSet, parse_tiles
 from envs.workspace import Tile
@@ -50,8 +51,10 @@ class Task(ABC):
     Attributes:
         name: by default the name of the class in lower case.
         markings: how pictures show the layout; later ones lie on top of earlier ones.
-        about: the objects whose subgoals pictures show: the `target` (object 0), or `all`.
+        about: the objects that the goal is about: the `target` (object 0), or `all`. Pictures show their subgoals, and
+            guidance follows their way.
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
+        goal_is_shared: whether one place is as good for each object as for another; else guidance follows `potential`.
         goal_varies: whether `of_episode` returns another task in every episode, which planners must not compile.
         target_start, obstacle_start: tiles on which objects start.
 
@@ -64,6 +67,7 @@ class Task(ABC):
     about: ClassVar[Literal["target", "all"]] = "target"
     maximum_return: ClassVar[float] = GOAL_REWARD + TIME_REWARD
     goal_varies: ClassVar[bool] = False
+    goal_is_shared: ClassVar[bool] = True
 
     target_start: TileSet
     obstacle_start: TileSet
@@ -150,6 +154,15 @@ class Task(ABC):
     def random_layouts(cls) -> tuple[Task, ...]:
         """The tasks that `layout=random` samples; if empty, those of the layouts in files."""
         return ()
+
+    @classmethod
+    def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
+        """The task in a new layout as `wanted`, for `layout=generated`; by default there are none.
+
+        Raises:
+            ValueError: there is no such layout.
+        """
+        raise ValueError(f"task {cls.name} has no generated layouts: give another layout, or another task")
 
     # Derived from them.
 

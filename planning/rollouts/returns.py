@@ -19,6 +19,11 @@ class Progress(NamedTuple):
     segments: Tensor  # [...] int64: segments entered while active
 
     @property
+    def earned(self) -> Tensor:
+        """`[...]` cumulative reward, which is all that plans are ranked by without guidance."""
+        return self.returns
+
+    @property
     def active(self) -> Tensor:
         """`[...]` bool: neither succeeded nor failed."""
         return ~(self.succeeded | self.failed)

@@ -330,7 +330,7 @@ def test_a_layout_may_be_a_number_or_a_file_or_belong_to_a_task_that_has_been_bu
         ({"render_mode": "human"}, r"^unknown render_mode 'human': choose rgb_array or None$"),
         ({"task": "juggling"}, rf"^unknown task 'juggling': choose from {KNOWN_TASKS}$"),
         ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
-        ({"layout": 3}, r"^unknown layout 3: choose 0, 1, 2, random or the path of a YAML file$"),
+        ({"layout": 3}, r"^unknown layout 3: choose 0, 1, 2, random, generated or the path of a YAML file$"),
         ({"robot": "hand"}, r"^unknown robot 'hand': choose from stick, sawyer, panda$"),
         ({"robot": "sawyer"}, r"^robot sawyer needs a folder with sawyer/sawyer_stick.urdf, and none was given: get"),
         ({"layout": "nowhere.yaml"}, r"^layout nowhere.yaml cannot be read"),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
 from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
+from envs.tasks.generated import ANY_SHAPE, FEWEST, MOST, OBSTACLES, SHAPES, GeneratedLayouts
 from envs.workspace import MAXIMUM_OBJECTS
 
 CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
@@ -20,6 +21,7 @@ CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of
     "mpc": ("dynamics", "none"),
 }
 DEFAULT_CHECKPOINT = "cavin"
+GENERATED = asdict(GeneratedLayouts())
 DEFAULTS: list[Any] = ["_self_", {"task": ENVIRONMENT["task"]}, {"planner": "cavin"}, {"env/ranges": "paper"}, "base"]
 
 
@@ -34,6 +36,35 @@ class TilesConfig:
 
 
 @dataclass
+class GeneratedConfig:
+    """What is wanted of `layout=generated` (section `generated`)."""
+
+    tiles: int = option(
+        GENERATED["tiles"],
+        "of the bridge, of the region to clear, or of the way to the slot (at most 8): how difficult it is",
+        minimum=FEWEST,
+        maximum=MOST,
+        group="task",
+    )
+    shape: str = option(
+        GENERATED["shape"],
+        "of the bridge or of the region, which may also be a block; winding has more than two turns",
+        choices=(*SHAPES, ANY_SHAPE),
+        group="task",
+    )
+    obstacles: str = option(
+        GENERATED["obstacles"], "where obstacles start, on or beside the bridge", choices=OBSTACLES, group="task"
+    )
+    seed: int | None = option(
+        GENERATED["seed"],
+        "of one layout for all scenes; null generates one for each scene, from its seed",
+        minimum=0,
+        maximum=MAXIMUM_SEED,
+        group="task",
+    )
+
+
+@dataclass
 class EpisodeConfig:
     """Common options of commands that run episodes."""
 
@@ -41,10 +72,12 @@ class EpisodeConfig:
     task: Any = None
     layout: int | str = option(
         ENVIRONMENT["layout"],
-        "number of one of the task's layouts, random (one per episode), or the path of a YAML file",
+        "number of one of the task's layouts, random (one per episode), generated (as generated.* say), or the path "
+        "of a YAML file",
         group="task",
     )
     tiles: TilesConfig = field(default_factory=TilesConfig)
+    generated: GeneratedConfig = field(default_factory=GeneratedConfig)
     reward: str = option(ENVIRONMENT["reward"], "reward", choices=("dense", "sparse"), group="task")
     criterion: str = option(
         ENVIRONMENT["criterion"],

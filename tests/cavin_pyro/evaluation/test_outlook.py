@@ -5,7 +5,7 @@ from typing import Any
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.outlook import outlook, outlook_of_episode
 
-ADVICE = "the goal may lie beyond planner.horizon=30 pushes; try a longer one"
+ADVICE = "the goal may lie beyond planner.horizon=30 pushes; try planner.guidance=layout, a longer one"
 
 
 def row(plans: int, hopeful: int, outcome: str = "timeout") -> dict[str, Any]:
@@ -16,6 +16,8 @@ def test_an_episode_in_which_no_plan_reached_the_goal_says_so_and_what_to_try() 
     config = compose("plan", "reward=sparse")
     said = outlook_of_episode(row(20, 0), config)
     assert said == f"no plan reached the goal by the model, so the pushes were not led there: {ADVICE} or reward=dense"
+    guided = outlook_of_episode(row(20, 0), compose("plan", "planner.guidance=layout"))
+    assert guided.endswith("horizon=30 pushes; try a longer one or reward=dense")
     assert outlook_of_episode(row(20, 3), config) == "3 of 20 plans reached the goal by the model"
 
 

@@ -196,7 +196,9 @@ def test_the_error_of_a_file_without_keys_lists_them(tmp_path: Path, text: str) 
 
 @pytest.mark.parametrize("layout", ["nowhere.yaml", -1, 1.0, None, "", "²"])
 def test_the_error_of_a_layout_that_is_no_file_lists_the_choices(tmp_path: Path, layout: Any) -> None:
-    with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, random or the path of a YAML file$"):
+    with pytest.raises(
+        ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, random, generated or the path of a YAML file$"
+    ):
         load_task("crossing", layout)
     with pytest.raises(ValueError, match=r"cannot be read \(Is a directory\)"):
         load_task("crossing", tmp_path)
@@ -205,7 +207,7 @@ def test_the_error_of_a_layout_that_is_no_file_lists_the_choices(tmp_path: Path,
 @pytest.mark.parametrize("layout", [3, "3", "17"])
 def test_the_error_of_an_unknown_number_lists_the_known_ones(layout: Any) -> None:
     with pytest.raises(
-        ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2, random or the path of a YAML file$"
+        ValueError, match=rf"^unknown layout {layout}: choose 0, 1, 2, random, generated or the path of a YAML file$"
     ):
         load_task("crossing", layout)
 

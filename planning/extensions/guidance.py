@@ -1,0 +1,162 @@
+"""Guidance beyond the horizon (our addition to Algorithm 1, lines 7 and 10, and to the baselines).
+
+Under sparse rewards all plans that miss the goal have one return, so nothing tells them apart. Guidance adds a value to
+each, from a potential (Ng, Harada and Russell, ICML 1999): minus the way that a state leaves to the goal. It is 0 at
+the goal and nowhere positive, so the order among plans that reach the goal, and their lead over all others, stay. A
+failed plan gets the lowest potential of the layout, so a plan that fails gains on no other plan.
+
+The value is the expected potential where a plan breaks off, if it goes on after each segment with probability
+`CONTINUES`, and else ends in its last state. The last state's potential alone would not tell when a plan makes its way:
+such plans wait, and do so again in the next plan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.protocol import GuidingReward, RewardFunction, WayToGoal
+from planning.rollouts.cumulative_reward import CumulativeReward
+from planning.rollouts.returns import Progress
+from planning.rollouts.segment import Objective, SegmentRollout, select_segment
+
+GUIDANCE = ("none", "layout")
+CONTINUES = 0.9  # after each segment; 1 values the last state alone
+PUSHES_PER_METRE = 20.0  # turns metres into returns, whose unit is a push: one moves an object by about 0.05 m
+
+
+class GuidedProgress(NamedTuple):
+    """The cumulative reward of candidates so far, and the value of their states; fields `[B, n]`."""
+
+    progress: Progress
+    value: Tensor  # at most 0; in pushes
+    passed: Tensor  # the part of the value that later segments do not change
+
+    @property
+    def returns(self) -> Tensor:
+        """Cumulative reward so far plus the value."""
+        return self.progress.returns + self.value
+
+    @property
+    def earned(self) -> Tensor:
+        """Cumulative reward alone."""
+        return self.progress.returns
+
+    @property
+    def succeeded(self) -> Tensor:
+        """bool: see `Progress`."""
+        return self.progress.succeeded
+
+    @property
+    def failed(self) -> Tensor:
+        """bool: see `Progress`."""
+        return self.progress.failed
+
+    @property
+    def segments(self) -> Tensor:
+        """int64: see `Progress`."""
+        return self.progress.segments
+
+    @property
+    def active(self) -> Tensor:
+        """bool: neither succeeded nor failed."""
+        return self.progress.active
+
+
+@dataclass(frozen=True)
+class GuidedReturn:
+    """Cumulative reward plus the value of the states that a plan leads to: the objective at line 7."""
+
+    objective: CumulativeReward
+    way: WayToGoal
+
+    def start(self, plans: State) -> GuidedProgress:
+        """Progress of candidates without a segment, `plans: [B, n]`."""
+        potential = self.potential(plans.centers, plans.mask)
+        return self.valued(self.objective.start(plans), potential, torch.zeros_like(potential), plans.mask)
+
+    def advance(
+        self, score_state: GuidedProgress, segment: int, before: State, rollout: SegmentRollout
+    ) -> GuidedProgress:
+        """Progress after one more segment from `before: [B, n]`."""
+        progress = self.objective.advance(score_state.progress, segment, before, rollout)
+        potential = self.potential(rollout.states.centers, before.mask)
+        arrives = CONTINUES**segment  # the probability that the plan comes so far
+        passed = score_state.passed + (1.0 - CONTINUES) * arrives * potential
+        return self.valued(progress, passed + CONTINUES * arrives * potential, passed, before.mask)
+
+    def potential(self, centers: Tensor, mask: Tensor) -> Tensor:
+        """Minus the way left, in pushes: `[B, n]`."""
+        return -PUSHES_PER_METRE * self.way(centers, mask)
+
+    def valued(self, progress: Progress, value: Tensor, passed: Tensor, mask: Tensor) -> GuidedProgress:
+        """The state of plans with that value, if they have not ended."""
+        lowest = -PUSHES_PER_METRE * self.way.longest(mask)
+        value = torch.where(progress.failed, lowest, torch.where(progress.succeeded, 0.0, value))
+        return GuidedProgress(progress, value, passed)
+
+    def early_stopped(self, score_state: GuidedProgress) -> Tensor:
+        """`[B]` bool: as without guidance, but ended plans count with their value; active ones can lose theirs."""
+        progress = score_state.progress
+        ended = torch.where(progress.active, progress.returns, score_state.returns)
+        return self.objective.early_stopped(progress._replace(returns=ended))
+
+
+class GuidedTracking(NamedTuple):
+    """The tracking cost of line 10, which grows where f leaves a longer way to the goal than the subgoal does.
+
+    A tracking cost alone has no direction: three centimetres short of a subgoal cost as much as three beyond it. Only
+    plans that miss the goal are guided; the motions of a plan that reaches it are ranked as without guidance.
+    """
+
+    objective: Any  # `planning.cavin.TrackingCost`
+    way: WayToGoal
+    guided: Tensor  # [B] bool: the chosen effect plan misses the goal
+
+    def start(self, plans: State) -> Any:
+        """The state of candidates without a segment, `plans: [B, n]`."""
+        return self.objective.start(plans)
+
+    def advance(self, state: Any, segment: int, before: State, rollout: SegmentRollout) -> Any:
+        """The state after one more segment from `before: [B, n]`."""
+        tracking = self.objective.advance(state, segment, before, rollout)
+        counts = (self.guided & (segment < self.objective.segments)).unsqueeze(-1)  # [B, 1]
+        subgoal = self.objective.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
+        behind = self.way(rollout.states.centers, before.mask) - self.way(subgoal.centers, subgoal.mask)
+        return tracking._replace(cost=tracking.cost + torch.where(counts, behind.clamp(min=0.0).square(), 0.0))
+
+    def early_stopped(self, state: Any) -> Tensor:
+        """As without guidance."""
+        return self.objective.early_stopped(state)
+
+
+def check_guidance(guidance: str) -> None:
+    """Raise ValueError for an unknown `guidance`."""
+    if guidance not in GUIDANCE:
+        raise ValueError(f"unknown guidance '{guidance}': choose {' or '.join(GUIDANCE)}")
+
+
+def way_of(guidance: str, reward: RewardFunction) -> WayToGoal | None:
+    """The way to the goal of this episode; None without guidance.
+
+    Raises ValueError if the reward function knows none.
+    """
+    if guidance == "none":
+        return None
+    if not isinstance(reward, GuidingReward):
+        raise ValueError(f"guidance='{guidance}' needs a reward function with a `way`: choose guidance='none'")
+    return reward.way
+
+
+def guided_return(objective: CumulativeReward, way: WayToGoal | None) -> Objective:
+    """The objective of effect codes and pushes, guided if there is a way."""
+    return objective if way is None else GuidedReturn(objective, way)
+
+
+def guided_tracking(cost: Objective, way: WayToGoal | None, succeeded: Tensor) -> Objective:
+    """The tracking cost of motions, guided if there is a way; `succeeded: [B]` bool, the effect plan's."""
+    return cost if way is None else GuidedTracking(cost, way, ~succeeded)
