@@ -8,7 +8,19 @@ from pathlib import Path
 
 from cavin_pyro import __version__
 
-ORDER = ("demo", "plan", "evaluate", "collect", "data", "pretrain", "train", "check", "reproduce", "assets")
+ORDER = (
+    "demo",
+    "plan",
+    "evaluate",
+    "collect",
+    "data",
+    "pretrain",
+    "train",
+    "check",
+    "calibrate",
+    "reproduce",
+    "assets",
+)
 
 
 def main() -> None:

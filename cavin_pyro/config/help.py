@@ -26,6 +26,7 @@ EXAMPLES = {
         "a=cavin b=sectar",
         "sections=[prior,consistency] sizes.consistency.scenes=300",
     ),
+    "calibrate": ("checkpoint=runs/train/checkpoint.safetensors data=data/pushes", "checkpoint=cavin wake_weight=0"),
     "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
     "evaluate": (
         "task=crossing reward=sparse objects=3",

@@ -19,6 +19,7 @@ FOLDERS = {
     "pretrain": ("runs/pretrain", ()),
     "train": ("runs/train", ()),
     "check": ("runs/check", ("sections",)),
+    "calibrate": ("runs/calibrate", ()),
     "plan": ("runs/plan/{task}-{reward}-{objects}-{planner}-{seed}", ("video", "viewer")),
     "evaluate": ("runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}", ("episodes", "compare", "merge", *LAUNCH)),
     "demo": ("runs/demo", ()),

@@ -62,8 +62,8 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
     world = collecting_world(config.env)
-    loaded = _load(config, config.checkpoint)
-    return _context(config, loaded, world, loaded.table.validation)
+    loaded = load_trained(config, config.checkpoint)
+    return context_of(config, loaded, world, loaded.table.validation)
 
 
 def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any]]]:
@@ -73,7 +73,7 @@ def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any
         UserError: their windows are not of the same data, or none is held out by both.
     """
     world = collecting_world(config.env)
-    both = {name: _load(config, config[name]) for name in ("a", "b")}
+    both = {name: load_trained(config, config[name]) for name in ("a", "b")}
     tables = {name: loaded.table for name, loaded in both.items()}
     lengths = {name: loaded.model.segment_length for name, loaded in both.items()}
     held_out_objects = [list(trained_windows(one.checkpoint, one.path)[0].held_out_objects) for one in both.values()]
@@ -90,11 +90,16 @@ def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any
     for name, loaded in both.items():
         order = tables[name].starts.argsort()
         numbers = order[torch.searchsorted(tables[name].starts[order], common)]
-        contexts[name] = _context(config, loaded, world, numbers)
+        contexts[name] = context_of(config, loaded, world, numbers)
     return contexts
 
 
-def _load(config: DictConfig, name: str) -> Loaded:
+def load_trained(config: DictConfig, name: str) -> Loaded:
+    """A checkpoint by its name or path, with its programs, and the windows of the option `data` as its training split.
+
+    Raises:
+        UserError: as `load_context`.
+    """
     path = find_checkpoint(name)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
@@ -109,9 +114,10 @@ def _load(config: DictConfig, name: str) -> Loaded:
     return Loaded(path, checkpoint, model, guide, geometry, table, folders)
 
 
-def _context(
+def context_of(
     config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: torch.Tensor
 ) -> tuple[CheckContext, dict[str, Any]]:
+    """The context of a checkpoint and its data, and `about`; `held_out`: numbers of windows for validation."""
     path, checkpoint, model, guide, geometry, table, folders = loaded
     training, trained_in = sample_windows(table, table.training, config.windows, seed=[config.seed, 0])
     validation, held_out_in = sample_windows(table, held_out, config.windows, seed=[config.seed, 1])

@@ -33,6 +33,7 @@ from tests.cavin_pyro.faults.forked_stages import fork_stages
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
     "cavin_pyro.criticism.loading",
+    "cavin_pyro.criticism.recalibration.run",
     "cavin_pyro.criticism.report",
     "cavin_pyro.criticism.sections",
     "cavin_pyro.data.collection",

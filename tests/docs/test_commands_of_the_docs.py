@@ -34,6 +34,7 @@ SHORT = {
     "windows.validation_fraction=0.4",
     "plan": f"{EPISODES} video=false",
     "evaluate": f"{EPISODES} episodes=2 workers=1",
+    "calibrate": "steps=2 batch_size=4 windows=4 samples=3",
     "check": "windows=2 sections=[elbo,consistency] sizes.consistency.scenes=1 sizes.consistency.samples=2",
 }
 WITHOUT_HYDRA = {"assets", "data"}  # their options are those of argparse

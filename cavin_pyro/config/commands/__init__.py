@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavin_pyro.config.commands.collection import CollectConfig
-from cavin_pyro.config.commands.criticism import CheckConfig
+from cavin_pyro.config.commands.criticism import CalibrateConfig, CheckConfig
 from cavin_pyro.config.commands.episodes import DemoConfig, EvaluateConfig, PlanConfig
 from cavin_pyro.config.commands.reproduction import ReproduceConfig
 from cavin_pyro.config.commands.training import PretrainConfig, TrainConfig
@@ -13,6 +13,7 @@ COMMANDS: dict[str, type] = {
     "pretrain": PretrainConfig,
     "train": TrainConfig,
     "check": CheckConfig,
+    "calibrate": CalibrateConfig,
     "plan": PlanConfig,
     "evaluate": EvaluateConfig,
     "demo": DemoConfig,

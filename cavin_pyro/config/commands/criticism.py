@@ -1,4 +1,4 @@
-"""Options of the command check."""
+"""Options of the commands check and calibrate."""
 
 from __future__ import annotations
 
@@ -42,3 +42,30 @@ class CheckConfig:
     )
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
+
+
+@dataclass
+class CalibrateConfig:
+    """Options of `python -m cavin_pyro.calibrate`."""
+
+    defaults: list[Any] = field(default_factory=lambda: ["_self_", "base"])
+    checkpoint: str = option(
+        DEFAULT_CHECKPOINT,
+        f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train",
+        group="model",
+    )
+    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
+    data: Any = option("data/pushes", f"{DATA}; the model's training data", group="data")
+    output: str | None = option(None, "folder for the checkpoint; by default runs/calibrate, or beside it", group="run")
+    seed: int = seed_option(group="run")
+    steps: int = option(1500, "gradient steps", minimum=1, group="training", limit=10**9)
+    batch_size: int = option(256, "windows per step", minimum=1, group="training", limit=10**6)
+    learning_rate: float = option(1e-3, "Adam's at the start; it ends at a hundredth of it", above=0, group="training")
+    wake_weight: float = option(
+        0.1,
+        "weight of -ELBO on real windows beside the loss on generated ones; 0 learns from generated ones alone",
+        minimum=0,
+        group="training",
+    )
+    windows: int = option(2000, "held-out windows for measurements", minimum=1, group="data", limit=10**7)
+    samples: int = option(50, "of the guide for each window, in measurements", minimum=2, group="data", limit=10**5)

@@ -126,8 +126,8 @@ def _verdict(values: dict[str, Any], codes: tuple[str, ...], episodes: Tensor) -
         f"{BAD[1]:.0%}."
     )
     advice = (
-        "Too narrow: train longer, or with guide=joint or guide=flow. If the deviation goes away without noise in the "
-        "features, mend their scale (scales=learned) instead."
+        "Too narrow: run calibrate, or train longer, or with guide=joint or guide=flow. If the deviation goes away "
+        "without noise in the features, mend their scale (scales=learned) instead."
     )
     return conclude(level, rule, advice, windows=len(episodes), episodes=episodes)
 

@@ -1,0 +1,1 @@
+"""Repair of a guide that fails simulation-based calibration."""

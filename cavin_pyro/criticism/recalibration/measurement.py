@@ -1,0 +1,100 @@
+"""What calibration changes: coverage of codes by simulation, and the ELBO and decoded subgoals on real windows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from cavin_pyro.criticism.checks.simulation import ACTIVE_CONTRACTION
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.statistics.clusters import mean_interval
+from cavin_pyro.criticism.statistics.codes import SYMBOLS
+from cavin_pyro.criticism.statistics.elbo import TOTAL, terms_by_window
+from cavin_pyro.criticism.statistics.inference.simulation import calibrate, held, held_jointly, simulate
+from cavin_pyro.criticism.statistics.predictions import (
+    has_subgoals,
+    predict_subgoals,
+    probability_integral_transform,
+)
+from cavin_pyro.criticism.statistics.windows import seeded
+
+LEVEL = 0.9
+BATCH = 500  # windows
+PARTICLES = 4  # of the ELBO
+DECODED = 20  # samples of h
+
+Measured = dict[str, Any]
+
+
+@torch.no_grad()
+def measure_guide(context: CheckContext, *, windows: int, samples: int) -> Measured:
+    """Means with 95 % intervals over episodes, on held-out windows, with the same random numbers for every guide.
+
+    Args:
+        windows: at most so many, and their first states for simulation. samples: of the guide for each.
+
+    Returns:
+        `windows`, `episodes`; of simulated windows what 90 % intervals hold, by code: `held` over all dimensions,
+        `held_informed` over those that learn from the window (`informed` of `dimensions`), and `joint`, of the
+        region of highest density. Of real windows `minus_elbo`, in nats, and `subgoal_held`, of the centres that
+        moved, in 90 % intervals of h's predictions with codes of the guide; None without h, or if nothing moved.
+    """
+    window, episodes = context.held_out(windows)
+    with seeded(context.seed):
+        codes, simulated = simulate(context.model, window)
+        found = calibrate(context.model, context.guide, codes, simulated, samples=samples)
+    by_code = {}
+    for name, ranks in found.ranks.items():
+        informed = found.contraction[name] > ACTIVE_CONTRACTION
+        by_code[SYMBOLS[name]] = {
+            "held": held(ranks, LEVEL, episodes)._asdict(),
+            "held_informed": held(ranks[:, informed] if informed.any() else ranks, LEVEL, episodes)._asdict(),
+            "informed": int(informed.sum()),
+            "dimensions": ranks.shape[1],
+            "contraction": found.contraction[name].max().item(),
+            "spread": found.spread[name].max().item(),
+        }
+    with seeded(context.seed):
+        terms = terms_by_window(context.model, context.guide, window, PARTICLES, BATCH)
+        decoded = None
+        if has_subgoals(context.model, window):
+            prediction = predict_subgoals(context.model, window, DECODED, guide=context.guide)
+            pit = probability_integral_transform(prediction.centers, prediction.real_centers)
+            inside = ((pit - 0.5).abs() <= LEVEL / 2).double().mean(-1)
+            share = (inside * prediction.moved).sum(-1) / prediction.moved.sum(-1)  # NaN where nothing moved
+            decoded = mean_interval(share, episodes)._asdict() if prediction.moved.any() else None
+    return {
+        "windows": len(episodes),
+        "episodes": len(episodes.unique()),
+        "codes": by_code,
+        "joint": held_jointly(found.joint, LEVEL, episodes)._asdict(),
+        "minus_elbo": mean_interval(terms[TOTAL], episodes)._asdict(),
+        "subgoal_held": decoded,
+    }
+
+
+def sentences(before: Measured, after: Measured) -> list[str]:
+    """Both measurements, side by side, for the terminal."""
+    lines = []
+    for symbol, code in before["codes"].items():
+        now = after["codes"][symbol]
+        lines += [
+            f"90 % intervals of {symbol} hold {_percent(code['held'])}, now {_percent(now['held'])}; of informed "
+            f"dimensions ({code['informed']}, now {now['informed']}) {_percent(code['held_informed'])}, "
+            f"now {_percent(now['held_informed'])}"
+        ]
+    lines.append(f"90 % regions of all codes hold {_percent(before['joint'])}, now {_percent(after['joint'])}")
+    elbo, now = (one["minus_elbo"]["mean"] for one in (before, after))
+    lines.append(f"real windows: -ELBO {elbo:.2f} nats, now {now:.2f}")
+    if before["subgoal_held"]:
+        lines.append(
+            f"real windows: 90 % intervals of h's centres that moved hold {_percent(before['subgoal_held'])}, "
+            f"now {_percent(after['subgoal_held'])}"
+        )
+    return lines
+
+
+def _percent(interval: dict[str, float]) -> str:
+    low, high = max(0.0, interval["low"]), min(1.0, interval["high"])
+    return f"{interval['mean']:.1%} ({low:.1%} to {high:.1%})"

@@ -1,0 +1,80 @@
+"""A calibration, from its configuration to the checkpoint with the repaired guide."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.loading import Loaded, context_of, load_trained
+from cavin_pyro.criticism.recalibration.measurement import Measured
+from cavin_pyro.criticism.recalibration.sleep import sleep
+from cavin_pyro.data.collection import CollectionConfig
+from cavin_pyro.data.dataset import content_records
+from cavin_pyro.storage.checkpoint import checkpoint_bytes
+from cavin_pyro.storage.files import atomic_write, write_json
+from cavin_pyro.storage.provenance import provenance
+from cavin_pyro.training.trainer import unchecked_programs
+from models.state import Window
+
+OPTIONS = ("steps", "batch_size", "learning_rate", "wake_weight", "seed")
+
+
+def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
+    """The checkpoint with its data, and held-out windows for measurements.
+
+    Raises:
+        UserError: a checkpoint or data that cannot be used, or a model without codes.
+    """
+    loaded = load_trained(config, config.checkpoint)
+    if not loaded.model.codes:
+        raise UserError(
+            f"checkpoint {loaded.path} has model {type(loaded.model).__name__}, which has no codes, so that there is "
+            "no guide to calibrate"
+        )
+    context, _ = context_of(config, loaded, CollectionConfig(), loaded.table.validation)
+    return loaded, context
+
+
+def calibrate_guide(config: DictConfig, loaded: Loaded) -> list[dict[str, float]]:
+    """Fit the guide in place on the windows that its training saw; returns the losses."""
+    generator = torch.Generator().manual_seed(config.seed)
+    torch.manual_seed(config.seed)
+
+    def batch() -> Window:
+        return loaded.table.batch(loaded.table.sample(config.batch_size, generator, bucketed=True))
+
+    with unchecked_programs():
+        return sleep(
+            loaded.model,
+            loaded.guide,
+            batch,
+            steps=config.steps,
+            learning_rate=config.learning_rate,
+            wake_weight=config.wake_weight,
+        )
+
+
+def write_calibrated(
+    folder: Path, config: DictConfig, loaded: Loaded, *, before: Measured, after: Measured, losses: list[dict[str, Any]]
+) -> Path:
+    """Write the checkpoint with the guide as it is now, all else as it was, and `calibration.json` beside it."""
+    checkpoint, path = loaded.checkpoint, folder / "checkpoint.safetensors"
+    guide = {f"guide.{name}": value.detach().contiguous() for name, value in loaded.guide.state_dict().items()}
+    record = {
+        **provenance(),
+        **{name: config[name] for name in OPTIONS},
+        "data": [one["fingerprint"] for data in loaded.folders for one in content_records(data)],
+        "before": before,
+        "after": after,
+    }
+    earlier = checkpoint.provenance.get("calibrated")
+    about = {**checkpoint.provenance, "calibrated": [*(earlier if isinstance(earlier, list) else []), record]}
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(checkpoint_bytes({**checkpoint.tensors, **guide}, checkpoint.config, about))
+    write_json(folder / "calibration.json", {**record, "losses": losses})
+    return path
