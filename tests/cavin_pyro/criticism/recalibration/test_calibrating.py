@@ -40,7 +40,8 @@ def test_only_the_guide_changes_and_the_checkpoint_says_so(
     assert before.config == after.config
     assert after.provenance["step"] == 7
     (record,) = after.provenance["calibrated"]
-    assert record["steps"] == 3 and record["wake_weight"] == 0.1 and record["command"].startswith("python -m cavin_pyro")
+    assert record["steps"] == 3 and record["wake_weight"] == 0.1
+    assert record["command"].startswith("python -m cavin_pyro")
     assert record["before"]["codes"].keys() == record["after"]["codes"].keys() == {"c", "z"}
     assert record["before"]["minus_elbo"] != record["after"]["minus_elbo"]
     losses = json.loads((tmp_path / "out" / "calibration.json").read_text())["losses"]
