@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +44,19 @@ class Scales:
     def _around(self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None) -> Isotropic:
         return IsotropicNormal(mean, scale)
 
+    def planar_errors(self, uniform: Tensor, predicted: Tensor | None = None) -> Tensor:
+        """Errors of centres in x and y, metres, as of `centers`: the sample that `uniform: [..., M, 2]` determines.
+
+        `predicted: [..., M]`, scales of centres. Of two numbers in [0, 1), the first is the probability of a smaller
+        error, the second tells its direction (Box and Muller 1958; for Student's t, Bailey 1994).
+        """
+        radius, angle = self._radius(1.0 - uniform[..., 0], predicted), 2 * math.pi * uniform[..., 1]
+        return torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
+
+    def _radius(self, exceeding: Tensor, predicted: Tensor | None) -> Tensor:
+        """The error in the plane that a sample exceeds with probability `exceeding`."""
+        return self.center * (-2.0 * exceeding.log()).sqrt()
+
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
         each = (torch.as_tensor(scale, dtype=mean.dtype) for scale in (self.start, self.motion))
@@ -77,6 +91,12 @@ class PredictedScales(LikelihoodScales):
         if predicted is None:
             return super()._around(mean, scale, predicted)
         return IsotropicStudentT(self.degrees_of_freedom, mean, predicted)
+
+    def _radius(self, exceeding: Tensor, predicted: Tensor | None) -> Tensor:
+        if predicted is None:
+            return super()._radius(exceeding, predicted)
+        freedom = self.degrees_of_freedom
+        return predicted * (freedom * (exceeding ** (-2.0 / freedom) - 1.0)).sqrt()
 
 
 class LearnedScales(Scales, nn.Module):

@@ -76,6 +76,17 @@ class Model(Program):
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
+    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
+        """A sample of f in x and y of the centres, which `uniform: [..., M, 2]` in [0, 1) determines; else its mean.
+
+        `state: [...]`, `action: [..., 4]` -> the state after one push.
+        """
+        encoded = self.encoder(state) if self.dynamics.reads_encoding else None
+        mean, predicted = self.dynamics.outcome(state, encoded, action)
+        errors = self.scales.planar_errors(uniform, None if predicted is None else predicted[..., 0])
+        errors = errors * mean.mask.unsqueeze(-1)
+        return mean._replace(centers=torch.cat((mean.centers[..., :2] + errors, mean.centers[..., 2:]), -1))
+
     def encode(self, window: Window, generate: bool = False) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 

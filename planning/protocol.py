@@ -34,6 +34,14 @@ class DynamicsModel(Protocol):
         """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., 4]`."""
 
 
+@runtime_checkable
+class SampledDynamics(Protocol):
+    """Dynamics that say how sure they are: `planner.robustness.outcomes=sampled`."""
+
+    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
+        """A sample of f(s'' | s, a): `[...]`, which `uniform: [..., M, 2]` in [0, 1) determines."""
+
+
 class EffectModel(DynamicsModel, Protocol):
     """A model with effect codes: their prior, and the meta-dynamics h (paper, equation 2)."""
 

@@ -17,7 +17,14 @@ from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
 from planning.plan import Plan
-from planning.protocol import DynamicsModel, EpisodicReward, ModelRequirements, RewardFunction, WayToGoal
+from planning.protocol import (
+    DynamicsModel,
+    EpisodicReward,
+    ModelRequirements,
+    RewardFunction,
+    SampledDynamics,
+    WayToGoal,
+)
 from planning.rollouts.candidates import Candidates, SearchProblem
 from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
 from planning.rollouts.segment import Objective, SearchSpace
@@ -60,6 +67,8 @@ class SearchingPlanner:
         self.reward_at, self.stride_limits = reward_at, stride_limits
         self.backend: Backend = Compiled() if compile else eager
         self.reparameterized = warm_start or compile
+        if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
+            raise ValueError("outcomes=sampled needs a model that samples f: it has no sampled_next_state")
         _ = self.cumulative_reward(), self.way  # refuse bad options now, not in the first plan
         self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
         self.samples = samples

@@ -18,6 +18,7 @@ CLASSES = {
     "models.priors.StandardPrior": "models.priors.standard.StandardPrior",
     "models.learned_priors.ConditionalPrior": "models.priors.conditional.ConditionalPrior",
     "models.learned_priors.FlowPrior": "models.priors.flow.FlowPrior",
+    "models.networks.contact.ContactDynamics": "models.networks.contact.dynamics.ContactDynamics",
     "models.pointnet.PointNetAutoencoder": "models.networks.pointnet.PointNetAutoencoder",
     "cavin_pyro.objectives.Objective": "cavin_pyro.training.objectives.Objective",
     "cavin_pyro.renyi.DifferentiableRenyiELBO": "cavin_pyro.training.renyi.DifferentiableRenyiELBO",

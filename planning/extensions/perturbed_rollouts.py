@@ -11,18 +11,19 @@ from torch import Tensor
 from models.state import State
 from planning import records
 from planning.backends.eager import Backend, eager
-from planning.inputs import check_positive, check_weight
-from planning.protocol import DynamicsModel, RewardFunction
+from planning.inputs import check_choice, check_positive, check_weight
+from planning.protocol import DynamicsModel, RewardFunction, SampledDynamics
 from planning.rollouts import ranking, returns
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
-from planning.rollouts.sampling import noise_each
+from planning.rollouts.sampling import noise_each, uniform_each
 from planning.rollouts.segment import actions_of
 
 QUARTER = 4  # one in four candidates continues in the next round, with four times as many rollouts
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
 # metres, is then worth 200: a failure earns -100 where a plan that reaches the goal promised +100.
 RETURN_WEIGHT = 0.0015
+OUTCOMES = ("perturbed", "sampled")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,9 @@ class PerturbedRollouts:
     candidates: motions with perturbed rollouts, the best by line 10, or by their return in the baselines.
     rollouts: of each candidate in the first round.
     rounds: of equally many rollouts in total, for fewer and fewer candidates; 1 gives every candidate the same number.
+    outcomes: `perturbed`, with the two noises below, or `sampled` from f's own predictive distribution, push by push.
+        A sampled rollout goes on from where it came, its distance to the subgoal is its own, and its pushes start where
+        they should.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
     outcome_noise: standard deviation, in x and in y, of an object's centre after a push, per metre of its predicted
         move. The perturbed centres decide whether a rollout fails; its distance to the subgoal is that of f's
@@ -46,12 +50,13 @@ class PerturbedRollouts:
     failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal. Where returns
         count, one unit of return weighs 0.0015 square metres.
 
-    Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
+    Raises ValueError for counts below 1, unknown outcomes, and for a noise or a cost that is negative or not finite.
     """
 
     candidates: int = 256
     rollouts: int = 2
     rounds: int = 3
+    outcomes: str = "perturbed"
     start_noise: float = 0.03
     outcome_noise: float = 0.5
     failure_cost: float = 0.3
@@ -60,6 +65,7 @@ class PerturbedRollouts:
         check_positive("candidates", self.candidates)
         check_positive("rollouts", self.rollouts)
         check_positive("rounds", self.rounds)
+        check_choice("outcomes", self.outcomes, OUTCOMES)
         check_weight("start_noise", self.start_noise)
         check_weight("outcome_noise", self.outcome_noise)
         check_weight("failure_cost", self.failure_cost)
@@ -153,6 +159,10 @@ def perturbed_rollouts(
     if goal is not None and goal.batch_shape[-1] > 1:
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
     pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
+    if robustness.outcomes == "sampled":
+        uniform = uniform_each((*pushes.shape[1:3], state.objects, 2), generators)
+        distance, failed = backend(_sampled_costs, model, reward, state, goal, pushes, uniform, feature_weight)
+        return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
     pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
     errors = None
     if robustness.outcome_noise:
@@ -176,10 +186,39 @@ def _rollout_costs(
     before, mask = plans.centers, plans.mask
     here, path = predict_states(model, state.expand_plans(1), pushes)
     possible = path if errors is None else outcomes(before, path, errors)
-    progress = returns.advance(returns.start(before), reward, before, possible, mask)
+    return _costs(reward, before, possible, mask, here, goal, feature_weight)
+
+
+def _sampled_costs(
+    model: SampledDynamics,
+    reward: RewardFunction,
+    state: State,
+    goal: State | None,
+    pushes: Tensor,
+    uniform: Tensor,
+    feature_weight: float,
+) -> tuple[Tensor, Tensor]:
+    """The same of rollouts that f's distributions sample, which `uniform: [B, n, T, M, 2]` determines."""
+    plans, here, steps = state.expand_plans(pushes.shape[1]), state.expand_plans(1), []
+    for push, own in zip(pushes.unbind(-2), uniform.unbind(2), strict=True):
+        here = model.sampled_next_state(here, push, own).expand(pushes.shape[:2])
+        steps.append(here.centers)
+    return _costs(reward, plans.centers, torch.stack(steps, -3), plans.mask, here, goal, feature_weight)
+
+
+def _costs(
+    reward: RewardFunction,
+    before: Tensor,
+    path: Tensor,
+    mask: Tensor,
+    last: State,
+    goal: State | None,
+    feature_weight: float,
+) -> tuple[Tensor, Tensor]:
+    progress = returns.advance(returns.start(before), reward, before, path, mask)
     if goal is None:
-        return progress.returns.new_zeros(pushes.shape[:2]), progress.failed
-    return ranking.squared_distance(here, goal, feature_weight=feature_weight), progress.failed
+        return progress.returns.new_zeros(path.shape[:2]), progress.failed
+    return ranking.squared_distance(last, goal, feature_weight=feature_weight), progress.failed
 
 
 def outcomes(start: Tensor, path: Tensor, errors: Tensor) -> Tensor:

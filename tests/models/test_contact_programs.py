@@ -10,7 +10,7 @@ from pyro import distributions, poutine
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
 from models.likelihoods import LikelihoodScales, PredictedScales
-from models.networks.contact import ContactDynamics
+from models.networks.contact.dynamics import ContactDynamics
 from models.networks.outline import Outline
 from models.state import State, Window
 
@@ -70,3 +70,17 @@ def test_generation_samples_as_widely_as_f_says() -> None:
     spread = ((drawn - mean.centers[:, 0]).abs().median() / scales[0, 0, 0]).item()
     # The median of |t| with 3 degrees of freedom.
     assert spread == pytest.approx(0.765, abs=0.08)
+
+
+def test_a_sampled_state_is_as_far_from_the_mean_as_f_says() -> None:
+    model, seen = model_with(PredictedScales()), window(batch=2)
+    state, push = seen.states.step(0), seen.actions[:, 0]
+    state = state._replace(mask=torch.tensor([[True, True], [True, False]]))
+    mean, scales = model.dynamics.outcome(state, None, push)
+    certain = model.sampled_next_state(state, push, torch.zeros(2, 2, 2))
+    assert torch.equal(certain.centers, mean.centers)
+    uniform = torch.full((2, 2, 2), 0.5)
+    off = (model.sampled_next_state(state, push, uniform).centers - mean.centers).norm(dim=-1)
+    expected = scales[..., 0] * (3.0 * (0.5 ** (-2.0 / 3.0) - 1.0)) ** 0.5
+    assert torch.allclose(off[state.mask], expected[state.mask], rtol=1e-3)
+    assert off[1, 1] == 0.0

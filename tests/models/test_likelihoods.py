@@ -7,7 +7,7 @@ import torch
 from pyro import distributions
 
 from models.isotropic import IsotropicNormal
-from models.likelihoods import LikelihoodScales
+from models.likelihoods import LikelihoodScales, PredictedScales
 from models.state import State
 
 
@@ -64,3 +64,19 @@ def test_starts_are_weighted_more_than_motions() -> None:
     peak = likelihood.log_prob(torch.zeros(3, 4))
     assert torch.allclose(peak - likelihood.log_prob(start), torch.full((2,), 0.5), atol=1e-5)
     assert torch.allclose(peak - likelihood.log_prob(motion), torch.full((2,), 0.5), atol=1e-5)
+
+
+@pytest.mark.parametrize("scales", [LikelihoodScales(), PredictedScales()], ids=["fixed", "predicted"])
+def test_errors_in_the_plane_are_distributed_as_the_likelihood_of_centres(scales: LikelihoodScales) -> None:
+    torch.manual_seed(0)
+    count, own = 200_000, torch.full((200_000, 1), 0.02)
+    mean = State(torch.zeros(count, 1, 3), torch.zeros(count, 1, 4), torch.ones(count, 1, dtype=torch.bool))
+    likelihood = scales.centers(mean, mean.mask, predicted=own.unsqueeze(-1).expand(-1, -1, 2))
+    parts = torch.tensor([0.1, 0.5, 0.9, 0.99])
+    drawn = likelihood.sample()[:, 0, :2].norm(dim=-1).quantile(parts)
+    errors = scales.planar_errors(torch.rand(count, 1, 2), own)
+    assert torch.allclose(errors.norm(dim=-1)[:, 0].quantile(parts), drawn, rtol=0.04)
+    assert errors.mean((0, 1)).abs().max() < 5e-4
+    other = LikelihoodScales(center=0.02) if isinstance(scales, PredictedScales) else PredictedScales()
+    wrong = other.planar_errors(torch.rand(count, 1, 2), own).norm(dim=-1)[:, 0].quantile(parts)
+    assert not torch.allclose(wrong, drawn, rtol=0.2)

@@ -136,7 +136,9 @@ def test_a_file_without_pointnet_is_refused(small: SimpleNamespace, tmp_path: Pa
 
 
 def test_an_f_that_reads_outlines_needs_them(small: SimpleNamespace) -> None:
-    config = small.config() | {"dynamics": {"_target_": "models.networks.contact.ContactDynamics", "object_width": 8}}
+    config = small.config() | {
+        "dynamics": {"_target_": "models.networks.contact.dynamics.ContactDynamics", "object_width": 8}
+    }
     model = build_model(config)
     check_fit(model, Outline(), 5)
     with pytest.raises(
@@ -149,5 +151,5 @@ def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> N
     config = small.config() | {"scales": {"_target_": "models.likelihoods.PredictedScales"}}
     with pytest.raises(UserError, match="scales=predicted needs an f that predicts them: dynamics=contact"):
         build_model(config)
-    contact = {"dynamics": {"_target_": "models.networks.contact.ContactDynamics"}}
+    contact = {"dynamics": {"_target_": "models.networks.contact.dynamics.ContactDynamics"}}
     assert isinstance(build_model(config | contact).scales, PredictedScales)

@@ -15,7 +15,7 @@ from cavin_pyro.storage.checkpoint import load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.training.run import train
 from models.likelihoods import PredictedScales
-from models.networks.contact import ContactDynamics
+from models.networks.contact.dynamics import ContactDynamics
 from models.networks.outline import Outline
 
 SMALL = (

@@ -13,8 +13,9 @@ from models.networks.outline import (
     PER_OUTLINE,
     Outline,
     multiples,
-    outline_features,
     outline_values,
+    standard_features,
+    standard_values,
     turned,
 )
 
@@ -69,7 +70,8 @@ def test_features_are_unit_vectors_whatever_the_order_of_the_points() -> None:
 def test_sizes_survive_the_scaling_to_unit_length() -> None:
     small, large = (outline_values(Outline()(factor * box(0.10, 0.06))) for factor in (1.0, 1.3))
     assert torch.allclose(large[:SERIES], 1.3 * small[:SERIES], atol=0.02)
-    assert torch.allclose(outline_features(outline_values(Outline()(box(0.1, 0.1)))).norm(), torch.tensor(1.0))
+    features = Outline()(box(0.1, 0.1))
+    assert torch.allclose(standard_features(standard_values(features)), features, atol=1e-6)
 
 
 def test_the_upper_outlines_tell_a_lying_can_from_a_box() -> None:

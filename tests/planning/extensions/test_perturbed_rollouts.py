@@ -51,6 +51,17 @@ class Grazing:
         return moved(state, torch.where(meets, action[..., 2:3], 0.0))
 
 
+class Unsure(Grazing):
+    """As `Grazing`, where every push meets, but the end of a narrow one is `spread` metres off, in any direction."""
+
+    narrow, spread = 10.0, 0.05
+
+    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
+        mean, angle = self.next_state(state, action), 2 * torch.pi * uniform[..., 1]
+        off = self.spread * (action[..., 3:] > 0) * torch.stack((angle.cos(), angle.sin(), 0 * angle), -1)[..., 0, :]
+        return mean._replace(centers=mean.centers + off.unsqueeze(-2))
+
+
 def standard(state: State) -> Distribution:
     zeros = state.centers.new_zeros((*state.centers.shape[:-2], 16))
     return torch.distributions.Independent(Normal(zeros, 1.0), 1)
@@ -66,9 +77,11 @@ def scenes(count: int) -> State:
     return State(torch.zeros(count, 2, 3), torch.zeros(count, 2, 4), torch.ones(count, 2, dtype=torch.bool))
 
 
-def chosen_motion(toy: SimpleNamespace, robustness: PerturbedRollouts | None, **options: object) -> Tensor:
+def chosen_motion(
+    toy: SimpleNamespace, robustness: PerturbedRollouts | None, model: Grazing | None = None, **options: object
+) -> Tensor:
     planner = toy.plain(
-        Grazing(), toy.GoalDisc(goal=(0.1, 0.0)), samples=SAMPLES, horizon=1, robustness=robustness, **options
+        model or Grazing(), toy.GoalDisc(goal=(0.1, 0.0)), samples=SAMPLES, horizon=1, robustness=robustness, **options
     )
     return planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2]
 
@@ -84,6 +97,20 @@ def test_a_motion_that_works_nearby_as_well_wins(toy: SimpleNamespace) -> None:
 
 def test_pushes_that_are_not_displaced_change_nothing(toy: SimpleNamespace) -> None:
     assert chosen_motion(toy, PerturbedRollouts(candidates=SAMPLES, start_noise=0.0)) == pytest.approx(0.1)
+
+
+def test_sampled_outcomes_pass_over_a_motion_of_which_f_is_not_sure(toy: SimpleNamespace) -> None:
+    sampled = PerturbedRollouts(candidates=SAMPLES, rollouts=4, outcomes="sampled")
+    assert chosen_motion(toy, sampled, Unsure()) == pytest.approx(0.09)
+    perturbed = PerturbedRollouts(candidates=SAMPLES, rollouts=4, outcome_noise=0.0)
+    assert chosen_motion(toy, perturbed, Unsure()) == pytest.approx(0.1)  # f's own doubt is not asked for
+
+
+def test_sampled_outcomes_need_a_model_that_samples(toy: SimpleNamespace) -> None:
+    with pytest.raises(ValueError, match="outcomes=sampled needs a model that samples f"):
+        chosen_motion(toy, PerturbedRollouts(outcomes="sampled"))
+    with pytest.raises(ValueError, match="unknown outcomes 'drawn': choose perturbed or sampled"):
+        PerturbedRollouts(outcomes="drawn")
 
 
 def test_only_the_best_candidates_get_perturbed_rollouts(toy: SimpleNamespace) -> None:

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.networks.contact import MAXIMUM_DISPLACEMENT, ContactDynamics
-from models.networks.outline import Outline, outline_features
+from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
+from models.networks.outline import Outline, standard_features
 from models.state import State
 
 
@@ -97,4 +97,4 @@ def test_a_push_of_no_length_gives_numbers() -> None:
 def test_features_that_are_no_outlines_are_refused(random_state: Callable[..., State]) -> None:
     with pytest.raises(ValueError, match="dynamics=contact reads outlines with 64 numbers, not 32"):
         ContactDynamics(feature_dimension=32)
-    assert outline_features(torch.zeros(63))[-1] == 1
+    assert standard_features(torch.zeros(63))[-1] == 1

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from envs.robots import STICK_RADIUS
 from envs.workspace import push_endpoints
+from models.networks.contact.tool import DISPLACEMENT_UNIT, PUSH_UNIT, TOOL_RADIUS, ToolContact, endpoints
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
-from models.networks.tool_contact import DISPLACEMENT_UNIT, PUSH_UNIT, TOOL_RADIUS, ToolContact, endpoints
 
 
 @settings(max_examples=25, deadline=None)

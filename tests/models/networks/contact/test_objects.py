@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.networks.contact.objects import PAIR_MEASURES, ObjectContact
+from models.networks.contact.tool import DISPLACEMENT_UNIT
+from models.networks.outline import PER_OUTLINE, Outline, outline_values
+
+RADII = (0.03, 0.02)  # metres, of two discs
+
+
+def discs() -> torch.Tensor:
+    angles = torch.linspace(0, 2 * math.pi, 257)[:-1]
+    ring = torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
+    clouds = torch.tensor(RADII)[:, None, None] * ring
+    return outline_values(Outline()(clouds))[..., :PER_OUTLINE]
+
+
+def measured(offset: tuple[float, float], aim: float, way: float) -> dict[str, float]:
+    """What the second disc, which lies at `offset` from the first, meets if that one is carried `way` along `aim`."""
+    place = torch.tensor([[0.0, 0.0], offset])
+    aims = torch.tensor([[math.cos(aim), math.sin(aim)], [1.0, 0.0]])
+    (found,) = ObjectContact()(place, discs(), aims, torch.tensor([way, 0.0]))
+    names = ("x", "y", "push_x", "push_y", "meet", "gap", "push", "own_meet", "own_gap", "own_push", "own_way", "way")
+    assert found.shape == (2, PAIR_MEASURES) == (2, len(names))
+    return dict(zip(names, (found[1] * DISPLACEMENT_UNIT).tolist(), strict=True))
+
+
+@settings(max_examples=20, deadline=None)
+@given(aim=st.floats(-3.1, 3.1), aside=st.floats(-0.04, 0.04))
+def test_a_disc_ahead_is_met_after_the_distance_between_both_and_pushed_for_the_rest(aim: float, aside: float) -> None:
+    cosine, sine = math.cos(aim), math.sin(aim)
+    found = measured((0.08 * cosine - aside * sine, 0.08 * sine + aside * cosine), aim, 0.05)
+    way = 0.08 - sum(RADII)
+    assert found["meet"] == pytest.approx(way, abs=1e-3)
+    assert found["gap"] == pytest.approx(abs(aside) - sum(RADII), abs=1e-3)
+    assert found["push"] == pytest.approx(0.05 - way, abs=1e-3)
+    assert (found["push_x"], found["push_y"]) == pytest.approx((found["push"] * cosine, found["push"] * sine), abs=1e-3)
+    assert found["way"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("offset", [(0.08, 0.06), (0.08, -0.06), (-0.08, 0.0)])
+def test_a_disc_beside_the_way_or_behind_is_not_pushed(offset: tuple[float, float]) -> None:
+    found = measured(offset, 0.0, 0.05)
+    assert found["push"] == found["push_x"] == found["push_y"] == 0.0
+
+
+def test_a_way_that_ends_before_the_other_disc_pushes_nothing() -> None:
+    assert measured((0.08, 0.0), 0.0, 0.02)["push"] == 0.0
+    assert measured((0.08, 0.0), 0.0, 0.04)["push"] > 0.005
+
+
+def test_what_an_object_would_push_is_what_the_other_is_pushed_by() -> None:
+    torch.manual_seed(0)
+    place, aim = 0.06 * torch.randn(4, 3, 2), torch.nn.functional.normalize(torch.randn(4, 3, 2), dim=-1)
+    outlines = outline_values(Outline()(0.02 * torch.randn(4, 3, 64, 3)))[..., :PER_OUTLINE]
+    first, second = ObjectContact()(place, outlines, aim, 0.08 * torch.rand(4, 3))
+    # Object i with j = i - 1 in the first is object j with i = j - 2 in the second.
+    assert torch.allclose(first[..., 4:7], second.roll(1, -2)[..., 7:10], atol=1e-5)
+    assert first[..., 6].max() > 0
