@@ -26,7 +26,11 @@ EXAMPLES = {
         "a=cavin b=sectar",
         "sections=[prior,consistency] sizes.consistency.scenes=300",
     ),
-    "calibrate": ("checkpoint=runs/train/checkpoint.safetensors data=data/pushes", "checkpoint=cavin wake_weight=0"),
+    "calibrate": (
+        "checkpoint=runs/train/checkpoint.safetensors data=data/pushes",
+        "checkpoint=cavin wake_weight=0",
+        "checkpoint=contact steps=3000 seed=1",
+    ),
     "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
     "evaluate": (
         "task=crossing reward=sparse objects=3",
