@@ -21,14 +21,14 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.reproduction.results import write_results
     from cavin_pyro.reproduction.table import read_table
     from cavin_pyro.storage.files import output_folder
-    from cavin_pyro.storage.provenance import append_provenance
+    from cavin_pyro.storage.provenance import PROVENANCE, append_provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
     with output_folder(config.output) as home:
         check_same_run(home, config, ignore=IGNORED)
         rows = read_table(Path(config.table)) if config.table else []
         write_config(home, config)
-        append_provenance(home / "provenance.json")
+        append_provenance(home / PROVENANCE, Path(config.extends).with_name(PROVENANCE) if config.extends else None)
         if config.merge:
             rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
         elif not config.table:

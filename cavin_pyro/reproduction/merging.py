@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.reproduction.cells import evaluations
 from cavin_pyro.reproduction.pipeline import chosen_scale
-from cavin_pyro.reproduction.table import TABLE, read_table, write_table
+from cavin_pyro.reproduction.table import TABLE, episode_key, read_table, row_key, write_table
 from cavin_pyro.storage.run_directory import check_same_run
 
-EXTENDED = ("planners", "episodes", "bottom_episodes")  # options that may change when a run goes on
+EXTENDED = ("planners", "episodes", "bottom_episodes", "extends")  # options that may change when a run goes on
 IGNORED = ("output", "workers", "shard", "merge", "pictures", *EXTENDED)
 
 
@@ -30,9 +30,9 @@ def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> lis
             raise UserError(f"merge={folder} holds no {TABLE}: let its shard end first")
         check_same_run(folder, config, ignore=IGNORED)
         for row in read_table(folder / TABLE):
-            rows[_key(row)] = row
+            rows[row_key(row)] = row
     wanted = [
-        (one.cell.method, one.cell.planner, one.cell.task, one.cell.reward, one.cell.objects, one.training_seed, seed)
+        episode_key(one, seed)
         for one in evaluations(chosen_scale(config), config.methods, config.planners)
         for seed in range(one.seed, one.seed + one.episodes)
     ]
@@ -46,7 +46,3 @@ def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> lis
     ordered = [rows[key] for key in wanted]
     write_table(home / TABLE, ordered)
     return ordered
-
-
-def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("method", "planner", "task", "reward", "objects", "training_seed", "seed"))

@@ -16,13 +16,13 @@ from tqdm import tqdm
 from cavin_pyro.config.commands.reproduction import ReproduceConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
+from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs
 from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
-from cavin_pyro.reproduction.table import TABLE, episode_row, write_table
+from cavin_pyro.reproduction.table import TABLE, Row, episode_key, episode_row, read_table, row_key, write_table
 from cavin_pyro.storage.files import clear_abandoned
 from cavin_pyro.storage.run_directory import write_config
 
@@ -30,12 +30,13 @@ ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
 
 
-def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
+def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
     """Collect, pretrain, train and evaluate, as far as that has not been done, and write the table of episodes.
 
     Args:
         config: of the command `reproduce`. `shard=i/n`: the i-th of every n trainings and their episodes only.
-            With more `episodes` or other `planners` than an earlier run, only what is missing is run.
+            With more `episodes` or other `planners` than an earlier run, only what is missing is run; `extends` names
+            the table of a run whose folder is elsewhere.
 
     Returns:
         The table's rows.
@@ -55,11 +56,12 @@ def run_pipeline(config: DictConfig, home: Path) -> list[dict[str, Any]]:
     # Each group needs the one before it.
     groups = [] if config.models else [[first[0]], [first[1]], learning]
     models = _models(config, home, own)
-    with _whole_progress([stage for group in groups for stage in group], scale, own, home, config.workers) as bar:
+    known = {row_key(row): row for row in read_table(Path(config.extends))} if config.extends else {}
+    flat = [stage for group in groups for stage in group]
+    with _whole_progress(flat, scale, own, home, config.workers, known) as bar:
         for stages in groups:
             run_stages(stages, config.workers, bar.update_stages)
-        found = _evaluate(scale, own, home, models, config.workers, bar)
-    rows = [episode_row(one, row) for one in own for row in found[one]]
+        rows = _evaluate(scale, own, home, models, config.workers, bar, known)
     write_table(home / TABLE, rows)
     return rows
 
@@ -84,7 +86,7 @@ def as_typed(config: DictConfig) -> str:
     if config.table:
         return shlex.join(["python", "-m", "cavin_pyro.reproduce", f"table={config.table}"])
     default, words = ReproduceConfig(), [f"scale={config.scale}"]
-    for name in ("methods", "planners", "episodes", "bottom_episodes", "models"):
+    for name in ("methods", "planners", "episodes", "bottom_episodes", "models", "extends"):
         if config[name] != getattr(default, name):
             value = config[name]
             words.append(f"{name}={value if isinstance(value, int | str) else '[' + ','.join(value) + ']'}")
@@ -121,16 +123,19 @@ def _evaluate(
     models: Mapping[Evaluation, Path],
     workers: int,
     bar: _Bar,
-) -> dict[Evaluation, list[Row]]:
-    """The episodes of all evaluations, one queue for all, so that no worker waits for the end of a cell.
+    known: Mapping[tuple[Any, ...], Row],
+) -> list[Row]:
+    """The table's rows of all evaluations, whose episodes are one queue, so that no worker waits for a cell's end.
 
-    The queue goes in rounds over the cells, so that an interrupted run has about as many episodes of each.
+    Episodes of the table `known` are taken from there. The queue goes in rounds over the cells, so that an interrupted
+    run has about as many episodes of each.
     """
     rows = {one: begin(_made(evaluation_folder(home, one))) for one in own}
     missing = [
         ((seed - one.seed) // ROUND, place, one, config, seed)
         for place, (one, config) in enumerate(_configurations(scale, own, home, models))
         for seed in missing_seeds(config, rows[one])
+        if episode_key(one, seed) not in known
     ]
     missing.sort(key=lambda job: (job[0], job[1], job[-1]))
     with closing(run_jobs([(config, seed) for *_, config, seed in missing], workers)) as finished:
@@ -139,7 +144,8 @@ def _evaluate(
             rows[one][row["seed"]] = row
             append(evaluation_folder(home, one), row)
             bar.update(scale.episode_seconds / workers)
-    return {one: [found[one.seed + place] for place in range(one.episodes)] for one, found in rows.items()}
+    wanted = [(one, seed) for one in own for seed in range(one.seed, one.seed + one.episodes)]
+    return [known.get(episode_key(one, seed)) or episode_row(one, rows[one][seed]) for one, seed in wanted]
 
 
 def _configurations(
@@ -194,10 +200,16 @@ class _Bar:
 
 @contextmanager
 def _whole_progress(
-    stages: Sequence[Stage], scale: Scale, own: Sequence[Evaluation], home: Path, workers: int
+    stages: Sequence[Stage],
+    scale: Scale,
+    own: Sequence[Evaluation],
+    home: Path,
+    workers: int,
+    known: Mapping[tuple[Any, ...], Row],
 ) -> Iterator[_Bar]:
     each = scale.episode_seconds / workers
     done = sum(len(begin(_made(evaluation_folder(home, one)))) for one in own)
+    done += sum(episode_key(one, one.seed + place) in known for one in own for place in range(one.episodes))
     bar = _Bar(stages, done * each, sum(one.episodes for one in own) * each)
     try:
         yield bar

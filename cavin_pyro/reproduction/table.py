@@ -80,6 +80,18 @@ def read_table(path: Path) -> list[Row]:
         raise UserError(f"{path} is no table of episodes ({why}): give an episodes.parquet of reproduce") from error
 
 
+def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What tells an episode from all others in a table."""
+    return tuple(row[name] for name in ("method", "planner", "task", "reward", "objects", "training_seed", "seed"))
+
+
+def episode_key(evaluation: Evaluation, seed: int) -> tuple[Any, ...]:
+    """`row_key` of an evaluation's episode in the scene `seed`."""
+    cell = evaluation.cell
+    place = cell.method, cell.planner, cell.task, cell.reward, cell.objects
+    return *place, evaluation.training_seed, seed
+
+
 def as_text(value: Any) -> str:
     """JSON whose bytes depend on the value alone."""
     return json.dumps(value, indent=1, sort_keys=True) + "\n"

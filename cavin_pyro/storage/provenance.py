@@ -16,6 +16,8 @@ from cavin_pyro import __version__
 from cavin_pyro.config.application import PACKAGES
 from cavin_pyro.storage.files import read_json, write_json
 
+PROVENANCE = "provenance.json"  # a run's records, in its folder
+
 
 def provenance() -> dict[str, Any]:
     """A record of this run, JSON-ready."""
@@ -30,9 +32,13 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def append_provenance(path: Path) -> None:
-    """Add a record of this run to those of the runs that it goes on from: a JSON list."""
-    earlier = read_json(path) if path.exists() else []
+def append_provenance(path: Path, extends: Path | None = None) -> None:
+    """Add a record of this run to those of the runs that it goes on from: a JSON list.
+
+    extends: such a list of a run in another folder, which begins the list of a run that has none yet.
+    """
+    begun = path if path.exists() or extends is None else extends
+    earlier = read_json(begun) if begun.exists() else []
     write_json(path, [*(earlier if isinstance(earlier, list) else [earlier]), provenance()])
 
 

@@ -53,6 +53,11 @@ class ReproduceConfig:
         "trained then",
         group="run",
     )
+    extends: str | None = option(
+        None,
+        "a table of episodes of an earlier run with the same scale and models: its episodes are not run again",
+        group="run",
+    )
     output: str | None = option(
         None, "folder for everything, where an unfinished run is resumed; by default one in runs/reproduce", group="run"
     )

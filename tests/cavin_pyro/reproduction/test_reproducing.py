@@ -16,6 +16,7 @@ from filelock import FileLock
 from cavin_pyro.config.errors import UserError, WorkerError
 from cavin_pyro.reproduction import stages
 from cavin_pyro.reproduction.stages import Stage, run_stages
+from cavin_pyro.reproduction.table import read_table
 from cavin_pyro.storage.files import output_folder
 
 WHOLE = ("scale=minimal", "methods=[mpc]", "planners=[paper]", "workers=1", "output=whole")
@@ -62,6 +63,15 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     assert trained.status == 0, trained.errors
     assert not (tmp_path / "trained" / "data").exists() and not (tmp_path / "trained" / "train").exists()
     assert contents(tmp_path / "trained") == made
+    extended = ("models=models", "bottom_episodes=3", "extends=whole/episodes.parquet", "output=extended")
+    joined = shell.run_command("reproduce", *WHOLE[:-1], *extended, folder=tmp_path)
+    assert joined.status == 0, joined.errors
+    rows, known = (read_table(path / "episodes.parquet") for path in (tmp_path / "extended", home))
+    assert len(rows) == 5 and [row for row in rows if row in known] == known
+    run = [path.read_text().splitlines() for path in (tmp_path / "extended").rglob("episodes.jsonl")]
+    assert sum(map(len, run)) == 5 - 4  # the other four are those of the table, and were not run again
+    records = json.loads((tmp_path / "extended" / "provenance.json").read_text())
+    assert [one["command"].split()[-1] for one in records[-2:]] == ["bottom_episodes=2", "output=extended"]
     lacking = shell.run_command("reproduce", "scale=minimal", "models=models", "output=lacking", folder=tmp_path)
     expected = "models=models holds no cavin-0.safetensors: choose other methods, or train it"
     assert lacking.status == 2 and expected in lacking.complaints[0]
