@@ -184,7 +184,7 @@ def test_the_oracle_foretells_pushes_without_touching_the_episode(monkeypatch: p
 
 def test_samples_are_set_against_success_and_a_finished_setting_is_not_run_again(tmp_path: Path) -> None:
     few = ["planner.horizon=6", "maximum_steps=2", "--methods", "cavin", "--planners", "paper", "--episodes", "1"]
-    few += ["--workers", "1", "--output", str(tmp_path)]
+    few += ["--workers", "1", "--timed", "1", "--output", str(tmp_path)]
     run("samples", *few, "--samples", "8")
     log = (tmp_path / "cavin-paper-8" / "episodes.jsonl").read_bytes()  # with times
     assert json.loads(log)["seed"] == 73000
