@@ -151,8 +151,8 @@ def table(found: Sequence[Point], arguments: argparse.Namespace) -> str:
         f"{arguments.task}, sparse reward, {arguments.objects} objects, scenes {FIRST_SCENE} to {last}, "
         "objects told apart in the depth image alone.",
         "Success with Wilson's 95 % interval; time: processor time of the first plan, median of",
-        f"{arguments.timed} scenes, {torch.get_num_threads()} thread(s). The paper's planners make a plan for 3 pushes,",
-        "ours one for each push.",
+        f"{arguments.timed} scenes, {torch.get_num_threads()} thread(s). The paper's planners make a plan for 3",
+        "pushes, ours one for each push.",
         "\\*: no other is as fast and succeeds more often.",
         "",
         "| method | planner | samples | CPU ms per plan | success, published | success, strict |",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS, Scale
 
 FIGURES = ("paper", "ours")  # kinds of planners that have a figure of their own
@@ -74,3 +76,14 @@ def evaluations(scale: Scale, methods: Sequence[str], planners: Sequence[str] = 
         share = -(-(scale.episodes if top else scale.bottom_episodes) // len(scale.training_seeds))
         for number, training_seed in enumerate(scale.training_seeds):
             yield Evaluation(cell, training_seed, scale.first_scene + number * SCENES_PER_TRAINING, share)
+
+
+def in_order(rows: Sequence[Mapping[str, Any]], scale: Scale) -> list[Any]:
+    """Rows of a table in the order of `evaluations` of all methods and planners, whatever was run first."""
+    places = {cell: place for place, cell in enumerate(cells(scale, list(METHODS)))}
+
+    def place(row: Mapping[str, Any]) -> tuple[int, int, int]:
+        cell = Cell(row["method"], row["planner"], row["task"], row["reward"], row["objects"])
+        return places[cell], row["training_seed"], row["seed"]
+
+    return sorted(rows, key=place)

@@ -18,7 +18,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs
 from cavin_pyro.launching.launcher import of_shard
-from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations
+from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations, in_order
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
@@ -36,7 +36,7 @@ def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
     Args:
         config: of the command `reproduce`. `shard=i/n`: the i-th of every n trainings and their episodes only.
             With more `episodes` or other `planners` than an earlier run, only what is missing is run; `extends` names
-            the table of a run whose folder is elsewhere.
+            the table of a run whose folder is elsewhere, and whose episodes are kept, wanted or not.
 
     Returns:
         The table's rows.
@@ -56,12 +56,14 @@ def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
     # Each group needs the one before it.
     groups = [] if config.models else [[first[0]], [first[1]], learning]
     models = _models(config, home, own)
-    known = {row_key(row): row for row in read_table(Path(config.extends))} if config.extends else {}
+    known = _known(config, scale)
     flat = [stage for group in groups for stage in group]
     with _whole_progress(flat, scale, own, home, config.workers, known) as bar:
         for stages in groups:
             run_stages(stages, config.workers, bar.update_stages)
         rows = _evaluate(scale, own, home, models, config.workers, bar, known)
+    own_keys = {row_key(row) for row in rows}
+    rows = in_order([*rows, *(row for key, row in known.items() if key not in own_keys)], scale)
     write_table(home / TABLE, rows)
     return rows
 
@@ -109,6 +111,27 @@ def _models(config: DictConfig, home: Path, own: Sequence[Evaluation]) -> dict[E
         else:
             found[one] = training_folder(home, method, seed) / "checkpoint.safetensors"
     return found
+
+
+def _known(config: DictConfig, scale: Scale) -> dict[tuple[Any, ...], Row]:
+    """The rows of the table `extends`, by `row_key`.
+
+    Raises:
+        UserError: the table has an episode that no run of this scale has.
+    """
+    if not config.extends:
+        return {}
+    rows = read_table(Path(config.extends))
+    whole = replace(scale, episodes=1, bottom_episodes=1)
+    own = {episode_key(one, one.seed)[:-1]: one.seed for one in evaluations(whole, list(METHODS))}
+    for row in rows:
+        first = own.get(row_key(row)[:-1])
+        if first is None or not first <= row["seed"] < first + SCENES_PER_TRAINING:
+            raise UserError(
+                f"extends={config.extends} has scene {row['seed']} of {row['method']} in {row['task']}, which no run "
+                f"with scale={config.scale} has: give the scale of that table"
+            )
+    return {row_key(row): row for row in rows}
 
 
 def evaluation_folder(home: Path, evaluation: Evaluation) -> Path:

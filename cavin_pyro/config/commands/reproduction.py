@@ -55,7 +55,7 @@ class ReproduceConfig:
     )
     extends: str | None = option(
         None,
-        "a table of episodes of an earlier run with the same scale and models: its episodes are not run again",
+        "a table of episodes of an earlier run with the same scale and models: its episodes are kept and not run again",
         group="run",
     )
     output: str | None = option(

@@ -72,6 +72,11 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     assert sum(map(len, run)) == 5 - 4  # the other four are those of the table, and were not run again
     records = json.loads((tmp_path / "extended" / "provenance.json").read_text())
     assert [one["command"].split()[-1] for one in records[-2:]] == ["bottom_episodes=2", "output=extended"]
+    strange = shell.run_command("reproduce", "scale=smoke", *extended[2:3], "output=strange", folder=tmp_path)
+    assert (
+        strange.status == 2
+        and "has scene 50000 of mpc in clearing, which no run with scale=smoke has" in (strange.complaints[0])
+    )
     lacking = shell.run_command("reproduce", "scale=minimal", "models=models", "output=lacking", folder=tmp_path)
     expected = "models=models holds no cavin-0.safetensors: choose other methods, or train it"
     assert lacking.status == 2 and expected in lacking.complaints[0]
