@@ -1,13 +1,14 @@
 from __future__ import annotations
 
-from dataclasses import replace
+import random
+from dataclasses import asdict, replace
 
 import pytest
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.launching.launcher import of_shard
-from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations
+from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations, in_order
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale
 from cavin_pyro.reproduction.scales import SCALES
@@ -81,6 +82,17 @@ def test_more_episodes_contain_those_of_a_shorter_run() -> None:
         for some in (scale, replace(scale, episodes=300, bottom_episodes=90))
     )
     assert short < long
+
+
+def test_rows_have_one_order_whatever_was_run_first() -> None:
+    scale = SCALES["small"]
+    rows = [
+        asdict(one.cell) | {"training_seed": one.training_seed, "seed": seed}
+        for one in evaluations(scale, list(METHODS))
+        for seed in range(one.seed, one.seed + one.episodes)
+    ]
+    mixed = random.Random(0).sample(rows, len(rows))
+    assert mixed != rows and in_order(mixed, scale) == rows
 
 
 def test_more_episodes_than_scenes_are_refused() -> None:
