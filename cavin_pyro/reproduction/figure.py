@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, Method
 from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
 from cavin_pyro.storage.files import atomic_write
 
@@ -49,27 +49,30 @@ def draw_figure(path: Path, rates: Rates, *, planner: str, criterion: str) -> No
 def _draw_rewards(axes: Axes, rates: Rates) -> None:
     """Dense and sparse rewards, three objects."""
     kinds = ("dense", "sparse")
-    for number, (name, method) in enumerate(METHODS.items()):
+    shown = _shown(rates)
+    for number, (name, method) in enumerate(shown.items()):
         chosen = [rate for rate in rates if rate["method"] == name and rate["objects"] == TOP_ROW_OBJECTS]
         for place, kind in enumerate(kinds):
             for rate in chosen:
                 if rate["reward"] == kind:
-                    x = place + (number - (len(METHODS) - 1) / 2) * BAR_WIDTH
+                    x = place + (number - (len(shown) - 1) / 2) * BAR_WIDTH
                     axes.bar(x, 100 * rate["rate"], BAR_WIDTH * 0.9, color=method.color)
                     axes.errorbar(x, 100 * rate["rate"], _whiskers([rate]), color="black", capsize=2, linewidth=0.8)
     axes.set_xticks(range(len(kinds)), [f"{kind} reward" for kind in kinds])
     axes.set_xlabel(_episodes([rate for rate in rates if rate["objects"] == TOP_ROW_OBJECTS]), fontsize=8)
+    axes.set_xlim(-0.5, len(kinds) - 0.5)
     axes.set_ylim(0, 104)
 
 
 def _draw_objects(axes: Axes, rates: Rates) -> None:
     """Sparse rewards, against the number of objects."""
-    for number, (name, method) in enumerate(METHODS.items()):
+    shown = _shown(rates)
+    for number, (name, method) in enumerate(shown.items()):
         chosen = [rate for rate in rates if rate["method"] == name and rate["reward"] == "sparse"]
         chosen.sort(key=lambda rate: rate["objects"])
         if chosen:
             axes.errorbar(
-                [rate["objects"] + DODGE * (number - (len(METHODS) - 1) / 2) for rate in chosen],
+                [rate["objects"] + DODGE * (number - (len(shown) - 1) / 2) for rate in chosen],
                 [100 * rate["rate"] for rate in chosen],
                 _whiskers(chosen),
                 color=method.color,
@@ -83,6 +86,12 @@ def _draw_objects(axes: Axes, rates: Rates) -> None:
     of_line = [rate for rate in rates if rate["reward"] == "sparse"]
     others = _episodes([rate for rate in of_line if rate["objects"] != TOP_ROW_OBJECTS])
     axes.set_xlabel(f"objects ({others}, but with {TOP_ROW_OBJECTS} as above)" if others else "objects", fontsize=8)
+
+
+def _shown(rates: Rates) -> dict[str, Method]:
+    """The methods that have episodes, in the order of `METHODS`."""
+    present = {rate["method"] for rate in rates}
+    return {name: method for name, method in METHODS.items() if name in present}
 
 
 def _episodes(rates: Rates) -> str:
