@@ -1,6 +1,8 @@
 """Ship checkpoints out of a reproduction: `python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]`.
 
 With `--models` instead of methods: all of its trainings, for `reproduce models=checkpoints/reproduction`.
+`python -m cavin_pyro.storage.shipping --guide FILE NAME`: the shipped checkpoint NAME with the guide that `calibrate`
+has written to FILE.
 """
 
 from __future__ import annotations
@@ -12,10 +14,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.checkpoint import Checkpoint, checkpoint_bytes, load_checkpoint, shipped_folder
-from cavin_pyro.storage.digests import update_manifest
+from cavin_pyro.storage.digests import file_digest, update_manifest
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 
 BASELINES = ("sectar", "cvae_mpc", "mpc")
@@ -62,6 +66,30 @@ def ship_models(home: Path, to: Path) -> list[Path]:
         shipped.append(to / f"{folder.name}.safetensors")
         _write(shipped[-1], load_checkpoint(folder / "checkpoint.safetensors"))
     return shipped
+
+
+def ship_guide(calibrated: Path, shipped: Path) -> None:
+    """Replace a shipped checkpoint by the result of its calibration, which differs in the guide alone.
+
+    Raises:
+        UserError: it was not calibrated from this file, or something else than the guide differs.
+    """
+    before, after = load_checkpoint(shipped), load_checkpoint(calibrated)
+    records = after.provenance.get("calibrated")
+    if not isinstance(records, list) or records[-1].get("checkpoint") != file_digest(shipped):
+        raise UserError(f"{calibrated} is no calibration of {shipped}: run calibrate checkpoint={shipped}")
+    changed = {
+        name
+        for name in before.tensors.keys() | after.tensors.keys()
+        if name not in before.tensors
+        or name not in after.tensors
+        or not torch.equal(before.tensors[name], after.tensors[name])
+    }
+    if other := sorted(name for name in changed if not name.startswith("guide.")):
+        raise UserError(f"{calibrated} differs from {shipped} in {other[0]}, not in the guide alone")
+    if after.config != before.config:
+        raise UserError(f"{calibrated} has another configuration than {shipped}")
+    _write(shipped, after)
 
 
 def _trainings(home: Path, method: str) -> list[Path]:
@@ -120,21 +148,30 @@ def _write(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def main() -> None:
-    """Ship the methods that the command line names, by default the three baselines."""
-    if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
-        raise SystemExit("usage: python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ... | --models]")
+    """Ship what the command line names, by default the three baselines of a run folder."""
+    arguments, to = sys.argv[1:], shipped_folder()
+    guide = len(arguments) == 3 and arguments[0] == "--guide"
+    if not guide and (not arguments or arguments[0].startswith("-")):
+        raise SystemExit(
+            "usage: python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ... | --models]\n"
+            "       python -m cavin_pyro.storage.shipping --guide FILE NAME"
+        )
     try:
-        if sys.argv[2:] == ["--models"]:
-            print(*ship_models(Path(sys.argv[1]), shipped_folder() / "reproduction"), sep="\n")
-            update_manifest(shipped_folder())
+        if guide:
+            ship_guide(Path(arguments[1]), to / f"{arguments[2]}.safetensors")
+            update_manifest(to)
             return
-        for method in sys.argv[2:] or BASELINES:
-            found = ship(Path(sys.argv[1]), method, shipped_folder())
+        if arguments[1:] == ["--models"]:
+            print(*ship_models(Path(arguments[0]), to / "reproduction"), sep="\n")
+            update_manifest(to)
+            return
+        for method in arguments[1:] or BASELINES:
+            found = ship(Path(arguments[0]), method, to)
             print(
                 f"{method}: training seed {found['training_seed']}, best step {found['best_step']} of "
                 f"{found['steps']}, validation losses by seed {found['validation_losses']}"
             )
-            update_manifest(shipped_folder())
+            update_manifest(to)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error

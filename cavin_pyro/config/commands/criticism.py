@@ -60,9 +60,9 @@ class CalibrateConfig:
     seed: int = seed_option(group="run")
     steps: int = option(1500, "gradient steps", minimum=1, group="training", limit=10**9)
     batch_size: int = option(256, "windows per step", minimum=1, group="training", limit=10**6)
-    learning_rate: float = option(1e-3, "Adam's at the start; it ends at a hundredth of it", above=0, group="training")
+    learning_rate: float = option(3e-3, "Adam's at the start; it ends at a hundredth of it", above=0, group="training")
     wake_weight: float = option(
-        0.1,
+        0.03,
         "weight of -ELBO on real windows beside the loss on generated ones; 0 learns from generated ones alone",
         minimum=0,
         group="training",

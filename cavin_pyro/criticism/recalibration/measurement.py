@@ -36,9 +36,10 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int) -> Measu
 
     Returns:
         `windows`, `episodes`; of simulated windows what 90 % intervals hold, by code: `held` over all dimensions,
-        `held_informed` over those that learn from the window (`informed` of `dimensions`), and `joint`, of the
-        region of highest density. Of real windows `minus_elbo`, in nats, and `subgoal_held`, of the centres that
-        moved, in 90 % intervals of h's predictions with codes of the guide; None without h, or if nothing moved.
+        `held_informed` over those that learn from the window (`informed` of `dimensions`), `held_worst` in the
+        dimension that holds least, and `joint`, of the region of highest density. Of real windows `minus_elbo`, in
+        nats, and `subgoal_held`, of the centres that moved, in 90 % intervals of h's predictions with codes of the
+        guide; None without h, or if nothing moved.
     """
     window, episodes = context.held_out(windows)
     with seeded(context.seed):
@@ -47,9 +48,11 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int) -> Measu
     by_code = {}
     for name, ranks in found.ranks.items():
         informed = found.contraction[name] > ACTIVE_CONTRACTION
+        each = [held(column, LEVEL, episodes) for column in ranks.T]
         by_code[SYMBOLS[name]] = {
             "held": held(ranks, LEVEL, episodes)._asdict(),
             "held_informed": held(ranks[:, informed] if informed.any() else ranks, LEVEL, episodes)._asdict(),
+            "held_worst": min(each, key=lambda one: one.mean)._asdict(),
             "informed": int(informed.sum()),
             "dimensions": ranks.shape[1],
             "contraction": found.contraction[name].max().item(),
@@ -82,7 +85,8 @@ def sentences(before: Measured, after: Measured) -> list[str]:
         lines += [
             f"90 % intervals of {symbol} hold {_percent(code['held'])}, now {_percent(now['held'])}; of informed "
             f"dimensions ({code['informed']}, now {now['informed']}) {_percent(code['held_informed'])}, "
-            f"now {_percent(now['held_informed'])}"
+            f"now {_percent(now['held_informed'])}; of the worst dimension {_percent(code['held_worst'])}, "
+            f"now {_percent(now['held_worst'])}"
         ]
     lines.append(f"90 % regions of all codes hold {_percent(before['joint'])}, now {_percent(after['joint'])}")
     elbo, now = (one["minus_elbo"]["mean"] for one in (before, after))

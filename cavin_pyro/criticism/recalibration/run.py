@@ -16,6 +16,7 @@ from cavin_pyro.criticism.recalibration.sleep import sleep
 from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.dataset import content_records
 from cavin_pyro.storage.checkpoint import checkpoint_bytes
+from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.files import atomic_write, write_json
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.trainer import unchecked_programs
@@ -62,12 +63,17 @@ def calibrate_guide(config: DictConfig, loaded: Loaded) -> list[dict[str, float]
 def write_calibrated(
     folder: Path, config: DictConfig, loaded: Loaded, *, before: Measured, after: Measured, losses: list[dict[str, Any]]
 ) -> Path:
-    """Write the checkpoint with the guide as it is now, all else as it was, and `calibration.json` beside it."""
+    """Write the checkpoint with the guide as it is now, all else as it was, and `calibration.json` beside it.
+
+    Its provenance has a record for every calibration in `calibrated`: program, options, the SHA-256 of the file that
+    was calibrated (`checkpoint`), fingerprints of the data, and what was measured before and after.
+    """
     checkpoint, path = loaded.checkpoint, folder / "checkpoint.safetensors"
     guide = {f"guide.{name}": value.detach().contiguous() for name, value in loaded.guide.state_dict().items()}
     record = {
         **provenance(),
         **{name: config[name] for name in OPTIONS},
+        "checkpoint": file_digest(loaded.path),
         "data": [one["fingerprint"] for data in loaded.folders for one in content_records(data)],
         "before": before,
         "after": after,

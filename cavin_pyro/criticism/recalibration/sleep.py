@@ -42,8 +42,8 @@ def sleep(
     batch: Callable[[], Window],
     *,
     steps: int = 1500,
-    learning_rate: float = 1e-3,
-    wake_weight: float = 0.1,
+    learning_rate: float = 3e-3,
+    wake_weight: float = 0.03,
 ) -> list[dict[str, float]]:
     """Fit a guide by Adam with a cosine schedule; the model stays as it is.
 

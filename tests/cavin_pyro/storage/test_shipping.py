@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -14,8 +15,9 @@ from safetensors.torch import save
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_model
 from cavin_pyro.storage import shipping
-from cavin_pyro.storage.checkpoint import load_checkpoint
-from cavin_pyro.storage.shipping import main, ship, ship_models
+from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.digests import file_digest, read_manifest
+from cavin_pyro.storage.shipping import main, ship, ship_guide, ship_models
 
 LOSSES = {0: -3.0, 1: -7.5, 2: -5.0}  # by training seed
 
@@ -117,3 +119,58 @@ def test_all_trainings_are_shipped_by_method_and_seed(home: Path, tmp_path: Path
     (home / "train" / "sectar-1" / "metrics.json").unlink()
     with pytest.raises(UserError, match="sectar-1 has not finished: rerun reproduce to resume it"):
         ship_models(home, tmp_path / "models")
+
+
+def calibrate_by_hand(small: SimpleNamespace, shipped: Path, to: Path, *, part: str, **config: Any) -> None:
+    """What `calibrate` would write for a shipped file, but for numbers of one part, which grow by 1."""
+    content = load_checkpoint(shipped)
+    modules = small.parts()
+    for name, module in modules.items():
+        content.load_into(name, module, shipped)
+    with torch.no_grad():
+        for parameter in modules[part].parameters():
+            parameter.add_(1.0)
+    about = {**content.provenance, "calibrated": [{"steps": 3, "checkpoint": file_digest(shipped)}]}
+    save_checkpoint(to, parts=modules, config={**content.config, **config}, provenance=about)
+
+
+@pytest.fixture
+def shipped(small: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of shipped checkpoints with `cavin`."""
+    folder = tmp_path / "shipped"
+    path = folder / "cavin.safetensors"
+    folder.mkdir()
+    save_checkpoint(path, parts=small.parts(), config={**small.config(), "output": "runs/long"}, provenance={"step": 7})
+    monkeypatch.setattr(shipping, "shipped_folder", lambda: folder)
+    return path
+
+
+def test_a_calibrated_guide_is_shipped_with_the_model_as_it_was(
+    small: SimpleNamespace, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, calibrated = load_checkpoint(shipped), tmp_path / "calibrated.safetensors"
+    calibrate_by_hand(small, shipped, calibrated, part="guide")
+    monkeypatch.setattr(sys, "argv", ["shipping", "--guide", str(calibrated), "cavin"])
+    main()
+    after = load_checkpoint(shipped)
+    changed = {name for name, value in before.tensors.items() if not torch.equal(value, after.tensors[name])}
+    assert changed and all(name.startswith("guide.") for name in changed)
+    assert after.provenance["step"] == 7 and after.provenance["calibrated"][-1]["steps"] == 3
+    assert read_manifest(shipped.parent) == {"cavin.safetensors": file_digest(shipped)}
+
+
+def test_a_guide_with_another_model_or_of_another_file_is_not_shipped(
+    small: SimpleNamespace, shipped: Path, tmp_path: Path
+) -> None:
+    digest, calibrated = file_digest(shipped), tmp_path / "calibrated.safetensors"
+    calibrate_by_hand(small, shipped, calibrated, part="model")
+    with pytest.raises(UserError, match=r"differs from .* in model\..*, not in the guide alone"):
+        ship_guide(calibrated, shipped)
+    calibrate_by_hand(small, shipped, calibrated, part="guide", seed=5)
+    with pytest.raises(UserError, match="has another configuration"):
+        ship_guide(calibrated, shipped)
+    assert file_digest(shipped) == digest
+    calibrate_by_hand(small, shipped, calibrated, part="guide")
+    ship_guide(calibrated, shipped)
+    with pytest.raises(UserError, match="is no calibration of"):  # of the file as it was before
+        ship_guide(calibrated, shipped)

@@ -11,6 +11,7 @@ import torch
 
 from cavin_pyro.criticism.loading import load_programs
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.geometry import geometry_of
 from tests.cavin_pyro.conftest import WINDOWS
 
@@ -40,7 +41,8 @@ def test_only_the_guide_changes_and_the_checkpoint_says_so(
     assert before.config == after.config
     assert after.provenance["step"] == 7
     (record,) = after.provenance["calibrated"]
-    assert record["steps"] == 3 and record["wake_weight"] == 0.1
+    assert record["steps"] == 3 and record["wake_weight"] == 0.03
+    assert record["checkpoint"] == file_digest(trained)
     assert record["command"].startswith("python -m cavin_pyro")
     assert record["before"]["codes"].keys() == record["after"]["codes"].keys() == {"c", "z"}
     assert record["before"]["minus_elbo"] != record["after"]["minus_elbo"]

@@ -120,6 +120,7 @@ def test_measurements_tell_narrow_guides_and_what_they_cost(scenes: SimpleNamesp
     }
     for code in found[1.0]["codes"].values():
         assert code["held_informed"]["mean"] == pytest.approx(0.9, abs=0.03)
+        assert code["held"]["mean"] - 0.05 < code["held_worst"]["mean"] <= code["held"]["mean"]
     for code in found[0.5]["codes"].values():
         assert code["held_informed"]["mean"] == pytest.approx(math.erf(0.5 * 1.645 / math.sqrt(2)), abs=0.04)
     # log q of a guide half as wide is larger by log 2 and loses (1 - 1/4) / 2, for each of seven dimensions
