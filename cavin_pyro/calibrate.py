@@ -22,7 +22,7 @@ def main(config: DictConfig) -> None:
         loaded, context = load_calibration(config)
         check_same_run(folder, config, ignore=("output",))
         write_config(folder, config)
-        sizes = {"windows": config.windows, "samples": config.samples}
+        sizes = {name: config[name] for name in ("windows", "samples", "repeats")}
         before = measure_guide(context, **sizes)
         losses = calibrate_guide(config, loaded)
         after = measure_guide(context, **sizes)

@@ -69,3 +69,10 @@ class CalibrateConfig:
     )
     windows: int = option(2000, "held-out windows for measurements", minimum=1, group="data", limit=10**7)
     samples: int = option(50, "of the guide for each window, in measurements", minimum=2, group="data", limit=10**5)
+    repeats: int = option(
+        1,
+        "windows generated from the first state of each held-out one, in measurements",
+        minimum=1,
+        group="data",
+        limit=10**4,
+    )

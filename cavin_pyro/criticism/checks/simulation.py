@@ -21,7 +21,7 @@ from cavin_pyro.criticism.statistics.inference.simulation import (
     simulate,
 )
 from cavin_pyro.criticism.statistics.predictions import has_subgoals
-from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.statistics.windows import from_same_starts, seeded
 from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, within, worst
 
 NAME, TITLE = "simulation", "Simulation-based calibration of the guide"
@@ -33,7 +33,7 @@ VARIANTS = {
 }
 
 EXPLANATION = """
-Codes are drawn from the prior at the first states of {windows} held-out windows of {episodes} episodes, windows are
+Codes are drawn from the prior at the first states of held-out windows of {episodes} episodes, {windows} windows are
 generated from them by the model's program, and {samples} codes are drawn from the guide for each. If the guide were the
 posterior, its 90 % intervals would hold the true code in 90 % of the windows, whatever the model: so what is missing is
 the guide's fault alone. Ranks heaped at the ends mean a guide that is too narrow; in the middle, too wide. The joint
@@ -47,15 +47,16 @@ guide has seen; "h's features without noise" shows how much of a deviation this 
 
 
 @torch.no_grad()
-def assess_simulation(context: CheckContext, *, windows: int = 1000, samples: int = 100) -> Section:
+def assess_simulation(context: CheckContext, *, windows: int = 1000, samples: int = 100, repeats: int = 1) -> Section:
     """Ranks and coverage of the guide's intervals for codes drawn from the prior.
 
     Args:
-        windows: first states of so many held-out windows. samples: of the guide, for each.
+        windows: first states of so many held-out windows. samples: of the guide, for each generated window.
+        repeats: windows that are generated from each first state.
     """
     if not context.codes:
         return without_codes(NAME, TITLE)
-    window, episodes = context.held_out(windows)
+    window, episodes = from_same_starts(*context.held_out(windows), repeats)
     found: dict[str, Calibration] = {}
     for variant in VARIANTS:
         with seeded(context.seed):

@@ -17,7 +17,7 @@ from cavin_pyro.criticism.statistics.predictions import (
     predict_subgoals,
     probability_integral_transform,
 )
-from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.statistics.windows import from_same_starts, seeded
 
 LEVEL = 0.9
 BATCH = 500  # windows
@@ -28,30 +28,32 @@ Measured = dict[str, Any]
 
 
 @torch.no_grad()
-def measure_guide(context: CheckContext, *, windows: int, samples: int) -> Measured:
+def measure_guide(context: CheckContext, *, windows: int, samples: int, repeats: int = 1) -> Measured:
     """Means with 95 % intervals over episodes, on held-out windows, with the same random numbers for every guide.
 
     Args:
         windows: at most so many, and their first states for simulation. samples: of the guide for each.
+        repeats: windows that are simulated from each first state.
 
     Returns:
-        `windows`, `episodes`; of simulated windows what 90 % intervals hold, by code: `held` over all dimensions,
-        `held_informed` over those that learn from the window (`informed` of `dimensions`), `held_worst` in the
-        dimension that holds least, and `joint`, of the region of highest density. Of real windows `minus_elbo`, in
+        `windows`, `simulated`, `episodes`; of simulated windows what 90 % intervals hold, by code: `held` over all
+        dimensions, `held_informed` over those that learn from the window (`informed` of `dimensions`), `held_worst` in
+        the dimension that holds least, and `joint`, of the region of highest density. Of real windows `minus_elbo`, in
         nats, and `subgoal_held`, of the centres that moved, in 90 % intervals of h's predictions with codes of the
         guide; None without h, or if nothing moved.
     """
     window, episodes = context.held_out(windows)
+    first, simulated_from = from_same_starts(window, episodes, repeats)
     with seeded(context.seed):
-        codes, simulated = simulate(context.model, window)
+        codes, simulated = simulate(context.model, first)
         found = calibrate(context.model, context.guide, codes, simulated, samples=samples)
     by_code = {}
     for name, ranks in found.ranks.items():
         informed = found.contraction[name] > ACTIVE_CONTRACTION
-        each = [held(column, LEVEL, episodes) for column in ranks.T]
+        each = [held(column, LEVEL, simulated_from) for column in ranks.T]
         by_code[SYMBOLS[name]] = {
-            "held": held(ranks, LEVEL, episodes)._asdict(),
-            "held_informed": held(ranks[:, informed] if informed.any() else ranks, LEVEL, episodes)._asdict(),
+            "held": held(ranks, LEVEL, simulated_from)._asdict(),
+            "held_informed": held(ranks[:, informed] if informed.any() else ranks, LEVEL, simulated_from)._asdict(),
             "held_worst": min(each, key=lambda one: one.mean)._asdict(),
             "informed": int(informed.sum()),
             "dimensions": ranks.shape[1],
@@ -69,9 +71,10 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int) -> Measu
             decoded = mean_interval(share, episodes)._asdict() if prediction.moved.any() else None
     return {
         "windows": len(episodes),
+        "simulated": len(simulated_from),
         "episodes": len(episodes.unique()),
         "codes": by_code,
-        "joint": held_jointly(found.joint, LEVEL, episodes)._asdict(),
+        "joint": held_jointly(found.joint, LEVEL, simulated_from)._asdict(),
         "minus_elbo": mean_interval(terms[TOTAL], episodes)._asdict(),
         "subgoal_held": decoded,
     }

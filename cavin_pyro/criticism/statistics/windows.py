@@ -39,6 +39,11 @@ def seeded(seed: int) -> Iterator[None]:
         yield
 
 
+def from_same_starts(window: Window, episodes: Tensor, times: int) -> tuple[Window, Tensor]:
+    """Each of the windows `[B]` and its episode so many times in a row: `[B * times]`."""
+    return window.map(lambda field: field.repeat_interleave(times, 0)), episodes.repeat_interleave(times)
+
+
 def observed(window: Window) -> Outcome:
     """The windows `[B]` themselves."""
     return Outcome(window.first, window.actions, window.states.centers[:, 1:], window.last.centers)

@@ -15,7 +15,7 @@ from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.geometry import geometry_of
 from tests.cavin_pyro.conftest import WINDOWS
 
-OPTIONS = ["steps=3", "batch_size=8", "windows=6", "samples=4"]
+OPTIONS = ["steps=3", "batch_size=8", "windows=6", "samples=4", "repeats=2"]
 
 
 def test_only_the_guide_changes_and_the_checkpoint_says_so(
@@ -45,6 +45,7 @@ def test_only_the_guide_changes_and_the_checkpoint_says_so(
     assert record["checkpoint"] == file_digest(trained)
     assert record["command"].startswith("python -m cavin_pyro")
     assert record["before"]["codes"].keys() == record["after"]["codes"].keys() == {"c", "z"}
+    assert record["after"]["simulated"] == 2 * record["after"]["windows"]
     assert record["before"]["minus_elbo"] != record["after"]["minus_elbo"]
     losses = json.loads((tmp_path / "out" / "calibration.json").read_text())["losses"]
     assert [row["step"] for row in losses] == [1, 2, 3]
@@ -74,6 +75,7 @@ def test_a_model_without_codes_is_refused_in_one_line(
         ("steps=0", "steps must be at least 1, not 0"),
         ("wake_weight=-1", "wake_weight must be at least 0"),
         ("samples=1", "samples must be at least 2, not 1"),
+        ("repeats=0", "repeats must be at least 1, not 0"),
         ("data=nowhere", "python -m cavin_pyro.collect"),
     ],
 )

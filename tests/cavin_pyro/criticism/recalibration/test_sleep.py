@@ -114,6 +114,17 @@ def test_a_loss_that_is_not_finite_ends_in_one_line(scenes: SimpleNamespace) -> 
         sleep(context.model, guide, batches(context), steps=3)
 
 
+def test_repeats_simulate_more_windows_of_the_same_episodes(scenes: SimpleNamespace) -> None:
+    context = scenes.context(scenes.guide(1.0))
+    once, often = (measure_guide(context, windows=60, samples=20, repeats=repeats) for repeats in (1, 8))
+    assert (once["simulated"], often["simulated"]) == (60, 480)
+    assert once["episodes"] == often["episodes"] and once["minus_elbo"] == often["minus_elbo"]
+    widths = [one["joint"]["high"] - one["joint"]["low"] for one in (once, often)]
+    assert widths[1] < widths[0]
+    section = assess_simulation(context, windows=60, samples=20, repeats=8)
+    assert section.values["windows"] == 480 and section.values["episodes"] == often["episodes"]
+
+
 def test_measurements_tell_narrow_guides_and_what_they_cost(scenes: SimpleNamespace) -> None:
     found = {
         stretch: measure_guide(scenes.context(scenes.guide(stretch)), windows=600, samples=40) for stretch in (0.5, 1.0)
