@@ -8,9 +8,20 @@ import pytest
 
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.storage.checkpoint import default_checkpoint, load_checkpoint
+from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.geometry import geometry_of, part_name
 
 SHIPPED = sorted(default_checkpoint().parent.glob("*.safetensors"))
+CALIBRATED = {  # SHA-256 of the file as trained, and of its weights without the guide's
+    "cavin": (
+        "d4b6913946ac23b195c8f748e349ce02e102b2ff02720bb75cf22047ae52c94a",
+        "a85e55a3b18410551a34c7a2f9600460e3ae97d6809acdaf92484089c16d918c",
+    ),
+    "contact": (
+        "76fa0302ea4d34476b19753db6d08a2f517cc6b506022cdb418a395244fd2bde",
+        "b72ed3505199da1f075ccfbf062fc9fe314deede447ae85d26e63411adbfa282",
+    ),
+}
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -33,3 +44,24 @@ def test_a_shipped_checkpoint_holds_its_provenance(path: Path) -> None:
     # Only a PointNet has been trained before.
     assert ("pointnet" in provenance) == (part_name(geometry_of(checkpoint, path)) == "pointnet")
     assert provenance["command"].startswith("python -m cavin_pyro.train ")
+
+
+@pytest.mark.parametrize("name", CALIBRATED)
+def test_calibration_has_left_the_model_as_it_was_trained(name: str) -> None:
+    checkpoint = load_checkpoint(default_checkpoint().with_stem(name))
+    trained, without_guide = CALIBRATED[name]
+    others = {key: value for key, value in checkpoint.tensors.items() if not key.startswith("guide.")}
+    assert tensors_digest(others) == without_guide
+    assert checkpoint.provenance["calibrated"][0]["checkpoint"] == trained
+
+
+@pytest.mark.parametrize("name", CALIBRATED)
+def test_a_calibrated_guide_tells_what_its_intervals_hold(name: str) -> None:
+    (record,) = load_checkpoint(default_checkpoint().with_stem(name)).provenance["calibrated"]
+    assert record["command"].startswith("python -m cavin_pyro.calibrate ")
+    assert {"revision", "date", "packages", "data", "steps", "wake_weight", "seed"} <= set(record)
+    assert record["before"]["codes"]["c"]["held_informed"]["high"] < 0.86
+    for code in ("c", "z"):
+        for dimensions in ("held", "held_informed"):
+            held = record["after"]["codes"][code][dimensions]
+            assert 0.86 <= held["low"] <= held["mean"] <= held["high"] <= 0.94, (code, dimensions)
