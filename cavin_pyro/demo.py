@@ -12,11 +12,13 @@ def main(config: DictConfig) -> None:
     """Plan and execute an episode of each task with the shipped checkpoint, from segmented depth images."""
     import copy
 
+    from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.factory import make_runner
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import write_config
     from cavin_pyro.visualization.rendering import render_episode
 
+    config.device = choose_device(config.device).type
     with output_folder(config.output):
         for task in config.tasks:
             options = copy.deepcopy(config)

@@ -13,6 +13,7 @@ def main(config: DictConfig) -> None:
     import copy
     from pathlib import Path
 
+    from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
     from cavin_pyro.evaluation.evaluation import NOT_COMPARED, evaluate, merge, seeds_of
     from cavin_pyro.evaluation.factory import make_runner, planner_name
@@ -22,6 +23,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
+    config.device = choose_device(config.device).type  # once, for all workers and for who resumes
     with output_folder(config.output) as folder:
         runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
         runner.env.close()

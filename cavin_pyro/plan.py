@@ -12,6 +12,7 @@ def main(config: DictConfig) -> None:
     """Run one closed-loop episode from segmented depth images, and write its table, pictures and video."""
     import copy
 
+    from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.factory import announce_waiting, make_runner
     from cavin_pyro.evaluation.outlook import outlook_of_episode
     from cavin_pyro.storage.files import output_folder, write_json
@@ -19,6 +20,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.run_directory import check_same_run, write_config
     from cavin_pyro.visualization.rendering import check_goal, check_viewer, episode_files, render_episode, write_goal
 
+    config.device = choose_device(config.device).type
     check_viewer(config.viewer)
     check_goal(config.save_goal)
     with output_folder(config.output) as folder:

@@ -13,6 +13,7 @@ def main(config: DictConfig) -> None:
     import numpy as np
     import torch
 
+    from cavin_pyro.config.device import choose_device
     from cavin_pyro.config.parts import check_sizes, construct
     from cavin_pyro.data.features import sample_clouds
     from cavin_pyro.storage.checkpoint import save_checkpoint
@@ -24,6 +25,8 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.visualization.training import draw_reconstructions
 
     check_sizes("autoencoder", config.autoencoder)
+    device = choose_device(config.device)
+    config.device = device.type
     torch.manual_seed(config.seed)
     with output_folder(config.output) as folder:
         autoencoder = construct(config.autoencoder)
@@ -33,7 +36,7 @@ def main(config: DictConfig) -> None:
             generator=np.random.default_rng(config.seed),
             held_out_objects=config.held_out_objects,
         )
-        check_same_run(folder, config, ignore=("data", "output"))
+        check_same_run(folder, config, ignore=("data", "output", "device"))
         stored_config = write_config(folder, config)
         losses = pretrain(
             autoencoder,
@@ -44,6 +47,7 @@ def main(config: DictConfig) -> None:
             seed=config.seed,
             log=folder / "metrics.csv",
             resume=folder / "resume.safetensors",
+            device=device,
         )
         record = {**provenance(), "clouds": len(clouds), "losses": losses}
         parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}

@@ -59,7 +59,7 @@ def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
 
 
 def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
-    """Raise ValueError unless `state` is a batch `[B]` with one generator per environment, on its device."""
+    """Raise ValueError unless `state` is a batch `[B]` with one generator per environment, on the CPU or its device."""
     centers = state.centers
     if centers.ndim != 3 or centers.shape[-1] != 3 or state.mask.shape != centers.shape[:-1]:
         raise ValueError(
@@ -80,8 +80,8 @@ def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
     if len({id(generator) for generator in generators}) != len(generators):
         raise ValueError("one generator per environment: the same generator was given twice")
     for index, generator in enumerate(generators):
-        if generator.device.type != centers.device.type:
+        if generator.device.type not in ("cpu", centers.device.type):
             raise ValueError(
                 f"generator {index} is on {generator.device.type}, the state on {centers.device.type}: "
-                f"make it with torch.Generator('{centers.device.type}')"
+                "make it with torch.Generator()"
             )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, check_distinct, iterate_shards, read_metadata
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
@@ -33,8 +34,11 @@ class WindowTable:
     Batches gather windows on demand, so overlapping windows share their memory. States and pushes may be memory maps of
     a file (`load_windows`); about 35 bytes for each window are held in memory.
 
+    Windows are chosen on the CPU, so that one seed chooses the same ones for every device (`move`).
+
     Attributes:
         training, validation: numbers of windows, for `batch`. episodes: the episode that each window is from.
+        device: of batches.
     """
 
     def __init__(
@@ -42,6 +46,7 @@ class WindowTable:
     ) -> None:
         """States, actions and transition_mask have leading dimension [P], positions in time, episode after episode."""
         self._states, self._actions, self._transition_mask = states, actions, transition_mask
+        self.device = torch.device("cpu")
         self._steps = torch.arange(segment_length + 1)
         self.starts = torch.empty(0, dtype=torch.int64)
         self.sequence_mask = torch.empty(0, dtype=torch.bool)
@@ -51,6 +56,20 @@ class WindowTable:
         # Objects up to the last real one, at each position; piece by piece, since the states may be larger than memory.
         slots = torch.arange(1, states.objects + 1, dtype=torch.uint8)
         self._objects = torch.cat([(part * slots).amax(-1) for part in states.mask.split(2**16)])
+
+    def move(self, device: torch.device, room: int) -> bool:
+        """Give batches on a device; also keep states and pushes there if they take at most `room` bytes.
+
+        Returns:
+            Whether they are kept there. If not, each batch is gathered on the CPU and copied.
+        """
+        tables = (*self._states, self._actions, self._transition_mask)
+        self.device = device
+        if sum(table.nbytes for table in tables) > room:
+            return False
+        self._states = self._states.map(lambda field: field.to(device))
+        self._actions, self._transition_mask = self._actions.to(device), self._transition_mask.to(device)
+        return True
 
     @cached_property
     def _by_object_count(self) -> dict[int, Tensor]:
@@ -71,15 +90,17 @@ class WindowTable:
         return numbers[torch.randint(len(numbers), (count,), generator=generator)]
 
     def batch(self, numbers: Tensor) -> Window:
-        """The windows with these numbers [B], without padding that none of them needs."""
+        """The windows with these numbers [B] on the CPU, without padding that none of them needs, on `device`."""
         positions = self.starts[numbers, None] + self._steps
         objects = int(self._objects[positions].max())
-        return Window(
+        positions = send(positions, self._actions.device)
+        window = Window(
             states=self._states.map(lambda field: field[:, :objects][positions]),
             actions=self._actions[positions[:, :-1]],
             transition_mask=self._transition_mask[positions[:, :-1]],
             sequence_mask=self.sequence_mask[numbers],
         )
+        return window.map(lambda field: send(field, self.device))
 
 
 def load_windows(

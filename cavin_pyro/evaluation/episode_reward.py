@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from envs.tasks import Outcome, Task, TaskReward
@@ -29,13 +30,14 @@ class EpisodeReward:
 
     Args:
         env: whose episodes are planned. reward: dense or sparse. margin: metres, as of `TaskReward`.
+        device: where plans are made.
 
     Raises:
         ValueError: as `TaskReward` does.
     """
 
-    def __init__(self, env: TaskSource, *, reward: str, margin: float) -> None:
-        self._env, self._kind = env, reward
+    def __init__(self, env: TaskSource, *, reward: str, margin: float, device: str | torch.device = "cpu") -> None:
+        self._env, self._kind, self._device = env, reward, device
         self.dense, self.margin = reward == "dense", margin
         self._rewards = {id(task): self._reward_of(task) for task in env.tasks}
 
@@ -52,7 +54,7 @@ class EpisodeReward:
         return self._rewards[id(self.task)]
 
     def _reward_of(self, task: Task) -> TaskReward:
-        return TaskReward(task, reward=self._kind, margin=self.margin)
+        return TaskReward(task, reward=self._kind, margin=self.margin, device=self._device)
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
         """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool."""

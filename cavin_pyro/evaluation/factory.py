@@ -14,6 +14,7 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.commands.episodes import CHECKPOINTS
+from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input, whole_number
 from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.parts import build_model, class_of, construct
@@ -35,18 +36,23 @@ from planning.optimizers import Shooting
 from planning.protocol import RewardFunction
 from planning.searching import SearchingPlanner
 
+CPU = torch.device("cpu")
 # Measured with 1,024 samples on one core: 0.26 to 0.28 s a plan, Shooting 0.13 s.
 SLOW_OPTIMIZERS = {"CrossEntropy", "ImprovedCrossEntropy", "PathIntegral", "Evolution", "SequentialMonteCarlo"}
 
 
 @dataclass(frozen=True)
 class EpisodeRunner:
-    """Runs closed-loop episodes with one environment and one planner; `env` belongs to this process."""
+    """Runs closed-loop episodes with one environment and one planner, which plans on `device`.
+
+    `env` belongs to this process.
+    """
 
     env: PushingEnv
     planner: Planner
     geometry: Geometry
     pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
+    device: torch.device = CPU
 
     @property
     def task(self) -> Task:
@@ -62,18 +68,28 @@ class EpisodeRunner:
         """
         parts = self.env, self.planner, self.geometry
         try:
-            return rollout(*parts, seed=seed, pushes_per_plan=self.pushes_per_plan, **options)
+            return rollout(*parts, seed=seed, pushes_per_plan=self.pushes_per_plan, device=self.device, **options)
         except (OptimizerError, NoFiniteCandidateError) as error:
             raise UserError(str(error)) from error
 
 
-def check_options(config: DictConfig) -> None:
-    """Check the options that need neither a checkpoint nor the simulator.
+def check_options(config: DictConfig, device: torch.device) -> None:
+    """Check the options that need neither a checkpoint nor the simulator; `device`: as the option `device` chose it.
 
     Raises:
-        UserError: a number or name out of its range.
+        UserError: a number or name out of its range, or options that exclude each other.
     """
     check_world(config.env)
+    if device.type != "cpu" and config.planner.get("compile"):
+        raise UserError(
+            f"planner.compile=true makes native code for the CPU, and device={config.device} plans on {device.type}: "
+            "choose planner.compile=false or device=cpu"
+        )
+    if device.type != "cpu" and config.get("launcher") == "ray":
+        raise UserError(
+            f"launcher=ray runs episodes on processors, and device={config.device} plans on {device.type}: "
+            "choose launcher=local or device=cpu"
+        )
     changing = config.layout == RANDOM or (config.layout == GENERATED and config.generated.seed is None)
     if changing and config.planner.get("compile"):
         raise UserError(
@@ -129,11 +145,12 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
 
 
 def make_planner(
-    config: DictConfig, reward: RewardFunction, *, wrap: Callable[[Model], Any] | None = None
+    config: DictConfig, reward: RewardFunction, device: torch.device, *, wrap: Callable[[Model], Any] | None = None
 ) -> tuple[Planner, Geometry]:
     """Build the planner with the checkpoint's model, and the geometric features of the checkpoint.
 
     Args:
+        device: of the model. The geometric features stay on the CPU, so that states are the same for every device.
         wrap: makes of the model what the planner gets in its place, to observe its calls.
 
     Raises:
@@ -154,7 +171,7 @@ def make_planner(
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = build_model(checkpoint.config)
     checkpoint.load_into("model", model, path)
-    model.requires_grad_(False).eval()
+    model.requires_grad_(False).eval().to(device)
     _check_planner(options, model, path)
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
@@ -169,14 +186,15 @@ def make_runner(
     Raises:
         UserError: as `check_options`, `make_environment` and `make_planner`, or a layout without room for the objects.
     """
-    check_options(config)
+    device = choose_device(config.device)
+    check_options(config, device)
     set_matmul_precision(config.matmul_precision)
     keep_freed_memory()
     env = make_environment(config, render=render)
     try:
         with user_input():
-            reward = EpisodeReward(env, reward=config.reward, margin=config.margin)
-        planner, geometry = make_planner(config, reward, wrap=wrap)
+            reward = EpisodeReward(env, reward=config.reward, margin=config.margin, device=device)
+        planner, geometry = make_planner(config, reward, device, wrap=wrap)
         if config.pushes_per_plan is not None:
             whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
@@ -187,7 +205,7 @@ def make_runner(
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan)
+    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan, device)
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def count_evaluations(config: DictConfig) -> dict[str, int]:
     try:
         observation, _ = runner.env.reset(seed=config.seed)
         generator = torch.Generator().manual_seed(planner_seed(config.seed))
-        runner.planner.plan(observed_state(observation, runner.geometry), [generator])
+        runner.planner.plan(observed_state(observation, runner.geometry, runner.device), [generator])
     finally:
         runner.env.close()
     return dict(models[0].rows) if models else dict.fromkeys(PARTS.values(), 0)

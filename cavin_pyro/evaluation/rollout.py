@@ -17,6 +17,7 @@ from envs.randomness import planner_seed
 from models.networks.geometry import Geometry
 from models.state import State
 from planning import Plan, Planner
+from planning.records import apply
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
 
@@ -100,17 +101,18 @@ class Episode:
 
 
 @torch.inference_mode()
-def observed_state(observation: ObservationDict, geometry: Geometry) -> State:
+def observed_state(observation: ObservationDict, geometry: Geometry, device: str | torch.device = "cpu") -> State:
     """The planner's state, a batch of one, from an observation, without needless padding.
 
     Args:
-        observation: as of `envs.pushing.PushingEnv`, [M, ...].
+        observation: as of `envs.pushing.PushingEnv`, [M, ...]. device: of the state; `geometry` is on the CPU.
     """
     objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1
     centers = torch.from_numpy(observation["centers"][:objects])
     clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
     mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
-    return State(centers[None], geometry(clouds)[None], mask[None])
+    state = State(centers[None], geometry(clouds)[None], mask[None])
+    return state.map(lambda field: field.to(device))
 
 
 class EpisodeCallback:
@@ -141,6 +143,7 @@ def rollout(
     pushes_per_plan: int | None = None,
     photograph: bool = False,
     callbacks: Sequence[EpisodeCallback] = (),
+    device: str | torch.device = "cpu",
 ) -> Episode:
     """Run one episode from depth images, which the environment segments.
 
@@ -149,8 +152,10 @@ def rollout(
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11).
         photograph: keep a picture with every plan.
         callbacks: called in this order; without any, no frame is computed.
+        device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
     """
     episode = Episode(seed)
+    previous: Plan | None = None
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.scene.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
     observation, _ = env.reset(seed=seed)
@@ -159,8 +164,8 @@ def rollout(
     ended = False
     while not ended:
         began = time.perf_counter()
-        state = observed_state(observation, geometry)
-        plan = planner.plan(state, [generator], episode.plan_records[-1].plan if episode.plan_records else None)
+        previous = planner.plan(observed_state(observation, geometry, device), [generator], previous)
+        plan = apply(previous, lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),
             centers=observation["centers"],

@@ -76,9 +76,9 @@ class Checkpoint:
 def save_checkpoint(
     path: Path, *, parts: Mapping[str, nn.Module], config: Mapping[str, Any], provenance: Mapping[str, Any]
 ) -> None:
-    """Write the parts' weights atomically, with configuration and provenance in the header."""
+    """Write the parts' weights, from any device, atomically, with configuration and provenance in the header."""
     tensors = {
-        f"{part}.{name}": value.detach().contiguous()
+        f"{part}.{name}": value.detach().cpu().contiguous()
         for part, module in parts.items()
         for name, value in module.state_dict().items()
     }

@@ -63,6 +63,7 @@ def stored_options(path: Path) -> dict[str, Any]:
         options["task._target_"] = f"{task.__module__}.{task.__qualname__}"
     if "reward" in options:
         options.setdefault("criterion", "strict")  # older versions knew no other
+        options.setdefault("device", "cpu")
         for name, default in asdict(GeneratedLayouts()).items():
             options.setdefault(f"generated.{name}", default)
     if "planner.horizon" in options:

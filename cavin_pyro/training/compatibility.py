@@ -11,6 +11,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import nn
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.training.randomness import forked
 from models.state import Window
 
 Site = Any  # of a trace: a dictionary of Pyro's
@@ -35,8 +36,9 @@ def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> N
                 f"{kind} {type(program).__name__} takes no state features: write "
                 "forward(self, window, generate=False, encoded=None)"
             )
-    window = window._replace(sequence_mask=torch.arange(len(window.actions)) == 0)
-    with torch.random.fork_rng(devices=[]):
+    device = window.actions.device
+    window = window._replace(sequence_mask=torch.arange(len(window.actions), device=device) == 0)
+    with forked(device):
         wanted, found = _codes(model, window), _codes(guide, window)
     name = f"guide {type(guide).__name__}"
     if wanted.keys() != found.keys():

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
 from models.networks.pointnet import PointNetAutoencoder
+
+CPU = torch.device("cpu")
 
 
 def pretrain(
@@ -30,6 +33,7 @@ def pretrain(
     seed: int,
     log: Path,
     resume: Path | None = None,
+    device: torch.device = CPU,
 ) -> dict[str, float]:
     """Minimise the Chamfer distance between clouds and their reconstructions.
 
@@ -40,6 +44,7 @@ def pretrain(
         clouds: [N, 256, 3] metres from their centres. log: where the losses go, as CSV.
         resume: a file that keeps the state at every fiftieth of the steps, from which the same call resumes; the result
             equals that of an unbroken run.
+        device: of the steps; the batches are chosen and augmented on the CPU, where the autoencoder is in the end.
 
     Returns:
         Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, the loss of one
@@ -50,7 +55,8 @@ def pretrain(
     """
     generator = np.random.default_rng(seed)
     held_out = max(1, len(clouds) // 10)
-    validation, training = torch.from_numpy(clouds[:held_out]), clouds[held_out:]
+    validation, training = torch.from_numpy(clouds[:held_out]).to(device), clouds[held_out:]
+    autoencoder.to(device)
     optimizer = torch.optim.Adam(autoencoder.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     rows: list[tuple[int, float, float]] = []
@@ -71,7 +77,7 @@ def pretrain(
                 raise ValueError("its counters contradict one another")
     with progress_bar("pretraining", total=steps, initial=begun) as bar:
         for step in range(begun + 1, steps + 1):
-            batch = _augment(training[generator.integers(len(training), size=batch_size)], generator)
+            batch = send(_augment(training[generator.integers(len(training), size=batch_size)], generator), device)
             optimizer.zero_grad(set_to_none=True)
             loss = autoencoder.loss(batch)
             if not math.isfinite(loss.item()):
@@ -91,6 +97,7 @@ def pretrain(
                     state = {"clouds": digest, "step": step, "rate": schedule.get_last_lr()[0], "rows": rows}
                     state["generator"] = generator.bit_generator.state
                     write_resume(resume, {**weights, **optimizer_tensors(optimizer)}, state)
+    autoencoder.cpu()
     with atomic_write(log) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("step", "training", "validation"), *rows])
     return {"validation": rows[-1][2], "mean_shape": _mean_shape_loss(training, validation)}
@@ -112,6 +119,6 @@ def _loss(autoencoder: PointNetAutoencoder, clouds: Tensor) -> float:
 def _mean_shape_loss(training: NDArray[np.float32], validation: Tensor) -> float:
     from models.networks.pointnet import CLOUD_UNIT, chamfer_distance
 
-    pooled = torch.from_numpy(training[:: max(1, len(training) // 64), 0][:64].copy())
+    pooled = torch.from_numpy(training[:: max(1, len(training) // 64), 0][:64].copy()).to(validation.device)
     distance = chamfer_distance(pooled.expand(len(validation), -1, -1) / CLOUD_UNIT, validation / CLOUD_UNIT)
     return float(distance.mean())

@@ -19,8 +19,8 @@ from cavin_pyro.storage.files import atomic_write
 
 
 def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
-    """Write tensors, and a state that JSON can hold, atomically."""
-    whole = {name: value.detach().contiguous() for name, value in tensors.items()}
+    """Write tensors of any device, and a state that JSON can hold, atomically; the file knows no device."""
+    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     header = {"sha256": tensors_digest(whole), "state": json.dumps(state)}
     with atomic_write(path) as temporary:
         temporary.write_bytes(save(whole, metadata=header))

@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
@@ -25,6 +26,8 @@ from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.factory import build_objective, data_folders
 from cavin_pyro.training.trainer import Trainer, fixed_windows
 from envs.workspace import MAXIMUM_OBJECTS
+
+DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
 
 
 def train(config: DictConfig) -> Trainer:
@@ -42,6 +45,8 @@ def train(config: DictConfig) -> Trainer:
 
 
 def _train(config: DictConfig, folder: Path) -> Trainer:
+    device = choose_device(config.device)
+    config.device = device.type
     torch.manual_seed(config.seed)
     model = build_model(config)
     guide = build_guide(config, model)
@@ -60,19 +65,21 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     )
     with user_input():
         objective.check(model, guide)
+    model.to(device), guide.to(device)  # made on the CPU: one seed makes the same weights for every device
+    where = _place(windows, device)
     if guide.amortized:
         check_compatibility(model, guide, windows.batch(windows.training[:2]))
-        print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation")
+        print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation{where}")
     else:
         count = len(fixed_windows(windows, config.trainer.batch_size, config.seed))
         others = ", ".join(amortized_guides(model.name))
         print(
-            f"{count} of {len(windows.training)} training windows (trainer.batch_size), for validation too: guide "
-            f"{type(guide).__name__} has parameters for each window, which batches of other windows cannot train; "
+            f"{count} of {len(windows.training)} training windows (trainer.batch_size), for validation too{where}: "
+            f"guide {type(guide).__name__} has parameters for each window, which other batches cannot train; "
             f"guides that infer any window: {others}"
         )
 
-    check_same_run(folder, config, ignore=("data", "output"))
+    check_same_run(folder, config, ignore=("data", "output", "device"))
     record = training_provenance(data, origin, windows)
     check_same_data(folder, record["data"])
     stored_config = write_config(folder, config)
@@ -90,6 +97,14 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
     return run
+
+
+def _place(windows: WindowTable, device: torch.device) -> str:
+    """Move the windows to a device; returns what there is to say about where they lie."""
+    if device.type == "cpu":
+        return ""
+    kept = windows.move(device, int(DATA_SHARE * free_memory(device)))
+    return ", all in the memory of the GPU" if kept else ", which are copied to the GPU batch by batch"
 
 
 def training_provenance(data: Sequence[Path], geometry: Mapping[str, Any], windows: WindowTable) -> dict[str, Any]:

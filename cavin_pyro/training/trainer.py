@@ -26,6 +26,7 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import ScalarLog, progress_bar
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
 from cavin_pyro.training.objectives import Objective
+from cavin_pyro.training.randomness import forked, random_state, set_random_state, stored_states, take_over
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
 from guides.guide import Guide
 from models.model import Model
@@ -34,7 +35,7 @@ Row = dict[str, float]
 
 
 class Trainer:
-    """Trains one model and guide on one table of windows.
+    """Trains one model and guide on one table of windows, all on the table's device.
 
     Args:
         objective: what is minimised. folder: where metrics and the resume file go. seed: of batches and codes.
@@ -55,7 +56,7 @@ class Trainer:
     ) -> None:
         self.model, self.guide, self.windows = model, guide, windows
         self.config = config = config or TrainerConfig()
-        self.folder, self._save = folder, save
+        self.folder, self._save, self._seed = folder, save, seed
         # A guide that infers no other windows is fitted to one batch, for good.
         self._fixed = None if guide.amortized else fixed_windows(windows, config.batch_size, seed)
         if self._fixed is not None:
@@ -103,7 +104,7 @@ class Trainer:
 
     def _check_programs(self) -> None:
         """Let Pyro validate model and guide once, instead of in every step."""
-        with torch.random.fork_rng(devices=[]):  # with gradients, which TraceEnum_ELBO demands
+        with forked(self.windows.device):  # with gradients, which TraceEnum_ELBO demands
             self._loss(self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed), self.step)
 
     def _update(self) -> float:
@@ -151,19 +152,19 @@ class Trainer:
 
     def _validation_terms(self) -> tuple[Row, float]:
         """Mean terms over the validation windows, and the loss per window, always with the same noise."""
-        numbers = self.windows.validation
+        numbers, device = self.windows.validation, self.windows.device
         chosen = numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))]
         totals: Row = {}
         parts: Sequence[Tensor] = chosen[: self.config.validation_windows].split(1024)
         loss, parts = 0.0, parts if self._fixed is None else [self._fixed]
-        with torch.random.fork_rng(devices=[]), torch.no_grad(), pyro.validation_enabled(False):
+        with forked(device), torch.no_grad(), pyro.validation_enabled(False):
             torch.manual_seed(0)
             for part in parts:
                 window = self.windows.batch(part)
-                encoded, state = self.model.encode(window), torch.get_rng_state()
+                encoded, state = self.model.encode(window), random_state(device)
                 for name, value in mean_terms(self.model, self.guide, window, encoded=encoded).items():
                     totals[name] = totals.get(name, 0.0) + value * len(part)
-                torch.set_rng_state(state)
+                set_random_state(state, device)
                 loss += sum(
                     value.item() for value in elbo_terms(self.model, self.guide, window, encoded=encoded).values()
                 )
@@ -178,7 +179,7 @@ class Trainer:
 
     def _keep(self) -> None:
         tensors: dict[str, Tensor] = {
-            "random": torch.get_rng_state(),
+            **stored_states(self.windows.device),
             "batches": self._batches.get_state(),
             "counters": torch.tensor([self.step, self.best, self.best_step, self.stale], dtype=torch.float64),
         }
@@ -203,7 +204,7 @@ class Trainer:
                 raise ValueError("its counters contradict one another")
             self.step, self.best, self.best_step, self.stale = int(step), best, int(best_step), int(stale)
             self._batches.set_state(tensors["batches"])
-            torch.set_rng_state(tensors["random"])
+            take_over(tensors, self.windows.device, self._seed + self.step)
         self.rows = [row for row in read_rows(self.folder / "metrics.csv") if row["step"] <= step]
         if not {self.step, self.best_step} <= {int(row["step"]) for row in self.rows}:
             raise UserError(

@@ -90,6 +90,11 @@ class Rearrange(Task):
             return replace(self, places=assign(observation, self._shown))
         return replace(self, places=sample_places(self.region, objects, self.clearance, generator))
 
+    def to(self, device: torch.device) -> Rearrange:
+        """As of `Task`, the places included."""
+        _ = self._padded
+        return super().to(device)
+
     def tile_groups(self) -> list[TileGroup]:
         """The region of random places; a file's places may lie anywhere."""
         return [] if self.goal else super().tile_groups()

@@ -64,7 +64,7 @@ class WayToGoal:
         if self._own_goals is not None:
             return
         outcome = _alone(reward, grid())
-        self._field = WayField(~outcome.failure, outcome.success)
+        self._field = WayField(~outcome.failure, outcome.success).to(reward.device)
 
     def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
         """Metres left: [...], from centers [..., M, 3] metres and mask [..., M] bool; object 0 is the target."""
@@ -90,19 +90,29 @@ class TaskReward:
             come closer.
         criterion: which rules make a step a violation: `strict`, those of the paper (`Task.violation`), or `published`,
             those of the published implementation for real episodes (`Task.published_violation`).
+        device: where the layout's numbers lie, best that of the tensors to evaluate.
 
     Raises:
         ValueError: unknown kind of reward, unknown criterion, or a negative margin.
     """
 
-    def __init__(self, task: Task, *, reward: str = "sparse", margin: float = 0.0, criterion: str = "strict") -> None:
+    def __init__(
+        self,
+        task: Task,
+        *,
+        reward: str = "sparse",
+        margin: float = 0.0,
+        criterion: str = "strict",
+        device: str | torch.device = "cpu",
+    ) -> None:
         if reward not in REWARD_NAMES:
             raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARD_NAMES)}")
         if criterion not in CRITERIA:
             raise ValueError(f"unknown criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
         if not margin >= 0.0:
             raise ValueError(f"margin must be at least 0 metres, not {margin}")
-        self.task, self.dense, self.margin = task, reward == "dense", margin
+        self.device = torch.device(device)
+        self.task, self.dense, self.margin = task.to(self.device), reward == "dense", margin
         self.criterion = criterion
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:

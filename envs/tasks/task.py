@@ -8,10 +8,11 @@ Source: paper, section 4.1 and appendix "Task Details".
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, fields
-from typing import ClassVar, Literal, NamedTuple, get_type_hints
+from typing import ClassVar, Literal, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 import torch
@@ -27,6 +28,9 @@ from envs.workspace import Tile
 GOAL_REWARD = 100.0
 VIOLATION_REWARD = -100.0
 TIME_REWARD = -1.0
+
+
+Self = TypeVar("Self", bound="Task")
 
 
 class Marking(NamedTuple):
@@ -172,6 +176,17 @@ class Task(ABC):
         starts = [field.name for field in fields(Task)]
         ordered = sorted(fields(cls), key=lambda field: field.name in starts)
         return {field.name: field.default is MISSING and field.default_factory is MISSING for field in ordered}
+
+    def to(self: Self, device: torch.device) -> Self:
+        """This task with its tiles and tensors on a device, for planners there: its functions then copy nothing."""
+        parts = {name: value for name, value in vars(self).items() if isinstance(value, TileSet | Tensor)}
+        moved = {name: value.to(device) for name, value in parts.items()}
+        if all(moved[name] is value for name, value in parts.items()):
+            return self
+        other = copy.copy(self)
+        for name, value in moved.items():
+            object.__setattr__(other, name, value)
+        return other
 
     def tile_groups(self) -> list[TileGroup]:
         """The layout for pictures."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -43,6 +44,15 @@ class TileSet:
     def __repr__(self) -> str:
         return f"TileSet({list(self.tiles)})"
 
+    def to(self, device: torch.device) -> TileSet:
+        """The same tiles with their numbers on a device; points elsewhere cost a copy in every call."""
+        if self.centers.device == device:
+            return self
+        moved = copy.copy(self)
+        moved.centers = self.centers.to(device)
+        moved._rows, moved._edges = self._rows.to(device), self._edges.to(device)
+        return moved
+
     def contains(self, points: Tensor) -> Tensor:
         """Whether points [..., 2] metres lie in the union, its border included: [...] bool."""
 
@@ -77,6 +87,11 @@ class _Rectangles:
     def __init__(self, corners: Sequence[Sequence[Sequence[float]]]) -> None:
         """`corners`: (x, y) of the low and of the high one, in metres, of each."""
         self._low, self._high = _tensor(corners).reshape(len(corners), 2, 2).permute(1, 2, 0)  # [2, n] each
+
+    def to(self, device: torch.device) -> _Rectangles:
+        moved = copy.copy(self)
+        moved._low, moved._high = self._low.to(device), self._high.to(device)
+        return moved
 
     def of_each(
         self,

@@ -6,6 +6,8 @@ shape of a U, the end is near the start. The length of the shortest way that bre
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -45,6 +47,12 @@ class WayField:
         self._cells = torch.from_numpy(np.stack(corners, -1).reshape(-1, 4).astype(np.float32))
         self._first = torch.tensor(_FIRST)
         self._last = torch.tensor([count - 1.001 for count in _COUNT])  # within the last cell
+
+    def to(self, device: torch.device) -> WayField:
+        """The same field with its numbers on a device; points elsewhere cost a copy in every call."""
+        moved = copy.copy(self)
+        moved._cells, moved._first, moved._last = (part.to(device) for part in (self._cells, self._first, self._last))
+        return moved
 
     def __call__(self, points: Tensor) -> Tensor:
         """Metres of way left from points [..., 2]: [...]. Off the table it is that of the nearest point on it."""

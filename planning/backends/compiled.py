@@ -75,7 +75,9 @@ class Compiled:
             _say(f"native code is made for this process only: {why} ({VARIABLE}=DIR names another folder)")
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """See `Backend`. Raises ValueError for a function that cannot be compiled, saying why."""
+        """See `Backend`. Raises ValueError for tensors elsewhere than on the CPU, and for a function that cannot be
+        compiled, saying why.
+        """
         rounded = torch.get_float32_matmul_precision() != "highest"
         tensors: list[Tensor] = []
         signature: list[Any] = [function, rounded]
@@ -108,6 +110,11 @@ class Compiled:
             return self._versions[version]
 
     def _make(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
+        if elsewhere := [tensor.device.type for tensor in tensors if tensor.device.type != "cpu"]:
+            raise ValueError(
+                f"compile=true makes native code for the CPU, and {function.name} got tensors on {elsewhere[0]}: "
+                "choose compile=false, or plan on the CPU"
+            )
         library = self._library(version, function, tensors)
         if library is None:
             _announce("is made for this process only")
@@ -118,7 +125,7 @@ class Compiled:
 
     def _library(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> Library | None:
         """From the cache, or made and put there; None where there is no cache, or it cannot take this function."""
-        if self._cache is None or any(tensor.device.type != "cpu" for tensor in tensors):
+        if self._cache is None:
             return None
         try:
             key = fingerprint([*_circumstances(), *version], [__name__])

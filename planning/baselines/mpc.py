@@ -35,7 +35,7 @@ class PushSpace(NamedTuple):
     ) -> SegmentRollout:
         """See `planning.rollouts.segment.SearchSpace`."""
         if noise is None:
-            noise = noise_each((plans.batch_shape[-1], self.dimension), generators)
+            noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
         shared, pushes, path = noise[..., : self.proposal.shared], [], []
         for own in noise[..., self.proposal.shared :].split(self.proposal.own, -1):
             push = self.proposal(plans, shared, own).unsqueeze(-2)

@@ -40,7 +40,7 @@ class RandomPlanner:
             )
             for generator in generators
         ]
-        actions = 2 * torch.stack(samples) - 1 if samples else empty(0, self.segment_length, 4)
+        actions = 2 * torch.stack(samples).to(state.centers.device) - 1 if samples else empty(0, self.segment_length, 4)
         return Plan(
             actions=actions,
             planned_actions=actions,

@@ -160,13 +160,14 @@ def perturbed_rollouts(
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
     pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
     if robustness.outcomes == "sampled":
-        uniform = uniform_each((*pushes.shape[1:3], state.objects, 2), generators)
+        uniform = uniform_each((*pushes.shape[1:3], state.objects, 2), generators, pushes.device)
         distance, failed = backend(_sampled_costs, model, reward, state, goal, pushes, uniform, feature_weight)
         return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
-    pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators)
+    pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators, pushes.device)
     errors = None
     if robustness.outcome_noise:
-        errors = robustness.outcome_noise * noise_each((*pushes.shape[1:3], state.objects, 2), generators)
+        shape = (*pushes.shape[1:3], state.objects, 2)
+        errors = robustness.outcome_noise * noise_each(shape, generators, pushes.device)
     pushes = pushes.clamp(-1.0, 1.0)
     distance, failed = backend(_rollout_costs, model, reward, state, goal, pushes, errors, feature_weight)
     return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))

@@ -29,7 +29,7 @@ def warm_start_noise(previous: Plan | None, generators: Sequence[torch.Generator
     if previous is None or previous.noise.shape[1] == 0:
         return None
     segments = previous.noise.shape[1]
-    fresh = noise_each((1, previous.noise.shape[-1]), generators)
+    fresh = noise_each((1, previous.noise.shape[-1]), generators, previous.noise.device)
     # Each candidate omits one of these K + 1 segments, the first candidate the fresh one.
     longer = torch.cat([previous.noise, fresh], 1)
     return torch.stack(

@@ -74,8 +74,9 @@ class Evolution:
     def _offspring(self, problem: SearchProblem, parents: Tensor, count: int) -> Tensor:
         """`parents: [B, p, K, D]` -> `[B, n, K, D]`, each of one uniformly sampled parent."""
         segments = problem.segments
-        whose, how_many, which, changed = uniform_each((4, count, segments), problem.generators).unbind(1)
-        fresh, last = noise_each((2, count, segments, problem.dimension), problem.generators).unbind(1)
+        sources = problem.generators, problem.device
+        whose, how_many, which, changed = uniform_each((4, count, segments), *sources).unbind(1)
+        fresh, last = noise_each((2, count, segments, problem.dimension), *sources).unbind(1)
         environments = torch.arange(len(parents), device=parents.device).unsqueeze(-1)
         child = parents[environments, (whose[..., 0] * parents.shape[1]).long()]
         # Some offspring lose no segment, others many.

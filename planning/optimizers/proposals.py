@@ -95,7 +95,7 @@ def propose(proposal: NoiseProposal | None, candidates: Candidates) -> tuple[Ten
     Ended candidates take the prior's noise, since theirs no longer matters.
     """
     problem, segment = candidates.problem, len(candidates.segments)
-    prior = noise_each((candidates.count, problem.dimension), problem.generators)
+    prior = noise_each((candidates.count, problem.dimension), problem.generators, problem.device)
     ratios = torch.zeros_like(candidates.returns, dtype=torch.float64)
     if proposal is None:
         return prior, ratios
@@ -113,7 +113,7 @@ def propose(proposal: NoiseProposal | None, candidates: Candidates) -> tuple[Ten
                 f"{list(distribution.event_shape)}"
             )
         active = candidates.score_state.active[index]
-        noise[index] = torch.where(active.unsqueeze(-1), sample(distribution, generator), prior[index])
+        noise[index] = torch.where(active.unsqueeze(-1), sample(distribution, generator, problem.device), prior[index])
         ratio = standard_normal(noise[index]) - distribution.log_prob(noise[index]).double()
         ratios[index] = torch.where(active, ratio, 0.0)
     return noise, ratios

@@ -139,13 +139,13 @@ class SequentialMonteCarlo:
         length = min(self.block, len(particles.segments))
         shape = (particles.count, length, problem.dimension)
         # The proposal leaves N(0, I) invariant, so the prior cancels and only the returns decide.
-        fresh = noise_each(shape, problem.generators)
+        fresh = noise_each(shape, problem.generators, problem.device)
         noise = math.sqrt(1.0 - self.step**2) * particles.noise[:, :, -length:] + self.step * fresh
         proposed = particles.back(length)
         for segment in noise.unbind(2):
             proposed = proposed.extend(segment)
         gain = inverse.unsqueeze(-1) * (self._scores(proposed) - self._scores(particles))  # NaN: both failed
-        chance = uniform_each((particles.count,), problem.generators)
+        chance = uniform_each((particles.count,), problem.generators, problem.device)
         accepted = chance.log() < gain
         own = torch.arange(particles.count, device=inverse.device)
         numbers = torch.where(accepted, own + particles.count, own.expand_as(accepted))
@@ -175,7 +175,7 @@ def _resample(logarithms: Tensor, generators: Sequence[torch.Generator], due: Te
     """Ancestors' numbers `[B, n]` by systematic resampling where it is `due: [B]` and a weight is not zero."""
     count = logarithms.shape[-1]
     weights = torch.softmax(logarithms, -1)
-    offsets = uniform_each((1,), generators)
+    offsets = uniform_each((1,), generators, weights.device)
     places = (torch.arange(count, device=weights.device) + offsets.double()) / count
     numbers = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)
     stay = ~(due.unsqueeze(-1) & torch.isfinite(weights).all(-1, keepdim=True))

@@ -59,9 +59,14 @@ class SearchProblem:
         """D, the dimension of the noise per segment."""
         return self.space.dimension
 
+    @property
+    def device(self) -> torch.device:
+        """Where the candidates are, and where all numbers go that are sampled with the generators."""
+        return self.state.centers.device
+
     def noise(self, count: int) -> Tensor:
         """Standard normal noise `[B, n, K, D]` of n = `count` candidates, from every environment's own generator."""
-        return noise_each((count, self.segments, self.dimension), self.generators)
+        return noise_each((count, self.segments, self.dimension), self.generators, self.device)
 
     def sample(self, count: int, *, replacement: bool) -> Candidates:
         """n = `count` whole candidates, sampled from the prior segment by segment; for `replacement` see `evaluate`."""
@@ -104,7 +109,7 @@ class SearchProblem:
         chances: Sequence[Tensor | None] = [None] * len(noise)
         if replacement and len(noise) > 1:
             # All at once, beforehand: an environment's random numbers must not depend on when others stop early.
-            chances = uniform_each((len(noise), count), self.generators).unbind(1)
+            chances = uniform_each((len(noise), count), self.generators, self.device).unbind(1)
         candidates = self.begin(count)
         for number, (segment, chance) in enumerate(zip(noise, chances, strict=True), 1):
             if early_stopped is not None and all(early_stopped.tolist()):

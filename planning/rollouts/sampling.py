@@ -1,4 +1,8 @@
-"""Samples of a model's priors, with one generator per environment."""
+"""Samples of a model's priors, with one generator per environment.
+
+Numbers are sampled on the generator's device and go to the device of the plan. With generators of the CPU, plans of one
+seed search the same noise on every device.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ def sample_each(
     """
     return torch.stack(
         [
-            sample(prior(*(_scene(condition, index) for condition in conditions)), generator)
+            sample(prior(*(_scene(condition, index) for condition in conditions)), generator, _device(conditions[0]))
             for index, generator in enumerate(generators)
         ]
     )
@@ -43,14 +47,23 @@ def sample_codes(
     return reparameterize_each(prior, conditions, noise)
 
 
-def noise_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-    """Standard normal noise, each environment's from its own generator: `[B, *shape]`."""
-    return torch.stack([torch.randn(*shape, generator=source, device=source.device) for source in generators])
+def noise_each(
+    shape: Sequence[int], generators: Sequence[torch.Generator], device: torch.device | None = None
+) -> Tensor:
+    """Standard normal noise, each environment's from its own generator: `[B, *shape]`.
+
+    device: where it goes, by default that of the generators.
+    """
+    samples = [torch.randn(*shape, generator=source, device=source.device) for source in generators]
+    return torch.stack(samples).to(device or samples[0].device)
 
 
-def uniform_each(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-    """Uniform numbers in [0, 1), each environment's from its own generator: `[B, *shape]`."""
-    return torch.stack([torch.rand(*shape, generator=source, device=source.device) for source in generators])
+def uniform_each(
+    shape: Sequence[int], generators: Sequence[torch.Generator], device: torch.device | None = None
+) -> Tensor:
+    """Uniform numbers in [0, 1), each environment's from its own generator: `[B, *shape]`; `device` as above."""
+    samples = [torch.rand(*shape, generator=source, device=source.device) for source in generators]
+    return torch.stack(samples).to(device or samples[0].device)
 
 
 def reparameterize_each(
@@ -101,13 +114,17 @@ def _is_reparameterizable(prior: Distribution) -> bool:
     return isinstance(prior, Normal)
 
 
-def sample(prior: Distribution, generator: torch.Generator) -> Tensor:
-    """One sample `[..., D]` for every element of the batch, from this generator alone."""
+def sample(prior: Distribution, generator: torch.Generator, device: torch.device) -> Tensor:
+    """One sample `[..., D]` for every element of the batch, from this generator alone; `device`: of the prior."""
     if _is_reparameterizable(prior):
         shape = prior.batch_shape + prior.event_shape
-        return reparameterize(prior, torch.randn(shape, generator=generator, device=generator.device))
-    with _global_randomness_from(generator):
+        return reparameterize(prior, torch.randn(shape, generator=generator, device=generator.device).to(device))
+    with _global_randomness_from(generator, device):
         return prior.sample()
+
+
+def _device(condition: State | Tensor) -> torch.device:
+    return (condition.centers if isinstance(condition, State) else condition).device
 
 
 def _scene(condition: State | Tensor, index: int) -> State | Tensor:
@@ -115,16 +132,24 @@ def _scene(condition: State | Tensor, index: int) -> State | Tensor:
 
 
 @contextmanager
-def _global_randomness_from(generator: torch.Generator) -> Iterator[None]:
-    """Use a generator as torch's global one: `Distribution.sample` takes no generator."""
-    device = generator.device
-    if device.type == "cuda":
-        with torch.random.fork_rng(devices=[device]):
-            torch.cuda.set_rng_state(generator.get_state(), device)
-            yield
-            generator.set_state(torch.cuda.get_rng_state(device))
-    else:
+def _global_randomness_from(generator: torch.Generator, device: torch.device) -> Iterator[None]:
+    """Use a generator as torch's global one on a device: `Distribution.sample` takes no generator.
+
+    A generator of the CPU seeds the global one of another device, whose algorithm differs: the samples are the same in
+    every run there, and others than on the CPU.
+    """
+    if device.type == "cpu":
         with torch.random.fork_rng(devices=[]):
             torch.set_rng_state(generator.get_state())
             yield
             generator.set_state(torch.get_rng_state())
+        return
+    place = torch.get_device_module(device)
+    with torch.random.fork_rng(devices=[device], device_type=device.type):
+        if generator.device.type == "cpu":
+            place.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+            yield
+        else:
+            place.set_rng_state(generator.get_state(), device)
+            yield
+            generator.set_state(place.get_rng_state(device))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from cavin_pyro.config.commands.device import DeviceOptions
 from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
 from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
@@ -65,7 +66,7 @@ class GeneratedConfig:
 
 
 @dataclass
-class EpisodeConfig:
+class EpisodeConfig(DeviceOptions):
     """Common options of commands that run episodes."""
 
     defaults: list[Any] = field(default_factory=lambda: [*DEFAULTS])
@@ -106,7 +107,7 @@ class EpisodeConfig:
     )
     matmul_precision: str = option(
         "bfloat16",
-        "precision of the factors of matrix products in plans",
+        "precision of the factors of matrix products in plans; bfloat16 is TF32 on a GPU",
         choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
         group="planning",
     )

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from cavin_pyro.config.commands.device import DeviceOptions
 from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
 from cavin_pyro.config.options import option, seed_option
 
@@ -32,7 +33,7 @@ class TrainerConfig:
     )
     matmul_precision: str = option(
         "float32",
-        "precision of the factors of matrix products",
+        "precision of the factors of matrix products; bfloat16 is TF32 on a GPU",
         choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
         group="trainer",
     )
@@ -90,7 +91,7 @@ class WindowConfig:
 
 
 @dataclass
-class TrainConfig:
+class TrainConfig(DeviceOptions):
     """Options of `python -m cavin_pyro.train`."""
 
     defaults: list[Any] = field(
@@ -131,7 +132,7 @@ class TrainConfig:
 
 
 @dataclass
-class PretrainConfig:
+class PretrainConfig(DeviceOptions):
     """Options of `python -m cavin_pyro.pretrain`."""
 
     defaults: list[Any] = field(default_factory=lambda: ["_self_", {"autoencoder": "pointnet"}, "base"])
