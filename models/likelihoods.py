@@ -59,7 +59,7 @@ class Scales:
 
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
-        each = (torch.as_tensor(scale, dtype=mean.dtype) for scale in (self.start, self.motion))
+        each = (torch.as_tensor(scale, dtype=mean.dtype, device=mean.device) for scale in (self.start, self.motion))
         return distributions.Normal(mean, torch.stack(tuple(each)).repeat_interleave(2)).to_event(2)
 
 
