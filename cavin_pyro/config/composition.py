@@ -215,7 +215,9 @@ def _unknown(key: str, known: DictConfig) -> str:
     while parent and not _names(known, parent):
         parent = parent.rpartition(".")[0]
     valid = f"valid{' under ' if parent else ''}{parent} are {', '.join(_names(known, parent))}"
-    return f"unknown override {key!r}: {f'did you mean {close[0]}? ' if close else ''}{valid}"
+    others = [name for name, schema in COMMANDS.items() if key in types(schema)]
+    elsewhere = f"it is an option of {', '.join(others)}; " if others else ""
+    return f"unknown override {key!r}: {elsewhere}{f'did you mean {close[0]}? ' if close else ''}{valid}"
 
 
 def _parsed(overrides: Sequence[str]) -> list[Override]:

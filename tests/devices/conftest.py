@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from cavin_pyro.data.collection import CollectionConfig, collect
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.training.run import train
+from cavin_pyro.training.trainer import Trainer
 
 PUSHES = CollectionConfig(seed=5, steps=6, episodes_per_shard=10, minimum_objects=1, maximum_objects=2)
 EPISODE = ["objects=2", "maximum_steps=2"]
@@ -56,6 +58,21 @@ def trained(data: Path, output: Path, *options: str) -> dict[str, Tensor]:
     train(compose("train", f"data={data}", f"output={output}", *TRAINING, *options))
     best = {f"best.{name}": value for name, value in load_file(output / "checkpoint.safetensors").items()}
     return {**load_file(output / "resume.safetensors"), **best}
+
+
+@contextmanager
+def broken_after(step: int) -> Iterator[None]:
+    """Interrupt a training in its step of this number; it has validated at step 2."""
+    usual = Trainer._update
+
+    def update(trainer: Trainer) -> float:
+        if trainer.step == step:
+            raise KeyboardInterrupt
+        return usual(trainer)
+
+    with pytest.MonkeyPatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(Trainer, "_update", update)
+        yield
 
 
 def tensors(record: Any) -> list[Tensor]:

@@ -134,11 +134,11 @@ def _run(operation: OpOverload, args: Any, kwargs: dict[str, Any]) -> Any:
     if not ours and not there:
         return operation(*args, **kwargs)
     if ours and operation not in COPIES:
-        harmless = torch.Tag.pointwise in operation.tags
-        if strange := [
-            one for one in tensors if not isinstance(one, PretendTensor) and not (harmless and one.ndim == 0)
-        ]:
-            raise DeviceError(f"{operation}: some tensors are on {NAME}, and one {list(strange[0].shape)} is on cpu")
+        others = [one for one in tensors if not isinstance(one, PretendTensor)]
+        if torch.Tag.pointwise in operation.tags:
+            others = [one for one in others if one.ndim > 0]
+        if others:
+            raise DeviceError(f"{operation}: some tensors are on {NAME}, and one {list(others[0].shape)} is on cpu")
     generator = kwargs.get("generator")
     if there and generator is not None:
         raise DeviceError(f"{operation}: the generator is on {generator.device}, the tensor on {NAME}")

@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+import itertools
+import shutil
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _get_current_dispatch_mode
 
+from cavin_pyro.data import windows
 from cavin_pyro.evaluation import factory
 from cavin_pyro.training import run
+from cavin_pyro.training.pretraining import pretrain
+from envs.layouts import load_task
+from envs.tasks import CRITERIA, TASKS, TaskReward, TileSet
+from envs.tasks.rearrange import Rearrange
+from guides.cascaded import CascadedGuide
+from models.networks import encoder
+from models.networks.pointnet import PointNetAutoencoder
+from planning.rollouts import candidates
+from planning.rollouts.sampling import noise_each
 from tests.devices import pretend
-from tests.devices.conftest import episode, tensors, trained
+from tests.devices.conftest import broken_after, episode, tensors, trained
 from tests.devices.pretend import DeviceError, PretendDevice, PretendTensor
 
 pytestmark = pytest.mark.pretend
@@ -96,7 +112,6 @@ PLANS = {
     "icem": ["task=crossing", "planner.optimizer=icem"],
     "mppi": ["task=crossing", "planner.optimizer=mppi"],
     "smc": ["task=crossing", "planner.optimizer=smc"],
-    "last_plan": ["task=crossing", "planner.optimizer=smc", "planner.optimizer.proposal=last_plan"],
     "strides": ["task=crossing", "planner.stride_limits=[0.1,0.3]", "planner.reward_at=subgoals"],
     "random": ["task=crossing", "planner=random"],
 }
@@ -139,3 +154,154 @@ def test_weights_are_those_of_the_cpu(name: str, device: torch.device, data: Pat
         found = trained(data, tmp_path / "pretend", *TRAININGS[name])
     assert found.pop("random_pretend").equal(expected["random"])  # the same numbers, of its own generator
     assert all(found[key].equal(value) for key, value in expected.items() if key != "random")
+
+
+def test_a_prior_that_is_no_function_of_noise_is_sampled_there_from_the_generator_alone(device: torch.device) -> None:
+    """SMC's proposal is a mixture: the generator of the CPU seeds the device's, which is as it was afterwards."""
+    options = ["task=crossing", "planner.optimizer=smc", "planner.optimizer.proposal=last_plan", "planner.samples=16"]
+    with PretendDevice():
+        before = pretend.module.random.clone()
+        one = episode(*options, "planner.horizon=9")
+        assert pretend.module.random.equal(before)
+        torch.manual_seed(99)
+        other = episode(*options, "planner.horizon=9")
+    assert len(one.plan_records) == 2  # the second has a last plan
+    for mine, theirs in zip(one.plan_records, other.plan_records, strict=True):
+        assert mine.plan.noise.equal(theirs.plan.noise)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_rewards_of_a_device_are_those_of_the_cpu_and_copy_nothing(name: str, device: torch.device) -> None:
+    task, (states, mask) = load_task(name), scenes()
+    if isinstance(task, Rearrange):
+        task = replace(task, places=((0.5, 0.1), (0.6, -0.2), (0.4, 0.3)))
+    for dense, margin, criterion in itertools.product((True, False), (0.0, 0.02), CRITERIA):
+        options = {"reward": "dense" if dense else "sparse", "margin": margin, "criterion": criterion}
+        expected = judged(TaskReward(task, **options), states, mask)
+        with PretendDevice() as both:
+            reward, here = TaskReward(task, **options, device=device), (states.to(device), mask.to(device))
+            _ = reward.way  # of a layout, computed once
+            both.copies.clear()
+            found = judged(reward, *here)
+            assert not both.copies
+            assert all(mine.cpu().equal(other) for mine, other in zip(found, expected, strict=True))
+
+
+def scenes() -> tuple[Tensor, Tensor]:
+    """Paths [64, T + 1, M, 3] of three objects, one of which some scenes lack, and their mask [64, M]."""
+    generator = torch.Generator().manual_seed(1)
+    places = torch.rand(64, 4, 3, 3, generator=generator) * torch.tensor([0.6, 1.2, 0.1]) + torch.tensor([0.3, -0.6, 0])
+    return places, torch.arange(3) < torch.randint(2, 4, (64, 1), generator=generator)
+
+
+def judged(reward: TaskReward, states: Tensor, mask: Tensor) -> list[Tensor]:
+    outcome = reward.along(states, mask)
+    step = reward(states[:, 0], states[:, 1], mask)
+    left = reward.way(states[:, 0], mask), reward.way.longest(mask)
+    return [outcome.reward, outcome.success, outcome.failure, step.reward, step.success, step.failure, *left]
+
+
+def test_a_training_copies_the_table_once_and_then_only_numbers_of_windows(
+    device: torch.device, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with PretendDevice() as both:
+        trained(data, tmp_path / "pretend", "trainer.validate_every=4")
+    assert "for validation, all in the memory of the GPU" in capsys.readouterr().out
+    large = [tuple(copy.shape) for copy in both.copies if copy.ndim == 3]  # states; weights have fewer dimensions
+    assert large == [(20 * 7, 5, 3), (20 * 7, 5, 64)]
+
+
+def test_data_that_do_not_fit_are_copied_batch_by_batch(
+    device: torch.device, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = trained(data, tmp_path / "cpu")
+    capsys.readouterr()
+    pretend.module.free = 1000  # bytes
+    with PretendDevice():
+        found = trained(data, tmp_path / "pretend")
+    assert "for validation, which are copied to the GPU batch by batch" in capsys.readouterr().out
+    assert all(found[key].equal(value) for key, value in expected.items() if key != "random")
+
+
+@pytest.mark.parametrize("there_first", [True, False])
+def test_a_run_resumes_on_another_device(there_first: bool, device: torch.device, data: Path, tmp_path: Path) -> None:
+    """Without codes nothing is sampled in a step, so that weights are those of an unbroken run."""
+    options = ["model=dynamics", "guide=none"]
+    expected = trained(data, tmp_path / "unbroken", *options)
+    for there in (there_first, not there_first):
+        with PretendDevice() if there else nullcontext(), broken_after(3) if there is there_first else nullcontext():
+            found = trained(data, tmp_path / "broken", *options)
+    assert all(found[key].equal(value) for key, value in expected.items() if key != "random")
+
+
+def test_a_run_resumes_exactly_on_its_device_and_from_the_seed_on_another(
+    device: torch.device, data: Path, tmp_path: Path
+) -> None:
+    with PretendDevice():
+        expected = trained(data, tmp_path / "unbroken")
+        with broken_after(3):
+            trained(data, tmp_path / "broken")
+        shutil.copytree(tmp_path / "broken", tmp_path / "elsewhere")
+        found = trained(data, tmp_path / "broken")
+    assert all(found[key].equal(value) for key, value in expected.items() if key != "random")
+    elsewhere = trained(data, tmp_path / "elsewhere")  # other random numbers of codes, the same windows
+    assert elsewhere["batches"].equal(expected["batches"])
+    assert not elsewhere["model.encoder.spatial.0.weight"].equal(expected["model.encoder.spatial.0.weight"])
+
+
+def test_pretraining_is_that_of_the_cpu(device: torch.device, tmp_path: Path) -> None:
+    clouds = np.random.default_rng(0).normal(0.0, 0.03, (40, 64, 3)).astype(np.float32)
+    sizes = {"steps": 4, "batch_size": 8, "learning_rate": 1e-3, "seed": 0}
+
+    def weights(where: torch.device) -> dict[str, Tensor]:
+        torch.manual_seed(0)
+        autoencoder = PointNetAutoencoder()
+        files = {"log": tmp_path / f"{where}.csv", "resume": tmp_path / f"{where}.safetensors"}
+        losses = pretrain(autoencoder, clouds, **sizes, **files, device=where)  # type: ignore[arg-type]
+        numbers = {name: torch.tensor(value) for name, value in losses.items()}
+        return {**autoencoder.state_dict(), **numbers, **load_file(files["resume"])}
+
+    expected = weights(torch.device("cpu"))
+    with PretendDevice():
+        found = weights(device)
+    assert all(found[name].equal(value) for name, value in expected.items())
+
+
+# What the tests above are for: each must fail if somebody forgets a device.
+
+
+def test_noise_that_stays_on_the_cpu_is_found(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(candidates, "noise_each", lambda shape, generators, device: noise_each(shape, generators))
+    with PretendDevice(), pytest.raises(DeviceError):
+        episode("task=crossing", "planner.samples=16")
+
+
+def test_a_constant_that_a_network_makes_on_the_cpu_is_found(
+    device: torch.device, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoder, "relative_positions", lambda centers: centers - torch.tensor((0.6, 0.0, 0.0)))
+    with PretendDevice(), pytest.raises(DeviceError):
+        trained(data, tmp_path)
+
+
+def test_a_guide_that_stays_on_the_cpu_is_found(
+    device: torch.device, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(CascadedGuide, "to", lambda self, device: self)
+    with PretendDevice(), pytest.raises(DeviceError):
+        trained(data, tmp_path)
+
+
+def test_a_layout_that_stays_on_the_cpu_is_found(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TileSet, "to", lambda self, device: self)
+    with pytest.raises(AssertionError, match="both.copies"):
+        test_rewards_of_a_device_are_those_of_the_cpu_and_copy_nothing("crossing", device)
+
+
+def test_a_batch_that_stays_on_the_cpu_is_found(
+    device: torch.device, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend.module.free = 1000
+    monkeypatch.setattr(windows, "send", lambda tensor, device: tensor)
+    with PretendDevice(), pytest.raises(DeviceError):
+        trained(data, tmp_path)

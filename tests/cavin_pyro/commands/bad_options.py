@@ -47,6 +47,12 @@ BAD_OPTIONS = [
     ("check", "env.camera=eye", "unknown env.camera 'eye': choose from ideal, kinect2"),
     ("plan", "env.ranges.names=[fork]", "unknown object 'fork' in env.ranges.names: choose from sugar_box"),
     ("plan", "matmul_precision=float16", "unknown matmul_precision 'float16': choose from float32, bfloat16"),
+    ("train", "device=gpu", "unknown device 'gpu': choose from auto, cpu, cuda"),
+    (
+        "check",
+        "device=cuda",
+        "unknown override 'device': it is an option of pretrain, train, plan, evaluate, demo; valid",
+    ),
     ("plan", "env.objects=toys", "unknown env.objects 'toys': choose from builtin, ycb, mixed, random"),
     ("plan", "env.objects=ycb", "give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to DIR"),
     ("collect", "env.objects=mixed env.assets=nowhere", "no objects in nowhere/ycb: meta.json cannot be read"),

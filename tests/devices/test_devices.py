@@ -1,0 +1,155 @@
+"""The option `device` without a GPU, the pretend device in a process of its own, and a GPU where there is one."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+import torch
+
+from cavin_pyro.config import device as devices
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.device import choose_device, send
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.numerics import set_matmul_precision
+from cavin_pyro.evaluation.factory import make_runner
+from planning.backends.compiled import Compiled
+from tests.cavin_pyro.shell import ENVIRONMENT, ROOT
+from tests.devices.conftest import broken_after, episode, tensors, trained
+
+GPU = torch.cuda.is_available()
+needs_gpu = pytest.mark.skipif(not GPU, reason="needs a GPU that torch can use by CUDA, and there is none")
+without_gpu = pytest.mark.skipif(GPU, reason="says what happens without a GPU, and there is one")
+
+
+def command(name: str, *options: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", f"cavin_pyro.{name}", *options]
+    return subprocess.run(line, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
+
+
+def test_everything_works_on_a_device_that_is_not_the_cpu() -> None:
+    """`test_on_pretend_device.py`, in a process of its own: the device would stay in this one."""
+    line = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", "pretend"]
+    file = "tests/devices/test_on_pretend_device.py"
+    ended = subprocess.run([*line, file], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stdout[-8000:]
+    counted = re.search(r"(\d+) passed", ended.stdout)
+    assert counted and int(counted[1]) > 40 and "skipped" not in ended.stdout
+
+
+@without_gpu
+def test_cuda_without_a_gpu_is_one_line_that_names_the_choices() -> None:
+    ended = command("plan", "device=cuda")
+    assert ended.returncode == 2 and ended.stdout == ""
+    assert re.fullmatch(
+        r"error: device=cuda, but torch .*: choose device=cpu, or device=auto, which takes a GPU where there is one\n",
+        ended.stderr,
+    )
+
+
+@without_gpu
+def test_auto_without_a_gpu_says_what_it_took_and_plans_as_the_cpu_does(tmp_path: Path) -> None:
+    options = ["task=crossing", "objects=1", "maximum_steps=1", "planner.samples=8", "video=false"]
+    automatic = command("plan", *options, "device=auto", f"output={tmp_path / 'auto'}")
+    usual = command("plan", *options, f"output={tmp_path / 'cpu'}")
+    assert automatic.returncode == usual.returncode == 0
+    assert re.fullmatch(r"device=auto takes cpu: torch .*\n", automatic.stderr) and usual.stderr == ""
+    assert "device: cpu\n" in (tmp_path / "auto" / "config.yaml").read_text()
+    assert pushes(tmp_path / "auto") == pushes(tmp_path / "cpu")
+
+
+def pushes(folder: Path) -> list[str]:
+    """The table of an episode's pushes without its planning times."""
+    lines = [line.split(",") for line in (folder / "steps.csv").read_text().splitlines()]
+    timed = [number for number, name in enumerate(lines[0]) if "ms" in name]
+    return [",".join(cell for number, cell in enumerate(line) if number not in timed) for line in lines]
+
+
+def test_auto_takes_a_gpu_where_there_is_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(devices, "_missing", lambda: None)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Some GPU")
+    assert choose_device("auto").type == choose_device("cuda").type == "cuda"
+    assert capsys.readouterr().err == "device=auto takes cuda: Some GPU\n"
+    assert choose_device("cpu").type == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["planner.compile=true"], "planner.compile=true makes native code for the CPU, and device=cuda plans on cuda"),
+        (["launcher=ray"], "launcher=ray runs episodes on processors, and device=cuda plans on cuda: choose"),
+    ],
+)
+def test_what_a_gpu_cannot_run_is_one_line(options: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "_missing", lambda: None)
+    with pytest.raises(UserError, match=message):
+        make_runner(compose("evaluate", "device=cuda", *options))
+
+
+def test_native_code_refuses_tensors_of_other_devices() -> None:
+    with pytest.raises(ValueError, match="compile=true makes native code for the CPU, and add got tensors on meta"):
+        Compiled()(torch.add, torch.ones(2, device="meta"), torch.ones(2))
+
+
+def test_copies_to_a_gpu_go_through_pinned_memory_and_do_not_wait() -> None:
+    tensor: Any = MagicMock(device=torch.device("cpu"))
+    send(tensor, torch.device("cuda"))
+    tensor.pin_memory.return_value.to.assert_called_once_with(torch.device("cuda"), non_blocking=True)
+    there: Any = MagicMock(device=torch.device("cuda"))
+    send(there, torch.device("cuda"))
+    there.pin_memory.assert_not_called()
+    here = torch.ones(2)
+    assert send(here, torch.device("cpu")) is here
+
+
+@pytest.mark.parametrize(("name", "rounded"), [("float32", False), ("bfloat16", True)])
+def test_matrix_products_of_a_gpu_are_rounded_as_the_option_says(name: str, rounded: bool) -> None:
+    set_matmul_precision(name)
+    assert torch.backends.cuda.matmul.allow_tf32 is rounded
+
+
+@needs_gpu
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_gpu_predicts_what_the_cpu_predicts(precision: str) -> None:
+    """Of the same noise; the chosen plan may differ where two are nearly as good, so the best return is compared."""
+    options = ["task=crossing", "planner.samples=256", f"matmul_precision={precision}"]
+    here, there = (episode(*options, f"device={name}").plan_records[0].plan for name in ("cpu", "cuda"))
+    assert all(tensor.device.type == "cpu" for tensor in tensors(there))
+    tolerance = 1e-3 if precision == "float32" else 2e-2  # metres, after ten segments
+    close = (here.candidate_centers - there.candidate_centers).abs().amax((-3, -2, -1)) < tolerance
+    assert close.float().mean() > 0.9  # candidates whose failure rounding decides become copies of others
+    torch.testing.assert_close(here.expected_return, there.expected_return, rtol=0, atol=2.0)
+
+
+@needs_gpu
+def test_a_gpu_plans_the_same_twice() -> None:
+    one, other = (episode("task=crossing", "device=cuda", "planner.samples=256") for _ in range(2))
+    assert [step.action.tolist() for step in one.transitions] == [step.action.tolist() for step in other.transitions]
+
+
+@needs_gpu
+@pytest.mark.parametrize("options", [[], ["trainer.batches=bucketed", "trainer.matmul_precision=bfloat16"]])
+def test_a_gpu_trains_as_the_cpu_does(options: list[str], data: Path, tmp_path: Path) -> None:
+    """A model without codes, because the random numbers of codes are the device's own."""
+    options = ["model=dynamics", "guide=none", *options]
+    here, there = (trained(data, tmp_path / name, f"device={name}", *options) for name in ("cpu", "cuda"))
+    assert here["batches"].equal(there["batches"])
+    for name, value in here.items():
+        if name.startswith("model."):
+            torch.testing.assert_close(there[name], value, rtol=0, atol=2e-3)
+
+
+@needs_gpu
+@pytest.mark.parametrize("first", ["cuda", "cpu"])
+def test_a_run_resumes_on_a_gpu_and_from_one(first: str, data: Path, tmp_path: Path) -> None:
+    with broken_after(3):
+        trained(data, tmp_path, f"device={first}")
+    found = trained(data, tmp_path, f"device={'cpu' if first == 'cuda' else 'cuda'}")
+    assert found["counters"][0] == 4 and all(value.device.type == "cpu" for value in found.values())
