@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.collection import CollectionConfig, collect
@@ -232,3 +233,16 @@ def test_the_published_rates_are_those_of_the_published_episodes(table: str, pag
     printed = run("rates", str(folder / table))
     assert printed.strip() in (folder / page).read_text(encoding="utf-8")
     assert printed.strip().replace("98.4%", "98.5%").replace("91.0%", "92.0%") not in (folder / page).read_text()
+
+
+def test_training_and_planning_are_timed_on_every_device_of_the_machine() -> None:
+    first, *lines = [line for line in run("devices", "--quick").splitlines() if line]
+    assert first.startswith("torch ")
+    titles = [
+        line
+        for line in lines
+        if line.startswith(("| steps per second, batches of | 8 |", "| ms per plan, samples | 16 |"))
+    ]
+    rows = [line for line in lines if line.startswith(("| cpu (", "| cuda ("))]
+    assert len(titles) == 2 and len(rows) == (5 if torch.cuda.is_available() else 2)
+    assert all(float(row.split("|")[2]) > 0.0 for row in rows)
