@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import torch
 
 from cavin_pyro.config.composition import compose
 from tests.cavin_pyro.conftest import Case, run_in_turn
@@ -88,6 +89,8 @@ def run_in_order(pages: Sequence[str], folder: Path) -> None:
             short.remove("planner.samples=8")
         if "planner.compile=true" in line.options:
             short.append("planner.compile=false")
+        if "device=cuda" in line.options and not torch.cuda.is_available():
+            short.append("device=auto")
         cases[f"{number}/.."] = Case(line.command, [*line.options, *short])
     assert cases
     for line, answer in zip(lines, run_in_turn(cases, folder).values(), strict=True):

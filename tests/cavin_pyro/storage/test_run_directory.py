@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
+from envs.tasks import GeneratedLayouts
 
 
 def config(**changes: object) -> DictConfig:
@@ -107,3 +109,12 @@ def test_a_damaged_record_of_the_data_is_refused(content: str, tmp_path: Path) -
     (tmp_path / "data.json").write_text(content)
     with pytest.raises(UserError, match="other data, something unreadable instead of 60 transitions"):
         check_same_data(tmp_path, [{"transitions": 60, "fingerprint": "12ab"}])
+
+
+def test_an_evaluation_belongs_to_a_device_which_is_the_cpu_where_it_does_not_say(tmp_path: Path) -> None:
+    write_config(tmp_path, config(reward="sparse"))
+    (tmp_path / "episodes.jsonl").touch()
+    now = {"reward": "sparse", "criterion": "strict", "generated": asdict(GeneratedLayouts())}
+    check_same_run(tmp_path, config(**now, device="cpu"), ignore=())
+    with pytest.raises(UserError, match="a run with device=cpu, not cuda"):
+        check_same_run(tmp_path, config(**now, device="cuda"), ignore=())
