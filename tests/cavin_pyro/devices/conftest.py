@@ -7,7 +7,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import pyro
 import pytest
 from safetensors.torch import load_file
 from torch import Tensor
@@ -25,14 +24,6 @@ TRAINING = [
     *("trainer.steps=4", "trainer.validate_every=2", "trainer.batch_size=8"),
     *("windows.minimum_move=0.0", "windows.negative_fraction=1.0"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def settings_of_commands() -> Iterator[None]:
-    pyro.clear_param_store()
-    kept = {name: pyro.settings.get(name) for name in ("validate_distributions_pyro", "validate_distributions_torch")}
-    with pyro.settings.context(module_local_params=True, **kept):
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -29,9 +29,9 @@ from models.networks import encoder
 from models.networks.pointnet import PointNetAutoencoder
 from planning.rollouts import candidates
 from planning.rollouts.sampling import noise_each, sample_each
-from tests.devices import pretend
-from tests.devices.conftest import broken_after, episode, tensors, trained
-from tests.devices.pretend import DeviceError, PretendDevice, PretendTensor
+from tests.cavin_pyro.devices import pretend
+from tests.cavin_pyro.devices.conftest import broken_after, episode, tensors, trained
+from tests.cavin_pyro.devices.pretend import DeviceError, PretendDevice, PretendTensor
 
 pytestmark = pytest.mark.pretend
 

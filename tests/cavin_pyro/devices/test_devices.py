@@ -19,8 +19,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.evaluation.factory import make_runner
 from planning.backends.compiled import Compiled
+from tests.cavin_pyro.devices.conftest import broken_after, episode, tensors, trained
 from tests.cavin_pyro.shell import ENVIRONMENT, ROOT
-from tests.devices.conftest import broken_after, episode, tensors, trained
 
 GPU = torch.cuda.is_available()
 needs_gpu = pytest.mark.skipif(not GPU, reason="needs a GPU that torch can use by CUDA, and there is none")
@@ -35,7 +35,7 @@ def command(name: str, *options: str) -> subprocess.CompletedProcess[str]:
 def test_everything_works_on_a_device_that_is_not_the_cpu() -> None:
     """`test_on_pretend_device.py`, in a process of its own: the device would stay in this one."""
     line = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", "pretend"]
-    file = "tests/devices/test_on_pretend_device.py"
+    file = "tests/cavin_pyro/devices/test_on_pretend_device.py"
     ended = subprocess.run([*line, file], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=1200)
     assert ended.returncode == 0, ended.stdout[-8000:]
     counted = re.search(r"(\d+) passed", ended.stdout)
