@@ -86,46 +86,62 @@ def series(angles: Tensor) -> Tensor:
 
 
 def standard_values(features: Tensor) -> Tensor:
-    """`features: [..., 64]` -> `[..., 63]`: three outlines and heights, less their mean, over their spread."""
-    return features[..., :-1] / (STANDARD_UNIT * features[..., -1:].clamp_min(0.02))
+    """`features: [64, ...]` -> `[63, ...]`: three outlines and heights, less their mean, over their spread."""
+    return features[:-1] / (STANDARD_UNIT * features[-1:].clamp_min(0.02))
 
 
 def standard_features(values: Tensor) -> Tensor:
     """The inverse of `standard_values`."""
-    return unit(torch.cat((STANDARD_UNIT * values, torch.ones_like(values[..., :1])), -1))
+    values = STANDARD_UNIT * values
+    scale = (values.square().sum(0, keepdim=True) + 1.0).rsqrt()
+    return torch.cat((scale * values, scale))
 
 
 def outline_values(features: Tensor) -> Tensor:
     """`features: [..., 64]` -> `[..., 63]`: series of three outlines and heights, in units of 0.05 m."""
-    return TYPICAL.to(features) + SPREAD.to(features) * standard_values(features)
-
-
-def support(outlines: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
-    """How far outlines reach in a direction: `[..., 2 K + 1]`, in units of 0.05 m -> `[...]` metres.
-
-    cosines, sines: `[..., K]` of 1 to K times the direction's angle in the axes of the series (`multiples`).
-    """
-    mean, real, imaginary = outlines.split((1, HARMONICS, HARMONICS), -1)
-    return OUTLINE_UNIT * (mean.squeeze(-1) + 2.0 * (real * cosines - imaginary * sines).sum(-1))
+    values = standard_values(features.movedim(-1, 0)).movedim(0, -1)
+    return TYPICAL.to(features) + SPREAD.to(features) * values
 
 
 def turned(outlines: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
-    """Outlines in axes that are turned by an angle.
+    """Outlines in axes that are turned by an angle, components first, so that loops run over candidates.
 
-    `outlines: [..., L * (2 K + 1)]` series; `cosines, sines: [..., K]` of 1 to K times the angle of the new x axis.
+    `outlines: [L, 2 K + 1, ...]` series; `cosines, sines: [K, ...]` of 1 to K times the angle of the new x axis.
     """
-    parts = outlines.unflatten(-1, (-1, PER_OUTLINE))
-    mean, real, imaginary = parts.split((1, HARMONICS, HARMONICS), -1)
-    cosines, sines = cosines.unsqueeze(-2), sines.unsqueeze(-2)
+    mean, real, imaginary = outlines.split((1, HARMONICS, HARMONICS), 1)
     new_real = real * cosines - imaginary * sines
-    mean = mean.expand(*new_real.shape[:-1], 1)
-    return torch.cat((mean, new_real, real * sines + imaginary * cosines), -1).flatten(-2)
+    new_imaginary = real * sines + imaginary * cosines
+    return torch.cat((mean.expand(-1, 1, *new_real.shape[2:]), new_real, new_imaginary), 1)
+
+
+def supports(outlines: Tensor, cosines: Tensor, sines: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """How far outlines reach along a direction, against it, to its left and to its right, `[...]` metres each.
+
+    `outlines: [2 K + 1, ...]` in units of 0.05 m, components first; `cosines, sines: [K, ...]` of 1 to K times the
+    direction's angle in the axes of the series. Only signs differ: order k, a quarter further on, is i^k times itself.
+    """
+    mean, real, imaginary = outlines.split((1, HARMONICS, HARMONICS))
+    along = real * cosines - imaginary * sines
+    across = real[::2] * sines[::2] + imaginary[::2] * cosines[::2]  # odd orders
+    even, odd = along[1::2], along[::2].sum(0)
+    even, alternating = even.sum(0), even[1::2].sum(0) - even[::2].sum(0)
+    side = across[1::2].sum(0) - across[::2].sum(0)
+    mean, unit = OUTLINE_UNIT * mean.squeeze(0), 2.0 * OUTLINE_UNIT
+    return (
+        mean + unit * (even + odd),
+        mean + unit * (even - odd),
+        mean + unit * (alternating + side),
+        mean + unit * (alternating - side),
+    )
 
 
 def multiples(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine `[...]` of an angle -> those of 1 to K times the angle, `[..., K]` each."""
-    cosines, sines = [cosine], [sine]
-    for _ in range(HARMONICS - 1):
-        cosines.append(cosines[-1] * cosine - sines[-1] * sine)
-        sines.append(sines[-1] * cosine + cosines[-2] * sine)
-    return torch.stack(cosines, -1), torch.stack(sines, -1)
+    """Cosine and sine `[...]` of an angle -> those of 1 to K times the angle, `[K, ...]` each."""
+    cosines, sines = cosine.unsqueeze(0), sine.unsqueeze(0)
+    while len(cosines) < HARMONICS:  # the angles so far, and these added to the largest of them
+        largest, other = cosines[-1], sines[-1]
+        cosines, sines = (
+            torch.cat((cosines, cosines * largest - sines * other)),
+            torch.cat((sines, sines * largest + cosines * other)),
+        )
+    return cosines[:HARMONICS], sines[:HARMONICS]

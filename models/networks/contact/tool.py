@@ -24,70 +24,61 @@ class ToolContact(nn.Module):
     those whose normals point against x, leaves those whose normals point along x, and stays beside the others.
     """
 
-    entered_normals: Tensor  # [2, N] of N half planes, and [2 K + 1, N] for the extents in their directions
-    entered_series: Tensor
-    entered_slowness: Tensor  # [N], distance along the push per distance to the half plane
-    left_normals: Tensor
-    left_series: Tensor
-    left_slowness: Tensor
-    beside_normals: Tensor
-    beside_series: Tensor
+    normals: Tensor  # [2, N] of N half planes: the E that are entered, as many that are left, and those beside
+    extents: Tensor  # [N, 2 K + 1], from a series to metres in their directions
+    slowness: Tensor  # [2 E], distance along the push per distance to the half plane; its negative for those left
 
     def __init__(self) -> None:
         super().__init__()
         angles = torch.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
-        weights = torch.full((PER_OUTLINE,), 2.0)
-        weights[0] = 1.0
-        terms = (series(angles) * weights).T
-        entered, beside = angles.cos() < -1e-3, angles.cos().abs() < 1e-3
-        for name, chosen in (("entered", entered), ("left", entered.roll(DIRECTIONS // 2)), ("beside", beside)):
-            normals = torch.stack((angles.cos(), angles.sin()))[:, chosen]
-            self.register_buffer(f"{name}_normals", normals.clone(), persistent=False)
-            self.register_buffer(f"{name}_series", terms[:, chosen].clone(), persistent=False)
-            if name != "beside":
-                self.register_buffer(f"{name}_slowness", -1.0 / normals[0], persistent=False)
+        facing = angles.cos()
+        order = torch.cat([chosen.nonzero()[:, 0] for chosen in (facing < -1e-3, facing > 1e-3, facing.abs() < 1e-3)])
+        self.entered = int((facing < -1e-3).sum())
+        angles = angles[order]
+        normals = torch.stack((angles.cos(), angles.sin()))
+        weights = torch.full((PER_OUTLINE,), 2.0 * OUTLINE_UNIT)
+        weights[0] = OUTLINE_UNIT
+        self.register_buffer("normals", normals, persistent=False)
+        self.register_buffer("extents", series(angles) * weights, persistent=False)
+        self.register_buffer("slowness", 1.0 / normals[0, : 2 * self.entered].abs(), persistent=False)
 
     def forward(self, along: Tensor, across: Tensor, outline: Tensor, length: Tensor) -> Tensor:
         """How a push meets each object: lengths in units of `PUSH_UNIT`, the chord in units of `DISPLACEMENT_UNIT`.
 
+        Components come first, so that loops run over candidates.
+
         Args:
-            along, across: `[..., M]` metres, the object's centre from the push's start.
-            outline: `[..., M, 2 K + 1]`, in the push's frame. length: `[..., 1]` metres, of the push.
+            along, across: `[...]` metres, the object's centre from the push's start.
+            outline: `[2 K + 1, ...]`, in the push's frame. length: metres, of the push; broadcasts to `[...]`.
 
         Returns:
-            `[..., M, MEASURES]`: the way until the tool enters; the chord that it would cut, negative if it passes
+            `[MEASURES, ...]`: the way until the tool enters; the chord that it would cut, negative if it passes
             beside; the way that is left then, and the same if it hits at all; the normal of the side that it meets
             (x, y) and its y if it hits at all; the distance from the start to the object, negative inside.
         """
-        place = torch.stack((along, across), -1)
-
-        def gap(normals: Tensor, terms: Tensor) -> Tensor:
-            """Metres from the tool's start to each half plane, positive outside."""
-            return -(place @ normals) - OUTLINE_UNIT * (outline @ terms) - TOOL_RADIUS
-
-        entered = gap(self.entered_normals, self.entered_series)
-        left = gap(self.left_normals, self.left_series)
-        times = entered * self.entered_slowness
-        enter = times.amax(-1)
-        leave = (left * self.left_slowness).amin(-1)
-        beside = gap(self.beside_normals, self.beside_series).amax(-1)
+        outline = outline.expand(-1, *along.shape)
+        extents = (self.extents @ outline.flatten(1)).unflatten(1, along.shape)
+        x, y = (each.view(-1, *along.dim() * [1]) for each in self.normals)
+        gaps = -(x * along + y * across) - extents - TOOL_RADIUS  # metres from start to half plane, positive outside
+        crossed, beside = gaps[: 2 * self.entered], gaps[2 * self.entered :].amax(0)
+        times = crossed * self.slowness.view(-1, *along.dim() * [1])
+        enter, leave = times[: self.entered].amax(0), -times[self.entered :].amax(0)
         chord = torch.where(beside > 0, -beside, leave - enter).clamp(-0.2, 0.2)
         rest = (length - enter).clamp(-0.1, 0.2)
         hit = ((chord > 0) & (rest > 0)).to(along.dtype)
-        sharp = ((times - enter.unsqueeze(-1)) / CORNER).softmax(-1)
-        normal = sharp @ self.entered_normals.T
+        sharp = ((times[: self.entered] - enter) / CORNER).softmax(0)
+        normal_x, normal_y = (self.normals[:, : self.entered] @ sharp.flatten(1)).unflatten(1, along.shape)
         return torch.stack(
             (
                 enter.clamp(-0.2, 0.3) / PUSH_UNIT,
                 chord / DISPLACEMENT_UNIT,
                 rest / PUSH_UNIT,
                 rest * hit / PUSH_UNIT,
-                normal[..., 0],
-                normal[..., 1],
-                hit * normal[..., 1],
-                torch.maximum(entered.amax(-1), left.amax(-1)) / PUSH_UNIT,
-            ),
-            -1,
+                normal_x,
+                normal_y,
+                hit * normal_y,
+                crossed.amax(0) / PUSH_UNIT,
+            )
         )
 
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.networks.outline import (
+    HARMONICS,
     OUTLINE_UNIT,
     OUTLINES,
     PER_OUTLINE,
@@ -16,6 +17,7 @@ from models.networks.outline import (
     outline_values,
     standard_features,
     standard_values,
+    supports,
     turned,
 )
 
@@ -47,11 +49,35 @@ def test_turning_an_object_turns_its_outlines(angle: float) -> None:
     cloud = 0.03 * torch.randn(2000, 3)
     cloud = cloud / cloud[:, :2].norm(dim=-1, keepdim=True).clamp_min(0.03) * 0.03  # round, without sharp corners
     cloud[:, 0] *= 2
-    here, there = (outline_values(Outline()(each))[:SERIES] for each in (cloud, cloud @ rotation(angle).T))
+    here, there = (
+        outline_values(Outline()(each))[:SERIES].unflatten(0, (OUTLINES, PER_OUTLINE))
+        for each in (cloud, cloud @ rotation(angle).T)
+    )
     # Seen in axes that are turned by minus the angle, the object appears turned by the angle.
     cosines, sines = multiples(torch.tensor(math.cos(angle)), torch.tensor(-math.sin(angle)))
     assert torch.allclose(turned(here, cosines, sines), there, atol=0.04)
     assert torch.allclose(turned(turned(here, cosines, sines), cosines, -sines), here, atol=1e-5)
+
+
+@settings(max_examples=10, deadline=None)
+@given(angle=st.floats(-3.1, 3.1))
+def test_an_outline_reaches_in_four_directions_as_far_as_its_points(angle: float) -> None:
+    torch.manual_seed(0)
+    ring = torch.linspace(0, 2 * math.pi, 400)
+    ellipse = torch.stack((0.05 * ring.cos() + 0.01, 0.03 * ring.sin(), torch.zeros(400)), -1)
+    outline = outline_values(Outline()(ellipse))[:PER_OUTLINE]
+    c, s = math.cos(angle), math.sin(angle)
+    found = supports(outline, *multiples(torch.tensor(c), torch.tensor(s)))
+    for reach, direction in zip(found, [(c, s), (-c, -s), (-s, c), (s, -c)], strict=True):
+        assert reach.item() == pytest.approx((ellipse[:, :2] @ torch.tensor(direction)).max().item(), abs=1e-3)
+
+
+def test_multiples_of_an_angle_are_those_of_trigonometry() -> None:
+    angles = 6.3 * torch.rand(5, dtype=torch.float64)
+    orders = torch.arange(1, HARMONICS + 1).unsqueeze(-1)
+    cosines, sines = multiples(angles.cos(), angles.sin())
+    assert torch.allclose(cosines, (orders * angles).cos())
+    assert torch.allclose(sines, (orders * angles).sin())
 
 
 def test_a_turned_outline_differs_from_one_that_is_not() -> None:

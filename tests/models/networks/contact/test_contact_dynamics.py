@@ -2,14 +2,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
 from models.networks.outline import Outline, standard_features
 from models.state import State
+from tests.models.networks.contact import by_hand
 
 
 def scene(*batch: int, objects: int = 3, real: int | None = None) -> State:
@@ -30,8 +33,34 @@ def loud(**sizes: int) -> ContactDynamics:
     return f
 
 
+def shipped() -> ContactDynamics:
+    """f of `checkpoint=contact`."""
+    part, f = "model.dynamics.", ContactDynamics()
+    tensors = load_checkpoint(find_checkpoint("contact")).tensors
+    f.load_state_dict({name[len(part) :]: value for name, value in tensors.items() if name.startswith(part)})
+    return f.double()
+
+
 def doubled(state: State) -> State:
     return State(state.centers.double(), state.features.double(), state.mask)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000), real=st.integers(1, 5), padding=st.integers(0, 2))
+def test_it_says_what_loops_over_objects_and_directions_say(seed: int, real: int, padding: int) -> None:
+    torch.manual_seed(seed)
+    f = shipped()
+    state = doubled(scene(4, objects=real + padding, real=real))
+    for _ in range(2):  # the second push is from where the first leads
+        actions = 2.4 * torch.rand(4, 4).double() - 1.2
+        with torch.no_grad():
+            predicted = f(state, None, actions)
+        for number, action in enumerate(actions):
+            here = [field[number, :real].numpy() for field in (state.centers, state.features)]
+            centers, features = by_hand.next_state(f, *here, action.numpy())
+            assert np.allclose(predicted.centers[number, :real], centers, atol=1e-8, rtol=0)
+            assert np.allclose(predicted.features[number, :real], features, atol=1e-7, rtol=0)
+        state = predicted
 
 
 def test_reordering_objects_reorders_the_prediction() -> None:

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.networks.contact.objects import PAIR_MEASURES, ObjectContact
+from models.networks.contact.objects import PAIR_MEASURES, pair_contact
 from models.networks.contact.tool import DISPLACEMENT_UNIT
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
 
@@ -18,17 +18,17 @@ def discs() -> torch.Tensor:
     angles = torch.linspace(0, 2 * math.pi, 257)[:-1]
     ring = torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
     clouds = torch.tensor(RADII)[:, None, None] * ring
-    return outline_values(Outline()(clouds))[..., :PER_OUTLINE]
+    return outline_values(Outline()(clouds))[..., :PER_OUTLINE].T
 
 
 def measured(offset: tuple[float, float], aim: float, way: float) -> dict[str, float]:
     """What the second disc, which lies at `offset` from the first, meets if that one is carried `way` along `aim`."""
-    place = torch.tensor([[0.0, 0.0], offset])
-    aims = torch.tensor([[math.cos(aim), math.sin(aim)], [1.0, 0.0]])
-    (found,) = ObjectContact()(place, discs(), aims, torch.tensor([way, 0.0]))
+    place = torch.tensor([[0.0, 0.0], offset]).T
+    aims = torch.tensor([[math.cos(aim), math.sin(aim)], [1.0, 0.0]]).T
+    found = pair_contact(place, discs(), aims, torch.tensor([way, 0.0]))
     names = ("x", "y", "push_x", "push_y", "meet", "gap", "push", "own_meet", "own_gap", "own_push", "own_way", "way")
-    assert found.shape == (2, PAIR_MEASURES) == (2, len(names))
-    return dict(zip(names, (found[1] * DISPLACEMENT_UNIT).tolist(), strict=True))
+    assert found.shape == (PAIR_MEASURES, 2, 2) == (len(names), 2, 2)
+    return dict(zip(names, (found[:, 1, 0] * DISPLACEMENT_UNIT).tolist(), strict=True))
 
 
 @settings(max_examples=20, deadline=None)
@@ -57,9 +57,9 @@ def test_a_way_that_ends_before_the_other_disc_pushes_nothing() -> None:
 
 def test_what_an_object_would_push_is_what_the_other_is_pushed_by() -> None:
     torch.manual_seed(0)
-    place, aim = 0.06 * torch.randn(4, 3, 2), torch.nn.functional.normalize(torch.randn(4, 3, 2), dim=-1)
-    outlines = outline_values(Outline()(0.02 * torch.randn(4, 3, 64, 3)))[..., :PER_OUTLINE]
-    first, second = ObjectContact()(place, outlines, aim, 0.08 * torch.rand(4, 3))
-    # Object i with j = i - 1 in the first is object j with i = j - 2 in the second.
-    assert torch.allclose(first[..., 4:7], second.roll(1, -2)[..., 7:10], atol=1e-5)
-    assert first[..., 6].max() > 0
+    place, aim = 0.06 * torch.randn(2, 3, 4), torch.nn.functional.normalize(torch.randn(2, 3, 4), dim=0)
+    outlines = outline_values(Outline()(0.02 * torch.randn(4, 3, 64, 3)))[..., :PER_OUTLINE].movedim((-1, -2), (0, 1))
+    found = pair_contact(place, outlines, aim, 0.08 * torch.rand(3, 4))
+    assert torch.equal(found[4:7], found[7:10].transpose(1, 2))
+    assert torch.equal(found[10], found[11].transpose(0, 1))
+    assert max(found[6, 0, 1].max(), found[6, 1, 0].max(), found[6, 2, 0].max()) > 0

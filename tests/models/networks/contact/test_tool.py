@@ -29,13 +29,13 @@ def test_where_the_tool_meets_a_disc_is_where_geometry_says() -> None:
     contact = ToolContact().double()
     values = outline_values(Outline()(disc))[:PER_OUTLINE].double()
     along = torch.tensor([gap + radius + TOOL_RADIUS], dtype=torch.float64)
-    found = contact(along, torch.zeros(1).double(), values[None], torch.tensor([0.1]).double())[0]
+    found = contact(along, torch.zeros(1).double(), values[:, None], torch.tensor([0.1]).double())[:, 0]
     enter, chord, rest, driven, normal_x, normal_y, *_ = found.tolist()
     assert enter * PUSH_UNIT == pytest.approx(gap, abs=1e-3)
     assert chord * DISPLACEMENT_UNIT == pytest.approx(2 * (radius + TOOL_RADIUS), abs=2e-3)
     assert rest == driven == pytest.approx((0.1 - gap) / PUSH_UNIT, abs=0.02)
     assert (normal_x, normal_y) == pytest.approx((-1.0, 0.0), abs=0.05)
     beside = torch.tensor([radius + TOOL_RADIUS + 0.01]).double()
-    missed = contact(along, beside, values[None], torch.tensor([0.1]).double())[0]
+    missed = contact(along, beside, values[:, None], torch.tensor([0.1]).double())[:, 0]
     assert missed[1] < 0
     assert missed[3] == 0
