@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -66,8 +66,16 @@ class ObjectMixturePrior(nn.Module):
         real = state.mask.repeat_interleave(self.components, -1).expand(score.shape[:-1])
         # The smallest finite number, not -inf: a scene without objects must not give NaN.
         score = score.squeeze(-1).masked_fill(~real, torch.finfo(score.dtype).min)
-        # Softplus is ten times slower on tensors that are not contiguous.
-        return GaussianMixture(score, mean, functional.softplus(scale.contiguous()) + SCALE_FLOOR)
+        return GaussianMixture(score, mean, scale, positive=_positive)
+
+
+def _positive(values: Tensor) -> Tensor:
+    # Softplus is ten times slower on tensors that are not contiguous.
+    return functional.softplus(values.contiguous()) + SCALE_FLOOR
+
+
+def _unchanged(values: Tensor) -> Tensor:
+    return values
 
 
 class GaussianMixture(TorchDistribution):
@@ -82,11 +90,22 @@ class GaussianMixture(TorchDistribution):
     support = constraints.real_vector
     has_rsample = False
 
-    def __init__(self, score: Tensor, mean: Tensor, scale: Tensor, validate_args: bool | None = None) -> None:
-        """`score: [..., K]` logarithms of weights up to a constant; `mean, scale: [..., K, D]`."""
+    def __init__(
+        self,
+        score: Tensor,
+        mean: Tensor,
+        scale: Tensor,
+        *,
+        positive: Callable[[Tensor], Tensor] = _unchanged,
+        validate_args: bool | None = None,
+    ) -> None:
+        """`score: [..., K]` logarithms of weights up to a constant; `mean, scale: [..., K, D]`.
+
+        `positive` makes a scale of each number of `scale`: a sample needs the chosen component's alone.
+        """
         self.log_weights = score.log_softmax(-1)
         self.mean_of_each = mean
-        self.scale_of_each = scale
+        self._scale, self._positive = scale, positive
         super().__init__(score.shape[:-1], mean.shape[-1:], validate_args=validate_args)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> GaussianMixture:
@@ -94,9 +113,15 @@ class GaussianMixture(TorchDistribution):
         return GaussianMixture(
             self.log_weights.expand(shape + self.log_weights.shape[-1:]),
             self.mean_of_each.expand(shape + self.mean_of_each.shape[-2:]),
-            self.scale_of_each.expand(shape + self.scale_of_each.shape[-2:]),
+            self._scale.expand(shape + self._scale.shape[-2:]),
+            positive=self._positive,
             validate_args=self._validate_args,
         )
+
+    @property
+    def scale_of_each(self) -> Tensor:
+        """`[..., K, D]`."""
+        return self._positive(self._scale)
 
     @property
     def mean(self) -> Tensor:
@@ -112,8 +137,9 @@ class GaussianMixture(TorchDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         if self._validate_args:
             self._validate_sample(value)
-        error = (value.unsqueeze(-2) - self.mean_of_each) / self.scale_of_each
-        normal = -0.5 * error**2 - self.scale_of_each.log() - 0.5 * math.log(2 * math.pi)
+        scale = self.scale_of_each
+        error = (value.unsqueeze(-2) - self.mean_of_each) / scale
+        normal = -0.5 * error**2 - scale.log() - 0.5 * math.log(2 * math.pi)
         return (self.log_weights + normal.sum(-1)).logsumexp(-1)
 
     def sample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
@@ -136,7 +162,7 @@ class GaussianMixture(TorchDistribution):
         share = self.log_weights.exp().expand(*component.shape[:-1], -1).gather(-1, component)
         within = ((quantile - (end - share)) / share).clamp(LEAST_QUANTILE, 1 - LEAST_QUANTILE)
         normal = torch.cat((math.sqrt(2) * (2 * within - 1).erfinv(), noise[..., 1:]), -1)
-        return self._of(self.mean_of_each, component) + self._of(self.scale_of_each, component) * normal
+        return self._of(self.mean_of_each, component) + self._positive(self._of(self._scale, component)) * normal
 
     def _of(self, values: Tensor, component: Tensor) -> Tensor:
         """The chosen component's row of `values: [..., K, D]`, for `component: [..., 1]` -> `[..., D]`."""
