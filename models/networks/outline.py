@@ -92,9 +92,8 @@ def standard_values(features: Tensor) -> Tensor:
 
 def standard_features(values: Tensor) -> Tensor:
     """The inverse of `standard_values`."""
-    values = STANDARD_UNIT * values
-    scale = (values.square().sum(0, keepdim=True) + 1.0).rsqrt()
-    return torch.cat((scale * values, scale))
+    values = torch.cat((STANDARD_UNIT * values, torch.ones_like(values[:1])))
+    return values * values.square().sum(0, keepdim=True).rsqrt()
 
 
 def outline_values(features: Tensor) -> Tensor:

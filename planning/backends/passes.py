@@ -122,6 +122,20 @@ def move_plans_innermost(graph: Graph) -> None:
                 _replace(node, joined.permute(back))
 
 
+def write_transposed_copies(graph: Graph) -> None:
+    """Write a copy that changes the order of dimensions in memory, once.
+
+    Inductor computes a copy where it is read. Every reader would then follow the strides of the original, which leaves
+    loops over three objects instead of sixteen plans at a time.
+    """
+    for node in _calls(graph, aten.contiguous.default):
+        original, *_ = _arguments(node)
+        if len(_value(original)) > 1 and _is_transposed(_value(original)):
+            with _before(node) as tensor:
+                value = tensor(original)
+                _replace(node, torch.cat([value[:1], value[1:]]))
+
+
 PASSES: Sequence[Callable[[Graph], None]] = (
     drop_checks,
     expand_small_layers,
@@ -129,6 +143,7 @@ PASSES: Sequence[Callable[[Graph], None]] = (
     round_concatenated,
     invert_shared_divisors,
     move_plans_innermost,
+    write_transposed_copies,
 )
 
 
@@ -152,6 +167,12 @@ def _before(node: Node) -> Iterator[Callable[[Node], Any]]:
     tracer = GraphAppendingTracer(node.graph)
     with node.graph.inserting_before(node):
         yield lambda other: Proxy(other, tracer)
+
+
+def _is_transposed(value: Tensor) -> bool:
+    """Whether dimensions lie in another order in memory."""
+    strides = [stride for size, stride in zip(value.shape, value.stride(), strict=True) if size > 1 and stride > 0]
+    return strides != sorted(strides, reverse=True)
 
 
 def _joined(node: Node) -> Sequence[Any]:

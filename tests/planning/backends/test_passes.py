@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.fx import Graph, GraphModule
 
+from models.networks.contact.dynamics import ContactDynamics
 from models.networks.encoder import StateEncoder
 from models.networks.layers import relative_positions, unit
 from models.networks.scene_context import SceneContext
@@ -131,6 +132,29 @@ def test_what_is_joined_otherwise_lies_as_it_did() -> None:
 
         module = changed(passes.move_plans_innermost, joined, values, -values)
         assert module(values, -values).is_contiguous()
+
+
+def test_a_copy_in_another_order_is_written_once() -> None:
+    values = torch.randn(2, 7, 3, 5)
+    moved = changed(passes.write_transposed_copies, lambda x: 2 * x.movedim(-1, 0).contiguous(), values)
+    assert calls(moved, "contiguous") == 0
+    assert torch.equal(moved(values), 2 * values.movedim(-1, 0))
+
+
+def test_a_copy_of_a_part_in_the_same_order_stays() -> None:
+    values = torch.randn(2, 7, 3, 5)
+    assert calls(changed(passes.write_transposed_copies, lambda x: 2 * x[..., :2].contiguous(), values), "contiguous")
+
+
+@pytest.mark.parametrize("objects", [1, 2, 4])
+def test_an_f_that_sees_contact_says_the_same(objects: int) -> None:
+    torch.set_float32_matmul_precision("highest")
+    f = ContactDynamics(object_width=16, pair_width=8, shape_width=8).double()
+    features = torch.cat((0.1 * torch.randn(7, objects, 63), torch.ones(7, objects, 1)), -1)
+    state = State(0.1 * torch.randn(7, objects, 3).double(), unit(features).double(), torch.rand(7, objects) < 0.7)
+    action = torch.rand(7, 4).double()
+    module = rewritten(lambda action, *fields: f(State(*fields), None, action).centers, action, *state)
+    torch.testing.assert_close(module(action, *state), f(state, None, action).centers)
 
 
 def scenes(objects: int) -> State:
