@@ -31,7 +31,7 @@ from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.storage.progress import progress_bar
 from envs.pushing import PushingEnv
 from models.state import State
-from planning import PerturbedRollouts
+from planning import MostRobust, PerturbedRollouts
 from planning import cavin as algorithm
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.segment import actions_of
@@ -61,8 +61,10 @@ class Oracle:
             self.twin.scene.push(np.clip(action, -1.0, 1.0))
         return self.twin.scene.observe().centers
 
-    def choose(self, robustness: object, motions: Candidates, scores: Tensor, later_cost: Tensor, *task: Any) -> Tensor:
-        """Line 10, in the place of `planning.extensions.perturbed_rollouts.most_robust`: `[1]` int64."""
+    def choose(
+        self, robustness: object, motions: Candidates, scores: Tensor, later_cost: Tensor, *task: Any
+    ) -> MostRobust:
+        """Line 10, in the place of `planning.extensions.perturbed_rollouts.most_robust`."""
         subgoal: State = task[2].step(0)  # [1]
         cost = motions.score_state.executed_cost[0]  # of the first segment, by f
         finite = torch.isfinite(cost) & torch.isfinite(scores[0])
@@ -71,7 +73,7 @@ class Oracle:
         objects = subgoal.objects
         reached = torch.from_numpy(np.stack([self.outcome(pushes)[:objects] for pushes in actions]))
         distance = torch.where(subgoal.mask[0], (reached - subgoal.centers[0]).square().sum(-1), 0.0).sum(-1)
-        return best[distance.argmin()].reshape(1)
+        return MostRobust(best[distance.argmin()].reshape(1), distance.new_full((1,), torch.nan))
 
 
 def play(runner: EpisodeRunner, oracle: Oracle | None, seed: int) -> Episode:

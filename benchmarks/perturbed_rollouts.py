@@ -99,7 +99,7 @@ def main() -> None:
                 )
                 for seed in range(REPETITIONS):
                     given = (options, *problem.given[1:-1], [torch.Generator().manual_seed(1000 + seed)])
-                    taken = (numbers == sequential_halving(*given, **problem.options)).nonzero().item()
+                    taken = (numbers == sequential_halving(*given, **problem.options).number).nonzero().item()
                     regret[way].append(float(costs[taken] - costs.min()))
                     failures[way].append(float(failed[taken]))
     print(f"{len(chosen)} of {len(asked)} plans")

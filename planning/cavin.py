@@ -134,10 +134,11 @@ class CavinPlanner(SearchingPlanner):
         if self.avoid_failures:
             tracking, scores = prefer_no_failure(motions.score_state)
         j = best_of(scores, "distances of motion plans to the subgoals")
+        failures = None
         if self.robustness is not None:
             later_cost = tracking.cost - tracking.executed_cost
             task = self.model, reward, subgoals, self.feature_weight
-            j = most_robust(self.robustness, motions, scores, later_cost, *task)
+            j, failures = most_robust(self.robustness, motions, scores, later_cost, *task)
         chosen = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = chosen.codes[:, 0], chosen.actions[:, 0], chosen.path[:, 0]
         a_star, path = idle_last(a_star, path, s_t, T, self.idle_distance)
@@ -150,7 +151,7 @@ class CavinPlanner(SearchingPlanner):
             motion_codes=z_star,
             subgoals=subgoals,
             predicted_centers=path,
-            **summary(effects, i),
+            **summary(effects, i, self.way, failures),
         )
 
 

@@ -22,6 +22,18 @@ class Evidence(NamedTuple):
     particles: Tensor  # [B] int64: the largest possible effective sample size
 
 
+class Prospects(NamedTuple):
+    """What the search for a plan tells about its chances, by the way; NaN where a planner does not know it.
+
+    `Plan.expected_success`, `expected_return` and `segments` tell more.
+    """
+
+    reaching: Tensor  # [B] share of all candidates that reach the goal by the model, as far as they were rolled out
+    failures: Tensor  # [B] share of the perturbed rollouts of the chosen motion that fail
+    way: Tensor  # [B] metres left to the goal from the observed state (`planner.guidance=layout`)
+    way_after: Tensor  # [B] metres left at the end of the chosen plan, by the model
+
+
 class Plan(NamedTuple):
     """The chosen plan of every environment, and the candidates (for pictures).
 
@@ -44,3 +56,4 @@ class Plan(NamedTuple):
     noise: Tensor  # [B, K, D] of the searched codes or pushes, or [B, 0, 0]; see `extensions.warm_start`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
     evidence: Evidence | None = None  # of the search by return; None for optimizers that do not sample by weights
+    prospects: Prospects | None = None  # None for planners that predict nothing

@@ -16,7 +16,7 @@ from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
-from planning.plan import Plan
+from planning.plan import Plan, Prospects
 from planning.protocol import (
     DynamicsModel,
     EpisodicReward,
@@ -136,19 +136,36 @@ class SearchingPlanner:
         return self.search(space, objective, state, generators, warm_start=warm_start, best_only=True)
 
 
-def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
-    """The fields of a `Plan` about its search, from `segments` to `evidence`.
+def summary(
+    candidates: Candidates, best: Tensor, way: WayToGoal | None, failures: Tensor | None = None
+) -> dict[str, Any]:
+    """The fields of a `Plan` about its search, from `segments` to `prospects`.
 
     candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, number of the chosen one.
+    way: that guided the search. failures: `[B]` share of the chosen motion's perturbed rollouts that fail.
     """
     progress = candidates.score_state
     environments = torch.arange(len(best), device=best.device)
+    chosen = candidates.take(best.unsqueeze(-1))
     return {
         "segments": progress.segments[environments, best],
         "expected_return": progress.earned[environments, best],
         "expected_success": progress.succeeded[environments, best],
-        "noise": chosen_noise(candidates.take(best.unsqueeze(-1))),
+        "noise": chosen_noise(chosen),
         "candidate_centers": candidates.centers,
         "candidate_returns": progress.earned,
         "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,
+        "prospects": _prospects(candidates, chosen, way, failures),
     }
+
+
+def _prospects(candidates: Candidates, chosen: Candidates, way: WayToGoal | None, failures: Tensor | None) -> Prospects:
+    """For `candidates: [B, N]` and the `chosen: [B, 1]` one."""
+    here, mask = candidates.problem.state.centers, candidates.problem.state.mask
+    unknown = here.new_full(mask.shape[:1], torch.nan)
+    return Prospects(
+        reaching=candidates.score_state.succeeded.to(here.dtype).mean(-1),
+        failures=unknown if failures is None else failures,
+        way=unknown if way is None else way(here, mask),
+        way_after=unknown if way is None else way(chosen.plans.centers[:, 0], mask),
+    )

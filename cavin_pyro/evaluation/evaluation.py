@@ -13,6 +13,7 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.chances.prospects import prospects_of
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
@@ -131,6 +132,7 @@ def episode_row(episode: Episode) -> Row:
         "plans": len(episode.plan_records),
         "hopeful_plans": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
+        "prospects": prospects_of(episode),
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ class PlanRecord:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
         milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
         clouds: [M, 256, 3] metres, as observed, if a photograph was asked for.
+        pushes_left: that the episode still allows. distance: metres left to the goal by the task's `potential`.
     """
 
     step: int
@@ -39,6 +41,8 @@ class PlanRecord:
     milliseconds: float
     photograph: NDArray[np.uint8] | None = None
     clouds: NDArray[np.float32] | None = None
+    pushes_left: int = 0
+    distance: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -174,6 +178,8 @@ def rollout(
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
             clouds=observation["clouds"] if photograph else None,
+            pushes_left=env.maximum_steps - len(episode.transitions),
+            distance=-float(env.task.potential(state.centers[0, :, :2], state.mask[0])),
         )
         episode.plan_records.append(record)
         for callback in callbacks:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.chances.prospects import PROSPECTS
 from cavin_pyro.evaluation.rollout import OUTCOMES
 
 Row = dict[str, Any]
@@ -24,6 +25,17 @@ def _number(value: Any) -> bool:
 
 def _outcome(value: Any) -> bool:
     return value in OUTCOMES
+
+
+def _prospects(value: Any) -> bool:
+    """One list per name, all of one length; or none, of a planner that predicts nothing."""
+    if value is None:
+        return True
+    if not isinstance(value, Mapping) or set(value) != set(PROSPECTS):
+        return False
+    columns = list(value.values())
+    numbers = all(isinstance(column, list) and all(one is None or _number(one) for one in column) for column in columns)
+    return numbers and len({len(column) for column in columns}) == 1
 
 
 ALWAYS: dict[str, Callable[[Any], bool]] = {
@@ -42,6 +54,7 @@ LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not writ
     "strict_return": _number,
     "plans": _count,
     "hopeful_plans": _count,
+    "prospects": _prospects,
 }
 
 

@@ -51,11 +51,13 @@ class PushSearch(SearchingPlanner):
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
         scores = torch.where(finite, candidates.returns, -torch.inf)
         best = best_of(scores, "returns of push sequences")
+        failures = None
         if self.robustness is not None:
             scores = prefer(scores, candidates.score_state.succeeded)
             pushes, cost = candidates.at(0, actions_of), -RETURN_WEIGHT * scores
             what = state, None, scores, pushes, cost, generators
-            best = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
+            robust = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
+            best, failures = robust
         chosen = candidates.take(best.unsqueeze(-1))
         actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
         actions, path = idle_last(actions, path, state, self.segment_length, self.idle_distance)
@@ -67,5 +69,5 @@ class PushSearch(SearchingPlanner):
             motion_codes=codes if self.has_codes else no_codes,
             subgoals=state.map(lambda field: field[:, None][:, :0]),
             predicted_centers=path,
-            **summary(candidates, best),
+            **summary(candidates, best, self.way, failures),
         )

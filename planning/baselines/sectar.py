@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from models.state import State
 from planning.backends.chunking import chunked
 from planning.cavin import EffectSpace
 from planning.extensions.idle_pushes import idle_last
-from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, PerturbedRollouts, sequential_halving
+from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, MostRobust, sequential_halving
 from planning.inputs import NoFiniteCandidateError
 from planning.plan import Plan
 from planning.protocol import ModelRequirements, RewardFunction, SingleLatentModel
@@ -55,10 +54,11 @@ class SectarPlanner(SearchingPlanner):
         # Lines 5 to 7: choose the codes c* and their subgoals.
         effects = self.search_by_reward(self.space, state, generators, previous)
         best = best_of(effects.returns, "returns of effect plans")
+        failures = None
         if self.robustness is not None:
-            best = torch.where(
-                effects.score_state.succeeded.any(-1), self._most_robust(self.robustness, effects, generators), best
-            )
+            hopeful, robust = effects.score_state.succeeded.any(-1), self._most_robust(effects, generators)
+            best = torch.where(hopeful, robust.number, best)
+            failures = torch.where(hopeful, robust.failures, torch.nan)
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
         # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
@@ -78,14 +78,13 @@ class SectarPlanner(SearchingPlanner):
             motion_codes=effect_codes.new_empty(len(actions), 0, 0),
             subgoals=chosen.states.map(lambda field: field[:, 0]),
             predicted_centers=centers,
-            **summary(effects, best),
+            **summary(effects, best, self.way, failures),
         )
 
-    def _most_robust(
-        self, robustness: PerturbedRollouts, effects: Candidates, generators: Sequence[torch.Generator]
-    ) -> Tensor:
-        """Number of the successful effect plan `[B]` int64 whose first segment costs least on average."""
-        state = effects.problem.state
+    def _most_robust(self, effects: Candidates, generators: Sequence[torch.Generator]) -> MostRobust:
+        """The successful effect plan whose first segment costs least on average; needs `robustness`."""
+        robustness, state = self.robustness, effects.problem.state
+        assert robustness is not None
         returns = torch.where(effects.score_state.succeeded, effects.returns, -torch.inf)
         best = returns.topk(min(robustness.candidates, effects.count), -1)
         first = effects.take(best.indices)
@@ -98,4 +97,5 @@ class SectarPlanner(SearchingPlanner):
         )
         what = state, subgoals, scores, actions, -RETURN_WEIGHT * scores, generators
         chosen = sequential_halving(robustness, self.model, self.reward, *what, backend=self.backend)
-        return best.indices.gather(1, chosen.unsqueeze(-1)).squeeze(1)
+        number = best.indices.gather(1, chosen.number.unsqueeze(-1)).squeeze(1)
+        return MostRobust(number, chosen.failures)

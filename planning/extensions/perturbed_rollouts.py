@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -71,6 +72,13 @@ class PerturbedRollouts:
         check_weight("failure_cost", self.failure_cost)
 
 
+class MostRobust(NamedTuple):
+    """The motion with the lowest cost on average."""
+
+    number: Tensor  # [B] int64, among the candidates
+    failures: Tensor  # [B] share of its rollouts that failed
+
+
 def most_robust(
     robustness: PerturbedRollouts,
     motions: Candidates,
@@ -80,8 +88,8 @@ def most_robust(
     reward: RewardFunction,
     subgoals: State,
     feature_weight: float,
-) -> Tensor:
-    """Number of the motion candidate `[B]` int64 with the lowest cost on average; see `sequential_halving`."""
+) -> MostRobust:
+    """The motion candidate with the lowest cost on average; see `sequential_halving`."""
     problem, actions, goal = motions.problem, motions.at(0, actions_of), subgoals.step(slice(0, 1))
     what = problem.state, goal, scores, actions, later_cost, problem.generators
     return sequential_halving(robustness, model, reward, *what, feature_weight=feature_weight, backend=problem.backend)
@@ -100,8 +108,8 @@ def sequential_halving(
     *,
     feature_weight: float = 0.0,
     backend: Backend = eager,
-) -> Tensor:
-    """Number of the motion with the lowest cost on average, `[B]` int64.
+) -> MostRobust:
+    """The motion with the lowest cost on average.
 
     state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
     without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, T, 4]`, the
@@ -112,12 +120,14 @@ def sequential_halving(
     numbers, count, done = best.indices, robustness.rollouts, 0
     infinite = ~torch.isfinite(best.values)
     total = torch.zeros_like(best.values)  # cost of all rollouts so far
+    failures = torch.zeros_like(best.values)  # how many of them failed
     for number in range(robustness.rounds):
         if number and total.shape[-1] == 1:
             break  # one candidate is left
         if number:
             going = (total / done).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
-            numbers, infinite, total = (field.gather(1, going) for field in (numbers, infinite, total))
+            fields = numbers, infinite, total, failures
+            numbers, infinite, total, failures = (field.gather(1, going) for field in fields)
             count = QUARTER * count
         distance, failed = perturbed_rollouts(
             robustness,
@@ -134,8 +144,10 @@ def sequential_halving(
         cost = (distance + robustness.failure_cost * failed).sum(-1)
         cost = cost + count * later.gather(1, numbers)
         total = torch.where(infinite | ~torch.isfinite(cost), torch.inf, total + cost)
+        failures = failures + failed.sum(-1)
         done += count
-    return numbers.gather(1, total.argmin(-1, keepdim=True)).squeeze(1)
+    winner = total.argmin(-1, keepdim=True)
+    return MostRobust(numbers.gather(1, winner).squeeze(1), failures.gather(1, winner).squeeze(1) / done)
 
 
 def perturbed_rollouts(
