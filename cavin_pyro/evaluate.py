@@ -19,6 +19,8 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.evaluation.factory import make_runner, planner_name
     from cavin_pyro.evaluation.outlook import outlook
     from cavin_pyro.evaluation.statistics import summarize, table
+    from cavin_pyro.evaluation.success.sentences import calibration_of, sentence
+    from cavin_pyro.evaluation.success.sentences import record as calibration_record
     from cavin_pyro.storage.files import atomic_write, output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -34,8 +36,10 @@ def main(config: DictConfig) -> None:
         results = summarize((merge if config.merge else evaluate)(config, folder))
         scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
         text = table(results, f"{scene}, {planner_name(config)}")
-        if said := outlook(results["per_episode"], config):
-            text += "\n" + said
+        calibration = calibration_of(results["per_episode"])
+        results["calibration"] = calibration_record(calibration)
+        for said in (outlook(results["per_episode"], config), sentence(calibration, runner.probability)):
+            text += f"\n{said}" if said else ""
         if others:
             comparison = compare(results["per_episode"], others)
             results["comparison"] = record(comparison, Path(config.compare))

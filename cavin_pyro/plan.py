@@ -15,6 +15,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.factory import announce_waiting, make_runner
     from cavin_pyro.evaluation.outlook import outlook_of_episode
+    from cavin_pyro.evaluation.success.sentences import sentence_of_episode
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -34,8 +35,8 @@ def main(config: DictConfig) -> None:
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
         print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
-        if said := outlook_of_episode(row, config):
-            print(said)
+        for said in (outlook_of_episode(row, config), sentence_of_episode(row, runner.probability)):
+            print(said, end="\n" * bool(said))
         for name in episode_files(video=config.video, viewer=config.viewer):
             print(f"  {folder / name}")
 

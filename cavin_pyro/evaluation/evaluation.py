@@ -13,10 +13,10 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.chances.prospects import prospects_of
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
+from cavin_pyro.evaluation.success.prospects import columns_of
 from cavin_pyro.launching.launcher import Launcher, as_launcher, of_shard
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
@@ -132,9 +132,17 @@ def episode_row(episode: Episode) -> Row:
         "plans": len(episode.plan_records),
         "hopeful_plans": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
-        "prospects": prospects_of(episode),
+        "prospects": columns_of([record.prospects for record in episode.plan_records]),
+        "success_probability": _probabilities(episode),
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }
+
+
+def _probabilities(episode: Episode) -> list[float] | None:
+    """Of success, for each plan; None if some plan has none."""
+    told = [record.success_probability for record in episode.plan_records]
+    known = [round(one, 4) for one in told if one is not None]
+    return known if known and len(known) == len(told) else None
 
 
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process

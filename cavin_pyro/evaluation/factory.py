@@ -21,6 +21,7 @@ from cavin_pyro.config.parts import build_model, class_of, construct
 from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
+from cavin_pyro.evaluation.success.probability import NO_PROBABILITY, Probability, probability_for
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from envs.layouts import GENERATED, RANDOM
@@ -53,6 +54,7 @@ class EpisodeRunner:
     geometry: Geometry
     pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
+    probability: Probability = NO_PROBABILITY  # of success, which each plan is given
 
     @property
     def task(self) -> Task:
@@ -67,8 +69,10 @@ class EpisodeRunner:
                 finite.
         """
         parts = self.env, self.planner, self.geometry
+        usual = {"pushes_per_plan": self.pushes_per_plan, "device": self.device, "probability": self.probability}
+        options = usual | options
         try:
-            return rollout(*parts, seed=seed, pushes_per_plan=self.pushes_per_plan, device=self.device, **options)
+            return rollout(*parts, seed=seed, **options)
         except (OptimizerError, NoFiniteCandidateError) as error:
             raise UserError(str(error)) from error
 
@@ -195,6 +199,7 @@ def make_runner(
         with user_input():
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin, device=device)
         planner, geometry = make_planner(config, reward, device, wrap=wrap)
+        probability = probability_for(config)
         if config.pushes_per_plan is not None:
             whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
@@ -205,7 +210,7 @@ def make_runner(
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan, device)
+    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan, device, probability)
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

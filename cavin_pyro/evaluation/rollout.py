@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavin_pyro.evaluation.success.prospects import Prospects, prospects_of
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
 from models.networks.geometry import Geometry
@@ -31,7 +31,8 @@ class PlanRecord:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
         milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
         clouds: [M, 256, 3] metres, as observed, if a photograph was asked for.
-        pushes_left: that the episode still allows. distance: metres left to the goal by the task's `potential`.
+        prospects: what the plan tells about success; None if its planner predicts nothing.
+        success_probability: of the episode; None where no fit is known.
     """
 
     step: int
@@ -41,8 +42,8 @@ class PlanRecord:
     milliseconds: float
     photograph: NDArray[np.uint8] | None = None
     clouds: NDArray[np.float32] | None = None
-    pushes_left: int = 0
-    distance: float = math.nan
+    prospects: Prospects | None = None
+    success_probability: float | None = None
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,7 @@ def rollout(
     seed: int,
     pushes_per_plan: int | None = None,
     photograph: bool = False,
+    probability: Callable[[Sequence[Prospects]], float | None] | None = None,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
 ) -> Episode:
@@ -155,6 +157,7 @@ def rollout(
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11).
         photograph: keep a picture with every plan.
+        probability: of success, from what the episode's plans have told so far; None leaves it out.
         callbacks: called in this order; without any, no frame is computed.
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
     """
@@ -178,9 +181,17 @@ def rollout(
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
             clouds=observation["clouds"] if photograph else None,
-            pushes_left=env.maximum_steps - len(episode.transitions),
-            distance=-float(env.task.potential(state.centers[0, :, :2], state.mask[0])),
+            prospects=prospects_of(
+                plan,
+                step=len(episode.transitions),
+                pushes_left=env.maximum_steps - len(episode.transitions),
+                distance=-float(env.task.potential(state.centers[0, :, :2], state.mask[0])),
+                mask=observation["mask"],
+            ),
         )
+        if probability is not None and record.prospects is not None:
+            told = [one.prospects for one in episode.plan_records if one.prospects is not None]
+            record = replace(record, success_probability=probability([*told, record.prospects]))
         episode.plan_records.append(record)
         for callback in callbacks:
             callback.on_plan(record)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.chances.prospects import PROSPECTS
 from cavin_pyro.evaluation.rollout import OUTCOMES
+from cavin_pyro.evaluation.success.prospects import PROSPECTS
 
 Row = dict[str, Any]
 
@@ -38,6 +38,10 @@ def _prospects(value: Any) -> bool:
     return numbers and len({len(column) for column in columns}) == 1
 
 
+def _probabilities(value: Any) -> bool:
+    return value is None or (isinstance(value, list) and all(_number(one) and 0.0 <= one <= 1.0 for one in value))
+
+
 ALWAYS: dict[str, Callable[[Any], bool]] = {
     "seed": _count,
     "outcome": _outcome,
@@ -55,6 +59,7 @@ LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not writ
     "plans": _count,
     "hopeful_plans": _count,
     "prospects": _prospects,
+    "success_probability": _probabilities,
 }
 
 

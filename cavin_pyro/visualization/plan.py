@@ -100,7 +100,8 @@ def draw_plan_record(
     view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)
     draw_overlay(panel, record, task, view, scale, reached)
     about = evidence_text(record.plan)
-    title = f"after {counted(record.step)}{_error(record, reached)}"
+    chance = "" if record.success_probability is None else f", success {100 * record.success_probability:.0f} %"
+    title = f"after {counted(record.step)}{chance}{_error(record, reached)}"
     panel.set_title("\n".join([title, about] if about else [title]), fontsize=10)
 
 

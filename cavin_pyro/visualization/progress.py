@@ -18,26 +18,32 @@ class EpisodeProgress(EpisodeCallback):
     def __init__(self, maximum_steps: int) -> None:
         self.maximum_steps = maximum_steps
         self._began: float | None = None
-        self._planned: float | None = None  # seconds, of a plan whose first push is not made yet
+        self._planned: PlanRecord | None = None  # a plan whose first push is not made yet
 
     def on_observation(self, observation: ObservationDict) -> None:
         """Start the clock."""
         self._began = self._began or time.perf_counter()
 
     def on_plan(self, record: PlanRecord) -> None:
-        """Keep the plan's time for the line of its first push."""
-        self._planned = record.milliseconds / 1e3
+        """Keep the plan for the line of its first push."""
+        self._planned = record
 
     def on_transition(self, transition: Transition) -> None:
         """Print the push."""
         assert self._began is not None
         left = self.maximum_steps - transition.step
         each = (time.perf_counter() - self._began) / transition.step
-        planned = "the same plan" if self._planned is None else f"planned in {self._planned:.2f} s"
+        planned = "the same plan" if self._planned is None else about_plan(self._planned)
         rest = f"at most {left} left, {duration(left * each)}" if left and not ended(transition) else "the last"
         what = f"{outcome(transition):<16} reward {transition.reward:6.2f}"
         print(f"push {transition.step:>2}: {what}   {planned}   {rest}", flush=True)
         self._planned = None
+
+
+def about_plan(record: PlanRecord) -> str:
+    """How long a plan took, and the probability of success that it gives, if one is known."""
+    chance = "" if record.success_probability is None else f", success {100 * record.success_probability:.0f} %"
+    return f"planned in {record.milliseconds / 1e3:.2f} s{chance}"
 
 
 def ended(transition: Transition) -> bool:

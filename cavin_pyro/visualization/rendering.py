@@ -100,7 +100,7 @@ def episode_files(*, video: bool, viewer: str | None = None) -> list[str]:
 
 
 def write_steps(path: Path, episode: Episode) -> None:
-    """One line per push: action, reward, what it did, and before a plan's first push the planning time.
+    """One line per push: action, reward, what it did; with a plan's first push its time and probability of success.
 
     A plan by inference (`planner.optimizer=smc`) also has its estimate of log Z, its temperature, and the fewest
     effective samples after any segment; see `planning.plan.Evidence`.
@@ -110,7 +110,7 @@ def write_steps(path: Path, episode: Episode) -> None:
         writer = csv.writer(file)
         writer.writerow(
             ["step", "x", "y", "dx", "dy", "reward", "success", "violation", "fall", "unsafe", "ineffective"]
-            + ["subgoal_distance_m", "planning_ms", *EVIDENCE_COLUMNS]
+            + ["subgoal_distance_m", "planning_ms", "success_probability", *EVIDENCE_COLUMNS]
         )
         for transition in episode.transitions:
             flags = (
@@ -127,6 +127,8 @@ def write_steps(path: Path, episode: Episode) -> None:
             )
             record = planned.get(transition.step - 1)
             took = "" if record is None else f"{record.milliseconds:.1f}"
+            probability = None if record is None else record.success_probability
+            chance = "" if probability is None else f"{probability:.3f}"
             writer.writerow(
                 [
                     transition.step,
@@ -134,7 +136,7 @@ def write_steps(path: Path, episode: Episode) -> None:
                     transition.reward,
                     *(int(flag) for flag in flags),
                 ]
-                + [distance, took, *_evidence(record)]
+                + [distance, took, chance, *_evidence(record)]
             )
 
 

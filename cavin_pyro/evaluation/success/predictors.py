@@ -1,0 +1,42 @@
+"""Predictors of success: functions of what an episode's plans have told so far."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from cavin_pyro.evaluation.success.prospects import Prospects
+
+FEW = 1e-3  # added to the share of candidates before its logarithm: about one of 1,024
+CLOSER = 0.02  # metres; less is no progress
+Predictor = Callable[[Sequence[Prospects]], float]  # of the plans up to now; NaN where the planner does not know it
+
+
+def left(plan: Prospects) -> float:
+    """Metres left to the goal: along allowed places where guidance knows them, else by the task's potential."""
+    return plan["distance"] if math.isnan(plan["way"]) else plan["way"]
+
+
+def without_progress(plans: Sequence[Prospects]) -> int:
+    """Pushes since the way left was last shortened by `CLOSER`."""
+    nearest, since = math.inf, plans[0]["step"]
+    for plan in plans:
+        if left(plan) < nearest - CLOSER:
+            nearest, since = left(plan), plan["step"]
+    return int(plans[-1]["step"] - since)
+
+
+# What each means for the last of the plans so far.
+PREDICTORS: dict[str, Predictor] = {
+    "reaches the goal": lambda plans: plans[-1]["reaches"],
+    "log share that reaches it": lambda plans: math.log10(plans[-1]["reaching"] + FEW),
+    "segments to the goal": lambda plans: plans[-1]["reaches"] * plans[-1]["segments"],
+    "failed rollouts": lambda plans: plans[-1]["failures"],
+    "metres left": lambda plans: left(plans[-1]),
+    "metres left after the plan": lambda plans: plans[-1]["way_after"],
+    "log pushes left": lambda plans: math.log10(plans[-1]["pushes_left"]),
+    "metres per push left": lambda plans: left(plans[-1]) / plans[-1]["pushes_left"],
+    "log pushes without progress": lambda plans: math.log10(1 + without_progress(plans)),
+    "objects": lambda plans: plans[-1]["objects"],
+    "metres off the subgoal": lambda plans: plans[-1]["tracking"],
+}
