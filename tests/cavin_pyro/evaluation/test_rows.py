@@ -14,8 +14,10 @@ from cavin_pyro.evaluation import evaluation, factory
 from cavin_pyro.evaluation.comparison import earlier_rows
 from cavin_pyro.evaluation.evaluation import evaluate
 from cavin_pyro.evaluation.rows import finished_episodes
+from cavin_pyro.evaluation.success.prospects import PROSPECTS as MEANING
 from planning.inputs import NoFiniteCandidateError
 
+PROSPECTS: dict[str, list[Any]] = {name: [0, 0.5] for name in MEANING} | {"pushes_left": [60, 59], "way": [None, None]}
 ROW: dict[str, Any] = {
     "seed": 10,
     "outcome": "success",
@@ -28,6 +30,8 @@ ROW: dict[str, Any] = {
     "ineffective": 1,
     "plans": 2,
     "hopeful_plans": 2,
+    "prospects": PROSPECTS,
+    "success_probability": [0.9, 1],
     "subgoal_distance": None,
     "planning_ms": [1.5, 2],
 }
@@ -40,7 +44,8 @@ def written(folder: Path, *rows: Any) -> Path:
 
 
 def test_rows_of_this_and_of_older_versions_are_read(tmp_path: Path) -> None:
-    older = {name: value for name, value in ROW.items() if "strict" not in name and "plans" not in name}
+    later = ("strict", "plans", "prospects", "probability")
+    older = {name: value for name, value in ROW.items() if not any(part in name for part in later)}
     path = written(tmp_path, ROW, {**older, "seed": 11}, ROW)
     with open(path, "a") as file:
         file.write('{"seed": 12, "outc')  # cut off by a kill
@@ -59,6 +64,12 @@ def test_rows_of_this_and_of_older_versions_are_read(tmp_path: Path) -> None:
         ({**ROW, "seed": 11, "return": float("nan")}, "return cannot be NaN"),
         ({**ROW, "seed": 11, "steps": -1}, "steps cannot be -1"),
         ({**ROW, "seed": 11, "planning_ms": 5}, "planning_ms cannot be 5"),
+        ({**ROW, "seed": 11, "success_probability": [1.5]}, "success_probability cannot be [1.5]"),
+        ({**ROW, "seed": 11, "prospects": {"step": [0]}}, 'prospects cannot be {"step": [0]}'),
+        (
+            {**ROW, "seed": 11, "prospects": {**PROSPECTS, "step": [1]}},
+            'prospects cannot be {"step": [1], "pushes_left": [60, 59], ',
+        ),
         ({**ROW, "steps": 5}, "an earlier line has another episode with seed 10"),
     ],
 )

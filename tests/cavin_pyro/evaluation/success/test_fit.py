@@ -1,0 +1,87 @@
+"""The fit finds the probabilities that made its episodes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.success.calibration import calibration
+from cavin_pyro.evaluation.success.fit import by_planner, fit, logistic, read_evaluation
+from cavin_pyro.evaluation.success.prospects import plans_of
+from tests.cavin_pyro.evaluation.success.made_up import IF_REACHES, INTERCEPT, PER_METRE, evaluation, rows
+
+
+def test_a_logistic_regression_finds_the_slopes_and_a_penalty_shortens_them() -> None:
+    generator = np.random.default_rng(0)
+    x = generator.normal(size=(20_000, 3)) * (1.0, 10.0, 0.1)
+    y = (generator.random(20_000) < expit(0.5 + x @ (1.0, -0.1, 0.0))).astype(float)
+    intercept, slopes = logistic(x, y, np.ones(20_000), 1e-6)
+    assert intercept == pytest.approx(0.5, abs=0.06) and slopes == pytest.approx([1.0, -0.1, 0.0], abs=0.2)
+    assert (np.abs(logistic(x, y, np.ones(20_000), 1e4)[1][:2]) < 0.6 * np.abs(slopes[:2])).all()
+
+
+def test_the_mean_prediction_is_the_rate_of_the_weighted_episodes() -> None:
+    generator = np.random.default_rng(1)
+    x, weights = generator.normal(size=(50, 2)), generator.uniform(0.1, 1.0, size=50)
+    y = (generator.random(50) < 0.8).astype(float)
+    intercept, slopes = logistic(x, y, weights, 3.0)
+    assert weights @ expit(intercept + x @ slopes) == pytest.approx(weights @ y, rel=1e-4)
+
+
+def test_a_constant_predictor_and_separable_outcomes_get_finite_slopes() -> None:
+    x = np.stack([np.linspace(-1.0, 1.0, 20), np.full(20, 3.0)], -1)
+    _, slopes = logistic(x, (x[:, 0] > 0).astype(float), np.ones(20), 1.0)
+    assert slopes[0] > 1.0 and slopes[1] == 0.0
+
+
+def test_a_fit_to_episodes_gives_new_ones_their_probabilities(tmp_path: Path) -> None:
+    found = fit([read_evaluation(evaluation(tmp_path / "episodes", 3000))], "mine")
+    told = [found(plans_of(row["prospects"])) for row in rows(50, seed=1)]
+    truth = [
+        expit(INTERCEPT + PER_METRE * row["prospects"]["distance"][0] + IF_REACHES * row["prospects"]["reaches"][0])
+        for row in rows(50, seed=1)
+    ]
+    assert told == pytest.approx(truth, abs=0.06)
+    fresh = rows(1500, seed=2)
+    predicted = [[found(plans_of(row["prospects"])) or 0.0] for row in fresh]
+    assert calibration(predicted, [row["outcome"] == "success" for row in fresh]).debiased.value < 0.03
+
+
+def test_a_prediction_goes_no_farther_than_those_of_the_fit(tmp_path: Path) -> None:
+    found = fit([read_evaluation(evaluation(tmp_path / "episodes", 200))], "mine")
+    (plan,) = plans_of({name: values[:1] for name, values in rows(1)[0]["prospects"].items()})
+    far = found([{**plan, "distance": 50.0}])
+    assert far == pytest.approx(expit(found.lowest))
+
+
+def test_each_planner_is_fitted_on_its_own_and_its_scenes_become_ranges(tmp_path: Path) -> None:
+    folders = [
+        evaluation(tmp_path / "a", 40),
+        evaluation(tmp_path / "b", 40, "objects=5"),
+        evaluation(tmp_path / "c", 40, "task=clearing"),
+        evaluation(tmp_path / "d", 40, "planner.horizon=60"),
+    ]
+    first, second = by_planner([read_evaluation(folder) for folder in folders])
+    assert [len(first), len(second)] == [3, 1]
+    found = fit(first, "mine")
+    assert found.episodes == 120 and second[0].situation.planner["planner.horizon"] == 60
+    assert [scenes.ranges["objects"] for scenes in found.scenes] == [(3, 5), (3, 3)]
+
+
+def test_episodes_that_tell_nothing_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no evaluation"):
+        read_evaluation(tmp_path)
+    folder = evaluation(tmp_path / "a", 5)
+    older = [{name: value for name, value in row.items() if name != "prospects"} for row in rows(5)]
+    (folder / "episodes.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in older))
+    with pytest.raises(UserError, match="holds no prospects"):
+        read_evaluation(folder)
+    alike = [{**row, "outcome": "success"} for row in rows(5)]
+    (folder / "episodes.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in alike))
+    with pytest.raises(UserError, match="all 5 episodes of mine ended alike"):
+        fit([read_evaluation(folder)], "mine")
