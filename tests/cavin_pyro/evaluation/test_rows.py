@@ -18,6 +18,7 @@ from cavin_pyro.evaluation.success.prospects import PROSPECTS as MEANING
 from planning.inputs import NoFiniteCandidateError
 
 PROSPECTS: dict[str, list[Any]] = {name: [0, 0.5] for name in MEANING} | {"pushes_left": [60, 59], "way": [None, None]}
+SHORT = json.dumps(PROSPECTS)[:40]
 ROW: dict[str, Any] = {
     "seed": 10,
     "outcome": "success",
@@ -66,10 +67,7 @@ def test_rows_of_this_and_of_older_versions_are_read(tmp_path: Path) -> None:
         ({**ROW, "seed": 11, "planning_ms": 5}, "planning_ms cannot be 5"),
         ({**ROW, "seed": 11, "success_probability": [1.5]}, "success_probability cannot be [1.5]"),
         ({**ROW, "seed": 11, "prospects": {"step": [0]}}, 'prospects cannot be {"step": [0]}'),
-        (
-            {**ROW, "seed": 11, "prospects": {**PROSPECTS, "step": [1]}},
-            'prospects cannot be {"step": [1], "pushes_left": [60, 59], ',
-        ),
+        ({**ROW, "prospects": {**PROSPECTS, "way": 1}, "seed": 11}, f"prospects cannot be {SHORT}"),
         ({**ROW, "steps": 5}, "an earlier line has another episode with seed 10"),
     ],
 )
