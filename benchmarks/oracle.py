@@ -31,8 +31,9 @@ from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.storage.progress import progress_bar
 from envs.pushing import PushingEnv
 from models.state import State
-from planning import MostRobust, PerturbedRollouts
+from planning import PerturbedRollouts
 from planning import cavin as algorithm
+from planning.extensions.perturbed_rollouts import MostRobust
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.segment import actions_of
 

@@ -157,7 +157,9 @@ def report(path: Path, folders: Sequence[Path], picture: Path | None) -> None:
         if some:
             print(row_of(name, compared(some)))
     if picture is not None and groups["all"]:
-        draw(picture, {name: compared(some) for name, some in groups.items() if name == "all" or ":" in name})
+        draw(
+            picture, {name: compared(some) for name, some in groups.items() if some and (name == "all" or ":" in name)}
+        )
 
 
 def row_of(name: str, found: Calibration) -> str:

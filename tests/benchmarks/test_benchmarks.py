@@ -20,6 +20,7 @@ from cavin_pyro.evaluation.factory import make_environment
 from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
 from cavin_pyro.reproduction.stages import preparation
 from envs.workspace import push_endpoints
+from tests.cavin_pyro.evaluation.success.made_up import evaluation
 
 ROOT = Path(__file__).parents[2]
 
@@ -141,6 +142,27 @@ def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> N
     assert [row[1] for row in rows] == ["code 32", "code 16", "code 64", "no codes"]
     assert all(float(row[2]) for row in rows) and all(row[-2].endswith(" of 3") for row in rows)
     assert run("tuning", str(home), *options, *fast) == printed
+
+
+def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_episodes(tmp_path: Path) -> None:
+    fitted, fresh, other = (
+        evaluation(tmp_path / "fit", 400),
+        evaluation(tmp_path / "fresh", 400, seed=1),
+        evaluation(tmp_path / "other", 20, "planner.horizon=60"),
+    )
+    file, picture = str(tmp_path / "fit.json"), tmp_path / "reliability.png"
+    printed = run("success_probability", "fit", file, str(fitted))
+    assert re.search(r"^fit: \d+ of 400 episodes succeeded, \d+ plans$", printed, re.M)
+    lines = run("success_probability", "report", file, str(fresh), str(other), "--picture", str(picture)).splitlines()
+    table = {line.split(" | ")[0].strip("| "): line.split(" | ")[1:] for line in lines[2:]}
+    assert list(table) == ["all", "planner: fresh", "fresh"]  # the other planner was not fitted
+    assert table["all"][0] == "400" and float(table["all"][4].split()[0]) < 0.08
+    assert picture.stat().st_size > 10_000
+    refused = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "success_probability.py"), "fit", file, str(tmp_path)],
+        **{"cwd": ROOT, "capture_output": True, "text": True},
+    )
+    assert refused.returncode == 2 and refused.stderr == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
 
 
 def test_the_simulator_takes_the_place_of_f() -> None:

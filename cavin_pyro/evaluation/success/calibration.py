@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_BINS = 10
-EPISODES_PER_BIN = 15  # worth of weight, at least
+EPISODES_PER_BIN = 25  # worth of weight, at least
 RESAMPLES = 2000
 LEVEL = 0.95
 

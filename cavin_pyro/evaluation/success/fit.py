@@ -23,6 +23,7 @@ from cavin_pyro.storage.files import write_json
 from cavin_pyro.storage.run_directory import stored_options
 
 RIDGE = 1.0  # see `logistic`
+FEWEST = 10  # episodes of a fit
 Array = NDArray[np.float64]
 
 
@@ -40,7 +41,7 @@ def read_evaluation(folder: Path) -> Evaluated:
         UserError: it holds no evaluation, a damaged one, or one whose planner predicts nothing.
     """
     if not (folder / "config.yaml").is_file():
-        raise UserError(f"{folder} holds no evaluation: give folders of python -m cavin_pyro.evaluate")
+        raise UserError(f"{folder} holds no evaluation: give folders of evaluate")
     rows = list(finished_episodes(folder / "episodes.jsonl").values())
     if not rows or any(row.get("prospects") is None for row in rows):
         raise UserError(f"{folder} holds no prospects of plans: evaluate it again, with a planner that predicts")
@@ -64,12 +65,12 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
     """The regression of one planner from its evaluations. Every episode counts as much as any other.
 
     Raises:
-        UserError: all episodes ended alike, so that there is nothing to tell apart.
+        UserError: there are too few episodes.
     """
     rows = [row for one in evaluations for row in one.rows]
     ends = np.array([row["outcome"] == "success" for row in rows])
-    if ends.all() or not ends.any():
-        raise UserError(f"all {len(ends)} episodes of {name} ended alike: give harder or easier ones, too")
+    if len(ends) < FEWEST:
+        raise UserError(f"{len(ends)} episodes of {name} are too few for a fit: evaluate at least {FEWEST}")
     episodes = [predictors_of(plans_of(row["prospects"])) for row in rows]
     names = [one for number, one in enumerate(PREDICTORS) if all(np.isfinite(x[:, number]).all() for x in episodes)]
     kept = [list(PREDICTORS).index(one) for one in names]
@@ -104,7 +105,8 @@ def logistic(x: Array, y: Array, weights: Array, ridge: float) -> tuple[float, A
     """Intercept and slopes [d] of the log odds, by weighted maximum likelihood with a ridge penalty.
 
     The penalty is half of `ridge` times the squared slopes per standard deviation of their predictors: a normal prior
-    with variance 1 / ridge. The intercept has none, so the mean prediction equals the weighted rate.
+    with variance 1 / ridge. The intercept, at the mean predictors, has Jeffreys' prior of a rate: as if half an
+    observation more had succeeded and half a one failed. So no probability is 0 or 1, even if all outcomes are alike.
 
     Args:
         x: [n, d]. y: [n] in {0, 1}. weights: [n], whose sum is the number of independent observations.
@@ -115,10 +117,12 @@ def logistic(x: Array, y: Array, weights: Array, ridge: float) -> tuple[float, A
     z = (x - mean) / scale
 
     def loss(parameters: Array) -> tuple[float, Array]:
-        odds = parameters[0] + z @ parameters[1:]
-        value = weights @ (np.logaddexp(0.0, odds) - y * odds) + 0.5 * ridge * parameters[1:] @ parameters[1:]
+        intercept, slopes = parameters[0], parameters[1:]
+        odds = intercept + z @ slopes
+        value = weights @ (np.logaddexp(0.0, odds) - y * odds) + 0.5 * ridge * slopes @ slopes
+        value += 0.5 * (np.logaddexp(0.0, intercept) + np.logaddexp(0.0, -intercept))
         off = weights * (expit(odds) - y)
-        return float(value), np.concatenate([[off.sum()], off @ z + ridge * parameters[1:]])
+        return float(value), np.concatenate([[off.sum() + expit(intercept) - 0.5], off @ z + ridge * slopes])
 
     found = minimize(loss, np.zeros(1 + x.shape[1]), jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8})
     slopes = found.x[1:] / scale

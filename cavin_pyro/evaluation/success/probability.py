@@ -17,6 +17,7 @@ from cavin_pyro.evaluation.success.prospects import Prospects
 from cavin_pyro.storage.files import read_json
 
 FORMAT = "cavin_pyro success probability"
+LARGEST = 10_000_000  # bytes of a file
 SHIPPED = Path(__file__).with_name("fitted.json")
 
 
@@ -96,8 +97,10 @@ def read_regressions(path: Path) -> list[Regression]:
     """The regressions in a file.
 
     Raises:
-        UserError: it is not such a file, or damaged.
+        UserError: there is no such file, or it is damaged.
     """
+    if not path.is_file() or path.stat().st_size > LARGEST:
+        raise UserError(f"success_probability={path} is no file of up to {LARGEST:,} bytes: fit one, or leave it out")
     content = read_json(path)
     try:
         if content["format"] != FORMAT:

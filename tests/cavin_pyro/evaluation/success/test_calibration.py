@@ -65,7 +65,7 @@ def test_the_interval_holds_the_error_of_many_more_episodes() -> None:
 
 
 def test_bins_have_enough_episodes() -> None:
-    assert [len(calibration([[p] for p in np.linspace(0, 1, n)], [True] * n).weight) for n in (10, 45, 900)] == [
+    assert [len(calibration([[p] for p in np.linspace(0, 1, n)], [True] * n).weight) for n in (10, 75, 900)] == [
         *(1, 3, 10)
     ]
 

@@ -100,6 +100,12 @@ def test_a_damaged_file_is_refused_in_one_line(change: dict[str, Any], file: Pat
         probability_for(compose("evaluate", f"success_probability={damaged}"))
 
 
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    for path in ("/dev/zero", tmp_path, tmp_path / "missing"):
+        with pytest.raises(UserError, match="is no file of up to 10,000,000 bytes"):
+            probability_for(compose("evaluate", f"success_probability={path}"))
+
+
 SHIPPED = {
     "default": ("objects=3",),
     "guided": ("planner.guidance=layout", "layout=generated", "generated.tiles=9", "maximum_steps=120"),
