@@ -157,9 +157,8 @@ def report(path: Path, folders: Sequence[Path], picture: Path | None) -> None:
         if some:
             print(row_of(name, compared(some)))
     if picture is not None and groups["all"]:
-        draw(
-            picture, {name: compared(some) for name, some in groups.items() if some and (name == "all" or ":" in name)}
-        )
+        drawn = [name for name, some in groups.items() if some and (name == "all" or name.startswith("planner"))]
+        draw(picture, {name: compared(groups[name]) for name in drawn})
 
 
 def row_of(name: str, found: Calibration) -> str:
