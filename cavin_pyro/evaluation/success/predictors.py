@@ -30,13 +30,8 @@ def without_progress(plans: Sequence[Prospects]) -> int:
 PREDICTORS: dict[str, Predictor] = {
     "reaches the goal": lambda plans: plans[-1]["reaches"],
     "log share that reaches it": lambda plans: math.log10(plans[-1]["reaching"] + FEW),
-    "segments to the goal": lambda plans: plans[-1]["reaches"] * plans[-1]["segments"],
     "failed rollouts": lambda plans: plans[-1]["failures"],
-    "metres left": lambda plans: left(plans[-1]),
-    "metres left after the plan": lambda plans: plans[-1]["way_after"],
-    "log pushes left": lambda plans: math.log10(plans[-1]["pushes_left"]),
     "metres per push left": lambda plans: left(plans[-1]) / plans[-1]["pushes_left"],
     "log pushes without progress": lambda plans: math.log10(1 + without_progress(plans)),
     "objects": lambda plans: plans[-1]["objects"],
-    "metres off the subgoal": lambda plans: plans[-1]["tracking"],
 }

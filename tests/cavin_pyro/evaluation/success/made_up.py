@@ -14,7 +14,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.success.prospects import PROSPECTS
 from tests.cavin_pyro.evaluation.test_rows import ROW
 
-INTERCEPT, PER_METRE, IF_REACHES = 1.0, -4.0, 1.5  # of the log odds
+INTERCEPT, PER_METRE, IF_REACHES = 1.0, -4.0, 1.5  # of the log odds; 60 pushes are left
 
 
 def rows(count: int, *, seed: int = 0) -> list[dict[str, Any]]:
