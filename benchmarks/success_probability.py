@@ -112,7 +112,8 @@ def fit_all(path: Path, folders: Sequence[Path], ridge: float) -> None:
     names = {id(one): planner_of(folder) for one, folder in zip(evaluations, folders, strict=True)}
     regressions = [fit(group, names[id(group[0])], ridge=ridge) for group in by_planner(evaluations)]
     seeds = sorted(row["seed"] for one in evaluations for row in one.rows)
-    about = {"provenance": provenance(), "seeds": [seeds[0], seeds[-1]], "ridge": ridge}
+    command = f"python benchmarks/success_probability.py {' '.join(sys.argv[1:])}"
+    about = {"provenance": {**provenance(), "command": command}, "seeds": [seeds[0], seeds[-1]], "ridge": ridge}
     write_regressions(path, regressions, about)
     for one in regressions:
         print(f"{one.name}: {one.successes} of {one.episodes} episodes succeeded, {one.plans} plans")
