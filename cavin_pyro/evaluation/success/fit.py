@@ -24,6 +24,7 @@ from cavin_pyro.storage.run_directory import stored_options
 
 RIDGE = 1.0  # see `logistic`
 FEWEST = 10  # episodes of a fit
+CONSTANT = 1e-9  # standard deviation of a predictor, against its size, that is rounding
 Array = NDArray[np.float64]
 
 
@@ -77,7 +78,7 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
     x = np.concatenate([one[:, kept] for one in episodes])
     y = np.concatenate([np.full(len(one), float(end)) for one, end in zip(episodes, ends, strict=True)])
     weights = np.concatenate([np.full(len(one), 1.0 / len(one)) for one in episodes])
-    intercept, slopes = logistic(x, y, weights, ridge)
+    intercept, slopes = logistic(x, y, weights, ridge, [PREDICTORS[one].sign for one in names])
     odds = intercept + x @ slopes
     situation = evaluations[0].situation
     return Regression(
@@ -98,10 +99,12 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
 def predictors_of(plans: Sequence[Prospects]) -> Array:
     """The predictors of every plan of an episode: [plans, predictors]; NaN for what its planner does not know."""
     sofar = [plans[: number + 1] for number in range(len(plans))]
-    return np.array([[predictor(some) for predictor in PREDICTORS.values()] for some in sofar], dtype=np.float64)
+    return np.array([[predictor.value(some) for predictor in PREDICTORS.values()] for some in sofar], dtype=np.float64)
 
 
-def logistic(x: Array, y: Array, weights: Array, ridge: float) -> tuple[float, Array]:
+def logistic(
+    x: Array, y: Array, weights: Array, ridge: float, signs: Sequence[int] | None = None
+) -> tuple[float, Array]:
     """Intercept and slopes [d] of the log odds, by weighted maximum likelihood with a ridge penalty.
 
     The penalty is half of `ridge` times the squared slopes per standard deviation of their predictors: a normal prior
@@ -110,10 +113,11 @@ def logistic(x: Array, y: Array, weights: Array, ridge: float) -> tuple[float, A
 
     Args:
         x: [n, d]. y: [n] in {0, 1}. weights: [n], whose sum is the number of independent observations.
+        signs: 1 or -1 for each predictor whose slope must not have the other sign; 0 or None: either.
     """
     mean = np.average(x, axis=0, weights=weights)
     scale = np.sqrt(np.average((x - mean) ** 2, axis=0, weights=weights))
-    scale = np.where(scale > 0.0, scale, math.inf)  # a constant has no slope
+    scale = np.where(scale > CONSTANT * (1.0 + np.abs(mean)), scale, math.inf)  # a constant has no slope
     z = (x - mean) / scale
 
     def loss(parameters: Array) -> tuple[float, Array]:
@@ -124,7 +128,16 @@ def logistic(x: Array, y: Array, weights: Array, ridge: float) -> tuple[float, A
         off = weights * (expit(odds) - y)
         return float(value), np.concatenate([[off.sum() + expit(intercept) - 0.5], off @ z + ridge * slopes])
 
-    found = minimize(loss, np.zeros(1 + x.shape[1]), jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8})
+    either = (-np.inf, np.inf)
+    slopes_within = [(either, (0.0, np.inf), (-np.inf, 0.0))[sign] for sign in signs or [0] * x.shape[1]]
+    found = minimize(
+        loss,
+        np.zeros(1 + x.shape[1]),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[either, *slopes_within],
+        options={"ftol": 1e-12, "gtol": 1e-8},
+    )
     slopes = found.x[1:] / scale
     return float(found.x[0] - slopes @ mean), slopes
 

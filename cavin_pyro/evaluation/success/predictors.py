@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from cavin_pyro.evaluation.success.prospects import Prospects
 
 FEW = 1e-3  # added to the share of candidates before its logarithm: about one of 1,024
 CLOSER = 0.02  # metres; less is no progress
-Predictor = Callable[[Sequence[Prospects]], float]  # of the plans up to now; NaN where the planner does not know it
+
+
+class Predictor(NamedTuple):
+    """A function of the plans up to now, NaN where the planner does not know it.
+
+    sign: 1 if more of it can only make success likelier, -1 if less likely.
+    """
+
+    sign: int
+    value: Callable[[Sequence[Prospects]], float]
 
 
 def left(plan: Prospects) -> float:
@@ -27,11 +37,11 @@ def without_progress(plans: Sequence[Prospects]) -> int:
 
 
 # What each means for the last of the plans so far.
-PREDICTORS: dict[str, Predictor] = {
-    "reaches the goal": lambda plans: plans[-1]["reaches"],
-    "log share that reaches it": lambda plans: math.log10(plans[-1]["reaching"] + FEW),
-    "failed rollouts": lambda plans: plans[-1]["failures"],
-    "metres per push left": lambda plans: left(plans[-1]) / plans[-1]["pushes_left"],
-    "log pushes without progress": lambda plans: math.log10(1 + without_progress(plans)),
-    "objects": lambda plans: plans[-1]["objects"],
+PREDICTORS = {
+    "reaches the goal": Predictor(1, lambda plans: plans[-1]["reaches"]),
+    "log share that reaches it": Predictor(1, lambda plans: math.log10(plans[-1]["reaching"] + FEW)),
+    "failed rollouts": Predictor(-1, lambda plans: plans[-1]["failures"]),
+    "metres per push left": Predictor(-1, lambda plans: left(plans[-1]) / plans[-1]["pushes_left"]),
+    "log pushes without progress": Predictor(-1, lambda plans: math.log10(1 + without_progress(plans))),
+    "objects": Predictor(-1, lambda plans: plans[-1]["objects"]),
 }

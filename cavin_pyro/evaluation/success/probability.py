@@ -46,7 +46,7 @@ class Regression:
 
     def __call__(self, plans: Sequence[Prospects]) -> float | None:
         """P(success | the last of an episode's plans so far); None if it does not tell what the fit needs."""
-        odds = self.intercept + sum(slope * PREDICTORS[name](plans) for name, slope in self.slopes.items())
+        odds = self.intercept + sum(slope * PREDICTORS[name].value(plans) for name, slope in self.slopes.items())
         if not math.isfinite(odds):
             return None
         return 1.0 / (1.0 + math.exp(-min(max(odds, self.lowest), self.highest)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +39,16 @@ def test_outcomes_that_are_all_alike_are_not_given_certainty() -> None:
     assert expit(intercept) == pytest.approx(20.5 / 21, abs=0.01) and (np.abs(slopes) < 0.5).all()
 
 
+def test_a_slope_does_not_get_a_sign_that_it_must_not_have() -> None:
+    x = np.random.default_rng(3).normal(size=(400, 2))
+    y = (x.sum(-1) > 0).astype(float)
+    slopes = logistic(x, y, np.ones(400), 1.0, [-1, 1])[1]
+    assert slopes[0] == 0.0 < slopes[1]
+
+
 def test_a_constant_predictor_and_separable_outcomes_get_finite_slopes() -> None:
-    x = np.stack([np.linspace(-1.0, 1.0, 20), np.full(20, 3.0)], -1)
-    _, slopes = logistic(x, (x[:, 0] > 0).astype(float), np.ones(20), 1.0)
+    x = np.stack([np.linspace(-1.0, 1.0, 20), np.full(20, math.log10(0.001))], -1)
+    _, slopes = logistic(x, (x[:, 0] > 0).astype(float), np.full(20, 1 / 7), 1.0)
     assert slopes[0] > 1.0 and slopes[1] == 0.0
 
 

@@ -50,6 +50,6 @@ def test_progress_counts_from_the_last_two_centimetres() -> None:
 def test_every_predictor_is_a_number_and_reads_only_the_past() -> None:
     first, second = {**told(), "way": 0.5, "way_after": 0.2}, {**told(), "way": 0.1, "way_after": 0.0}
     for name, predictor in PREDICTORS.items():
-        assert math.isfinite(predictor([first, second])), name
-    assert PREDICTORS["metres per push left"]([first, second]) == pytest.approx(0.1 / 58)
-    assert PREDICTORS["metres per push left"]([told()]) == pytest.approx(0.5 / 58)  # the task's distance
+        assert math.isfinite(predictor.value([first, second])), name
+    assert PREDICTORS["metres per push left"].value([first, second]) == pytest.approx(0.1 / 58)
+    assert PREDICTORS["metres per push left"].value([told()]) == pytest.approx(0.5 / 58)  # the task's distance
