@@ -176,7 +176,7 @@ def row_of(name: str, found: Calibration) -> str:
 
 def draw(path: Path, found: dict[str, Calibration]) -> None:
     """The reliability diagram: the frequency of success over the mean prediction, for all and for each planner."""
-    figure = Figure(figsize=(5.6, 5.2), dpi=150, layout="constrained")  # inches
+    figure = Figure(figsize=(5.2, 6.4), dpi=150, layout="constrained")  # inches
     axes = figure.subplots()
     axes.plot([0, 100], [0, 100], color="#BBBBBB", linewidth=1, zorder=0)
     for (name, one), (marker, color) in zip(found.items(), cycle(STYLES), strict=False):
@@ -188,6 +188,7 @@ def draw(path: Path, found: dict[str, Calibration]) -> None:
             marker=marker,
             color=color,
             alpha=1.0 if whole else 0.6,
+            clip_on=False,
             label=f"{name}, {one.episodes} episodes: {bounds(one.error)}",
             zorder=3 if whole else 2,
         )
@@ -195,7 +196,7 @@ def draw(path: Path, found: dict[str, Calibration]) -> None:
     axes.set(xlabel="predicted success of a plan's episode, %", ylabel="succeeded, %", xlim=(-3, 103), ylim=(-3, 103))
     axes.set_aspect("equal")
     title = "calibration error (95 %)"
-    legend = axes.legend(frameon=False, fontsize=7.5, loc="upper left", title=title, title_fontsize=8)
+    legend = figure.legend(frameon=False, fontsize=8, loc="outside lower center", title=title, title_fontsize=8)
     for handle in legend.legend_handles:
         if handle is not None:
             handle.set_sizes(np.array([25.0]))  # type: ignore[attr-defined]

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class Interval(NamedTuple):
-    """An estimate with its bounds at 95 %."""
+    """An estimate with its bounds at 95 %, which are too narrow if all episodes ended alike."""
 
     value: float
     low: float

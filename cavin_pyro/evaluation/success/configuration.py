@@ -30,7 +30,8 @@ class Scenes:
 
     def mismatch(self, other: Scenes) -> str | None:
         """The first option by which `other`, of a single configuration, lies outside; None if it lies inside."""
-        for name in sorted(self.equal | other.equal):
+        first = ("task._target_", "layout")  # which tell more than the options that follow from them
+        for name in (*first, *sorted(self.equal | other.equal)):
             if self.equal.get(name) != other.equal.get(name):
                 return f"{name}={other.equal.get(name)}"
         for name, (low, high) in self.ranges.items():
