@@ -171,7 +171,8 @@ def rollout(
     ended = False
     while not ended:
         began = time.perf_counter()
-        previous = planner.plan(observed_state(observation, geometry, device), [generator], previous)
+        state = observed_state(observation, geometry, device)
+        previous = planner.plan(state, [generator], previous)
         plan = apply(previous, lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),
@@ -185,7 +186,7 @@ def rollout(
                 plan,
                 step=len(episode.transitions),
                 pushes_left=env.maximum_steps - len(episode.transitions),
-                distance=-float(env.task.potential(state.centers[0, :, :2], state.mask[0])),
+                distance=-float(env.task.potential(state.centers[0, :, :2].cpu(), state.mask[0].cpu())),
                 mask=observation["mask"],
             ),
         )

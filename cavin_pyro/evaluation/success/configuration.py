@@ -17,7 +17,7 @@ RANGED = ("objects", "maximum_steps", "generated.tiles")  # options of a scene w
 FREE = (  # options that change neither plans nor scenes
     *("seed", "output", "episodes", "workers", "launcher", "address", "compare", "shard", "merge", "trust", "tasks"),
     *("video", "viewer", "save_goal", "success_probability"),
-    *("generated.seed", "planner.compile", "planner.default_checkpoint"),
+    *("device", "generated.seed", "planner.compile", "planner.default_checkpoint"),
 )
 
 
