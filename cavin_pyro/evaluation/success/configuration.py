@@ -9,8 +9,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.storage.checkpoint import find_checkpoint
-from cavin_pyro.storage.digests import file_digest
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
+from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.run_directory import flat_options
 
 RANGED = ("objects", "maximum_steps", "generated.tiles")  # options of a scene with a range
@@ -45,7 +45,7 @@ class Scenes:
 class Situation:
     """A planner with its checkpoint, and the scenes that it plans for.
 
-    planner: options by their dotted names, those of the world included. checkpoint: SHA-256 of the file.
+    planner: options by their dotted names, those of the world included. checkpoint: SHA-256 of its weights but the guide's, which plans do not read.
     """
 
     planner: dict[str, Any]
@@ -57,7 +57,7 @@ def situation(config: DictConfig) -> Situation:
     """The situation of a configuration of `plan` or `evaluate`.
 
     Raises:
-        UserError: there is no such checkpoint.
+        UserError: there is no such checkpoint, or it cannot be used.
     """
     options = flat_options(OmegaConf.to_container(config, resolve=True))
     return situation_of(options)
@@ -67,9 +67,10 @@ def situation_of(options: Mapping[str, Any]) -> Situation:
     """The same, of options by their dotted names.
 
     Raises:
-        UserError: there is no such checkpoint.
+        UserError: there is no such checkpoint, or it cannot be used.
     """
-    checkpoint = file_digest(find_checkpoint(options["checkpoint"]))
+    tensors = load_checkpoint(find_checkpoint(options["checkpoint"]), trust=list(options.get("trust") or ())).tensors
+    checkpoint = tensors_digest({name: value for name, value in tensors.items() if not name.startswith("guide.")})
     generated = options["layout"] == "generated"
     ranged = [name for name in RANGED if generated or not name.startswith("generated.")]
     ranges = {name: (options[name], options[name]) for name in ranged}
