@@ -69,7 +69,8 @@ def situation_of(options: Mapping[str, Any]) -> Situation:
     Raises:
         UserError: there is no such checkpoint, or it cannot be used.
     """
-    tensors = load_checkpoint(find_checkpoint(options["checkpoint"]), trust=list(options.get("trust") or ())).tensors
+    path = find_checkpoint(options["checkpoint"])
+    tensors = load_checkpoint(path, trust=list(options.get("trust") or ())).tensors
     checkpoint = tensors_digest({name: value for name, value in tensors.items() if not name.startswith("guide.")})
     generated = options["layout"] == "generated"
     ranged = [name for name in RANGED if generated or not name.startswith("generated.")]
