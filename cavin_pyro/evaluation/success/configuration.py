@@ -45,7 +45,8 @@ class Scenes:
 class Situation:
     """A planner with its checkpoint, and the scenes that it plans for.
 
-    planner: options by their dotted names, those of the world included. checkpoint: SHA-256 of its weights but the guide's, which plans do not read.
+    planner: options by their dotted names, those of the world included. checkpoint: SHA-256 of its weights, without the
+        guide, which plans do not read.
     """
 
     planner: dict[str, Any]
