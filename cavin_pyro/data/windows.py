@@ -17,9 +17,11 @@ from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, check_distinct, iterate_shards, read_metadata
+from cavin_pyro.data.declaration import padded
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.data.mapped import MappedArray
+from cavin_pyro.data.sources import slots_of
 from cavin_pyro.storage.progress import progress_bar
 from models.networks.geometry import Geometry
 from models.state import State, Window
@@ -132,6 +134,7 @@ def load_windows(
         )
     check_distinct(folders)
     total = sum(read_metadata(folder)["shards"] for folder in folders)
+    slots = max(slots_of(read_metadata(folder)) for folder in folders)
     held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
     with (
@@ -143,7 +146,7 @@ def load_windows(
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
                 known.add(number, arrays["episode"])
                 arrays["features"] = shard_features(folder, number, geometry, fingerprint)
-                found.add(held_out.filter_episodes(arrays))
+                found.add(padded(held_out.filter_episodes(arrays), slots))
                 bar.update()
         return found.table()
 

@@ -18,7 +18,7 @@ from envs.robots import OFF_STAGE, SETTLED_SPEED, STICK_RADIUS
 from envs.scene import MOVED, TURNED, PushReport, Scene
 from envs.sensors import IdealSensor
 from envs.sensors.camera import Camera
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
+from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
 
 ROOT = Path(__file__).parents[2]
 REACHABLE: Area = (((0.40, -0.35), (0.70, 0.35)),)
@@ -61,7 +61,7 @@ def history(scene: Scene, seed: int, pushes: int = 4) -> list[np.ndarray]:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_sampled_scene_has_settled_on_the_table(scene: Scene, seed: int) -> None:
     (sampling, _) = generators(seed)
-    count = 1 + seed % MAXIMUM_OBJECTS
+    count = 1 + seed % OBJECT_SLOTS
     observed = scene.sample([WHOLE_TABLE] * count, RANGES, sampling)
     assert scene.world.fastest(scene.bodies) < SETTLED_SPEED
     before = truth(scene)
@@ -69,7 +69,7 @@ def test_a_sampled_scene_has_settled_on_the_table(scene: Scene, seed: int) -> No
     for _ in range(240):
         scene.world.step()
     np.testing.assert_allclose(truth(scene)[:, :3], before[:, :3], atol=0.003)
-    assert observed.mask.tolist() == observed.visible.tolist() == [True] * count + [False] * (MAXIMUM_OBJECTS - count)
+    assert observed.mask.tolist() == observed.visible.tolist() == [True] * count + [False] * (OBJECT_SLOTS - count)
 
 
 @pytest.mark.parametrize("name", BUILTIN_NAMES)
@@ -214,7 +214,7 @@ def test_a_fallen_object_keeps_its_latest_cloud(scene: Scene, put: Callable, pus
 
 def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scene, put: Callable) -> None:
     observed = scene.reset([put("mug", 0.5, 0.2), put("banana", 0.6, -0.2)], np.random.default_rng(0))
-    assert observed.clouds.shape == (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
+    assert observed.clouds.shape == (OBJECT_SLOTS, POINTS_PER_OBJECT, 3)
     assert observed.clouds.dtype == observed.centers.dtype == np.float32
     np.testing.assert_allclose(observed.centers, observed.clouds.mean(axis=1), atol=1e-6)
     assert not observed.clouds[2:].any() and not observed.centers[2:].any()

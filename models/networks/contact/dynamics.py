@@ -12,6 +12,7 @@ from models.networks.contact.objects import PAIR_MEASURES, pair_contact
 from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, ToolContact, endpoints
 from models.networks.dynamics import PushOutcome
 from models.networks.layers import fully_connected, relative_positions
+from models.networks.neighbours import nearest_pairs
 from models.networks.outline import (
     FEATURES,
     HEIGHTS,
@@ -140,7 +141,11 @@ class ContactDynamics(PushOutcome):
             own, other = (layer(each).unflatten(0, (objects, -1)) for layer in (self.own, self.other))
             hidden = hidden.unflatten(0, (objects, objects - 1, -1)) + own.unsqueeze(1)
             hidden = (hidden.flatten(0, 1) + other.index_select(0, second)).relu_()
-            related = self.relation(hidden) * real.expand(batch).index_select(0, second).flatten(1).unsqueeze(-1)
+            counts = real.expand(batch).index_select(0, second)
+            if self.neighbours is not None and objects - 1 > self.neighbours:
+                near = nearest_pairs(place.movedim((0, 1), (-1, -2)), real.expand(batch).movedim(0, -1), self.neighbours)
+                counts = counts * near.movedim((-2, -1), (0, 1)).flatten(0, 1).index_select(0, pairs)
+            related = self.relation(hidden) * counts.flatten(1).unsqueeze(-1)
             relation = related.unflatten(0, (objects, -1)).sum(1).flatten(0, 1)
         after = self.head(self.second(torch.cat((alone, relation), -1)))
         return torch.cat((motion, torch.zeros_like(motion))) + _unflat(after, batch)
