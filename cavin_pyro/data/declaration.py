@@ -109,10 +109,16 @@ def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def padded(arrays: Mapping[str, NDArray[Any]], objects: int) -> dict[str, NDArray[Any]]:
-    """Declared arrays of a shard with room for M = `objects`, which is at least what they have room for."""
+    """Declared arrays of a shard with room for M = `objects`.
+
+    Raises:
+        ValueError: one has room for more.
+    """
     wider = {}
     for name, array in arrays.items():
         sizes = zip(ARRAYS[name].dimensions, array.shape, strict=True)
         ends = [(0, objects - size if dimension == "M" else 0) for dimension, size in sizes]
+        if np.min(ends) < 0:
+            raise ValueError(f"{name} has room for more than {objects} objects, of which the metadata tell")
         wider[name] = np.pad(array, ends, constant_values=ARRAYS[name].padding) if np.any(ends) else array
     return wider

@@ -138,7 +138,7 @@ def load_windows(
     held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
     with (
-        closing(_Finder(config, segment_length, seed, where, storage)) as found,
+        closing(_Finder(config, segment_length, seed, where, slots, storage)) as found,
         progress_bar("reading", total=total, unit="file") as bar,
     ):
         for folder, held_out in zip(folders, held_out_of, strict=True):
@@ -146,7 +146,7 @@ def load_windows(
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
                 known.add(number, arrays["episode"])
                 arrays["features"] = shard_features(folder, number, geometry, fingerprint)
-                found.add(padded(held_out.filter_episodes(arrays), slots))
+                found.add(held_out.filter_episodes(arrays))
                 bar.update()
         return found.table()
 
@@ -155,9 +155,11 @@ class _Finder:
     """Finds the windows in one shard after another, and holds no more of them than where they start."""
 
     def __init__(
-        self, config: WindowConfig, segment_length: int, seed: int, where: str, storage: Path | None = None
+        self, config: WindowConfig, segment_length: int, seed: int, where: str, slots: int, storage: Path | None = None
     ) -> None:
+        """`slots`: M, that of the dataset with the most objects."""
         self._config, self._length, self._seed, self._where = config, segment_length, seed, where
+        self._slots = slots
         self._turns = np.random.default_rng(seed)
         self._positions = {name: MappedArray(storage) for name in ("centers", "features", "mask", "actions", "counts")}
         self._windows: dict[str, list[NDArray[Any]]] = {"start": [], "counts": [], "episode": [], "validation": []}
@@ -167,7 +169,7 @@ class _Finder:
         """Add the episodes of a shard.
 
         Raises:
-            UserError: they are too short, or not shaped as earlier ones.
+            UserError: they are too short, or not shaped as the metadata say.
         """
         T, config, positions = self._length, self._config, episodes["visible"].shape[1]
         if positions <= T:
@@ -175,6 +177,10 @@ class _Finder:
                 f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
                 f"T={T}: collect with steps of at least that many"
             )
+        try:
+            episodes = padded(episodes, self._slots)
+        except ValueError as error:
+            raise UserError(f"dataset {self._where} is damaged: {error}") from error
         mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
         visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
         counts = _transitions_that_count(episodes, visible, config.maximum_step)
@@ -208,13 +214,8 @@ class _Finder:
 
     def _store(self, **arrays: NDArray[Any]) -> None:
         """Append arrays [E, S+1, ...]: positions in time, episode after episode."""
-        try:
-            for name, array in arrays.items():
-                self._positions[name].append(array.reshape(-1, *array.shape[2:]))
-        except ValueError as error:
-            raise UserError(
-                f"{self._where}: files with different numbers of objects cannot be joined ({error})"
-            ) from error
+        for name, array in arrays.items():
+            self._positions[name].append(array.reshape(-1, *array.shape[2:]))
 
     def close(self) -> None:
         """Close the temporary files; the table keeps what it maps."""
