@@ -143,6 +143,15 @@ def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> N
     assert run("tuning", str(home), *options, *fast) == printed
 
 
+def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:
+    few = ("--objects", "2", "6", "--neighbours", "4", "9", "--repetitions", "1")
+    _, *rows = run("many_objects", *few, "--options", "planner.samples=8", "planner.horizon=6").splitlines()
+    assert [row.split()[:2] for row in rows] == [["2", "4"], ["6", "4"], ["6", "9"]]
+    for row in rows:
+        milliseconds, moved, _, apart, _ = row.split()[2:]
+        assert float(milliseconds) > 0 and 0 < float(moved) < 6 and 0 < float(apart) < 20
+
+
 def test_the_simulator_takes_the_place_of_f() -> None:
     small = ["planner.samples=8", "planner.horizon=3", "maximum_steps=4"]
     lines = run("oracle", "--episodes", "1", "--objects", "2", "--candidates", "2", "--seed", "5", *small).splitlines()
@@ -212,7 +221,8 @@ def test_rows_of_networks_are_counted_for_every_planner_of_a_method() -> None:
 
 
 def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -> None:
-    printed = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", "--picture", str(tmp_path / "a.png"))
+    options = ("--objects", "3", "6", "--neighbours", "4", "--picture", str(tmp_path / "a.png"))
+    printed = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", *options)
     one_push, three_pushes = printed.split("after 3 pushes")
     means = {}
     for part in (one_push, three_pushes):
