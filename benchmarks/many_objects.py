@@ -3,8 +3,9 @@
 Processor time per plan of crossing with 1,024 samples and sparse rewards, from the first images of the same six seeds
 for every number of objects, all of them in turn in one process, medians of --repetitions. And what the sampled plans
 are like: of 1,024 segments from the priors, how many objects h moves by more than 5 cm, in how many f moves one so far
-by the pushes that g generates, and how far f and h are apart (mean over objects, median over segments). Each number of
-neighbours is `model.neighbours`; the first is also that of scenes with fewer others. Set OMP_NUM_THREADS=1.
+by the pushes that g generates, how far f and h are apart (mean over objects, median over segments), and in how many of
+the segments in which h moves the target f moves it by more than 3 cm. Each number of neighbours is `model.neighbours`;
+the first is also that of scenes with fewer others. Set OMP_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from planning import CavinPlanner
 
 SEEDS = range(10000, 10006)
 SAMPLES = 1024
-FAR = 0.05  # metres
+FAR, SOME = 0.05, 0.03  # metres
 
 
 def planner_and_scenes(objects: int, neighbours: int, overrides: list[str]) -> tuple[CavinPlanner, list[State]]:
@@ -50,9 +51,9 @@ def milliseconds(planner: CavinPlanner, states: list[State]) -> float:
 
 
 @torch.inference_mode()
-def sampled_segments(model: CascadedModel, states: list[State]) -> tuple[float, float, float]:
-    """Objects that h moves, the share of segments in which f moves one, and metres between f and h."""
-    by_h, by_f, apart = [], [], []
+def sampled_segments(model: CascadedModel, states: list[State]) -> tuple[float, float, float, float]:
+    """Objects that h moves, how often f moves one, metres from f to h, how often f moves the target that h moves."""
+    by_h, by_f, apart, targets = [], [], [], []
     for number, state in enumerate(states):
         torch.manual_seed(number)
         here = there = state.expand_plans(SAMPLES)
@@ -64,7 +65,9 @@ def sampled_segments(model: CascadedModel, states: list[State]) -> tuple[float, 
         by_h.append(float((moved_by_h > FAR).sum(-1).float().mean()))
         by_f.append(float((moved_by_f > FAR).any(-1).float().mean()))
         apart.append(float((there.centers - subgoal.centers)[..., :2].norm(dim=-1).mean(-1).median()))
-    return statistics.mean(by_h), statistics.mean(by_f), statistics.mean(apart)
+        wanted = moved_by_h[..., 0] > FAR
+        targets.append(float((moved_by_f[..., 0] > SOME)[wanted].float().mean()) if wanted.any() else 0.0)
+    return statistics.mean(by_h), statistics.mean(by_f), statistics.mean(apart), statistics.mean(targets)
 
 
 def main() -> None:
@@ -87,11 +90,12 @@ def main() -> None:
             spent = milliseconds(*parts)
             if repetition:  # the first warms up
                 times[case].append(spent)
-    print("objects  neighbours  ms per plan  moved by h  f moves one  f from h")
+    print("objects  neighbours  ms per plan  moved by h  f moves one  f from h  target")
     for case, (planner, states) in cases.items():
-        moved, share, apart = sampled_segments(planner.model, states)  # type: ignore[arg-type]
+        moved, share, apart, target = sampled_segments(planner.model, states)  # type: ignore[arg-type]
         spent = statistics.median(times[case])
-        print(f"{case[0]:7d}  {case[1]:10d}  {spent:11.1f}  {moved:10.2f}  {share:11.1%}  {100 * apart:5.1f} cm")
+        segments = f"{moved:10.2f}  {share:11.1%}  {100 * apart:5.1f} cm  {target:6.1%}"
+        print(f"{case[0]:7d}  {case[1]:10d}  {spent:11.1f}  {segments}")
 
 
 if __name__ == "__main__":

@@ -91,9 +91,8 @@ def nearest_pairs(centers: Tensor, mask: Tensor, most: int) -> Tensor:
 def neighbours(centers: Tensor, mask: Tensor, most: int | None) -> list[Neighbour]:
     """For each object the other objects that enter its relations, at most `most` of them.
 
-    All others where there are no more than `most`, or if it is None; else the nearest on the table. So relation sums
-    have no more terms in a crowded scene than in the scenes of the training, and their cost grows with the number of
-    objects, not with its square.
+    All others where there are no more than `most`, or if it is None; else the nearest on the table, so that relation
+    sums do not grow in a crowded scene, and their cost grows with the number of objects, not with its square.
 
     Args:
         centers: `[..., M, 3]` metres. mask: `[..., M]`.
