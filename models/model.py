@@ -62,7 +62,7 @@ class Model(Program):
         most; how many others enter a relation; the likelihoods' scales; f.
 
         A scene may have more than `maximum_objects`. `neighbours`: the nearest others that enter each sum over other
-        objects; None takes all, as in the paper.
+        objects; None takes `maximum_objects - 1`, which are all others in the scenes of the training, as in the paper.
 
         Raises `ValueError` for scales that f must predict if it does not.
         """
@@ -71,7 +71,7 @@ class Model(Program):
         self.feature_dimension = feature_dimension
         self.width = width
         self.maximum_objects = maximum_objects
-        self.neighbours = neighbours
+        self.neighbours = maximum_objects - 1 if neighbours is None else neighbours
         self.scales = scales or LikelihoodScales()
         self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, neighbours=self.neighbours)
         self.dynamics: PushOutcome = dynamics or Dynamics(feature_dimension=feature_dimension, width=width)

@@ -130,9 +130,13 @@ def announce_objects(config: DictConfig) -> None:
         return
     path = find_checkpoint(config.checkpoint)
     model = load_checkpoint(path, trust=list(config.trust)).config["model"]
-    trained = model.get("maximum_objects", OBJECT_SLOTS)
+    trained, near = model.get("maximum_objects", OBJECT_SLOTS), model.get("neighbours")
     if config.objects > trained:
-        print(f"objects={config.objects}: checkpoint {path} was trained with at most {trained}", file=sys.stderr)
+        print(
+            f"objects={config.objects}: checkpoint {path} was trained with at most {trained}; in its relations, each "
+            f"object has its {trained - 1 if near is None else near} nearest",
+            file=sys.stderr,
+        )
 
 
 def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:

@@ -275,7 +275,8 @@ def test_a_checkpoint_runs_with_more_objects_than_it_was_trained_with_and_says_s
         runner = make_runner(options)
         assert runner.rollout(10000).plan_records[0].plan.subgoals.centers.shape[-2] == objects
         runner.env.close()
-    assert told == f"objects=8: checkpoint {path} was trained with at most 3\n"
+    assert f"objects=8: checkpoint {path} was trained with at most 3; in its relations, each object has its 2" in told
+    assert runner.planner.model.encoder.neighbours == runner.planner.model.dynamics.neighbours == 2
     announce_objects(configure(f"checkpoint={path}", "objects=8", "planner=random"))  # which asks no model
     assert not capsys.readouterr().err
 
