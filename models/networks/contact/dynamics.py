@@ -45,8 +45,8 @@ class ContactDynamics(PushOutcome):
     change of shape_i, its scale = linear of FC(FC(the same of i)): layers of their own, because 64 numbers of shape
     outweigh three of motion in the likelihood
 
-    Both changes are turned back. It takes no features of the state encoder. Equivariant to the order of objects;
-    padding does not change and does not affect other objects.
+    Of more than `neighbours` others the nearest enter relation_i. Both changes are turned back. It takes no features of
+    the state encoder. Equivariant to the order of objects; padding does not change and does not affect other objects.
     """
 
     typical: Tensor  # [2 K + 1]
@@ -143,7 +143,9 @@ class ContactDynamics(PushOutcome):
             hidden = (hidden.flatten(0, 1) + other.index_select(0, second)).relu_()
             counts = real.expand(batch).index_select(0, second)
             if self.neighbours is not None and objects - 1 > self.neighbours:
-                near = nearest_pairs(place.movedim((0, 1), (-1, -2)), real.expand(batch).movedim(0, -1), self.neighbours)
+                near = nearest_pairs(
+                    place.movedim((0, 1), (-1, -2)), real.expand(batch).movedim(0, -1), self.neighbours
+                )
                 counts = counts * near.movedim((-2, -1), (0, 1)).flatten(0, 1).index_select(0, pairs)
             related = self.relation(hidden) * counts.flatten(1).unsqueeze(-1)
             relation = related.unflatten(0, (objects, -1)).sum(1).flatten(0, 1)
