@@ -14,6 +14,8 @@ The floor has two parts. Hidden: the distance between what happened and the mean
 in a second world, from the same poses, with mass and friction drawn anew within their ranges (those that leave the
 object on the table). Camera: the distance
 between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
+`--objects 8 10` is for other numbers of objects than 1 to 5, and `--neighbours 4 9` predicts once with the nearest 4
+other objects in each relation, and once with the nearest 9.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
 from envs.robots import STICK_RADIUS
 from envs.scene import FALLEN, Scene
-from envs.workspace import push_endpoints
+from envs.workspace import OBJECT_SLOTS, push_endpoints
 from models.state import State, Window, stack_steps
 
 T = 3  # pushes of a segment
@@ -201,10 +203,17 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
 
 
 @torch.inference_mode()
-def predictions(path: str, episodes: Sequence[Episode]) -> dict[int, dict[str, list[NDArray[np.float32]]]]:
-    """Centres [M, 3] metres that a checkpoint predicts, by the number of pushes and the predictor."""
+def predictions(
+    path: str, episodes: Sequence[Episode], neighbours: int | None = None
+) -> dict[int, dict[str, list[NDArray[np.float32]]]]:
+    """Centres [M, 3] metres that a checkpoint predicts, by the number of pushes and the predictor.
+
+    `neighbours`: of the option `model.neighbours`, None for the checkpoint's own.
+    """
     file = find_checkpoint(path)
     checkpoint = load_checkpoint(file)
+    if neighbours is not None:
+        checkpoint.config["model"]["neighbours"] = neighbours
     model, guide = load_programs(checkpoint, file)
     geometry = geometry_of(checkpoint, file)
 
@@ -214,6 +223,8 @@ def predictions(path: str, episodes: Sequence[Episode]) -> dict[int, dict[str, l
         return State(torch.from_numpy(seen.centers)[None], features, torch.from_numpy(seen.mask)[None])
 
     name, found = file.parent.name if file.stem == "checkpoint" else file.stem, {}
+    if neighbours is not None:
+        name += f" {neighbours}"
     for ahead in (1, T):
         rolled, inferred = [], []
         for _, _, pushes in segments(episodes, ahead):
@@ -280,9 +291,12 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=20000)
     parser.add_argument("--redraws", type=int, default=8)
+    parser.add_argument("--objects", type=int, nargs=2, default=(1, OBJECT_SLOTS), help="at least, and at most")
+    parser.add_argument("--neighbours", type=int, nargs="+", default=(None,))
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
-    config = CollectionConfig(seed=arguments.seed, perturbation_rate=0.3)
+    fewest, most = arguments.objects
+    config = CollectionConfig(seed=arguments.seed, perturbation_rate=0.3, minimum_objects=fewest, maximum_objects=most)
     episodes = []
     with (
         closing(open_scene(config)) as scene,
@@ -292,7 +306,8 @@ def main() -> None:
         for number in range(arguments.episodes):
             episodes.append(play(scene, twin, config, number, arguments.redraws))
             bar.update()
-    found = [predictions(path, episodes) for path in arguments.checkpoints or ["cavin"]]
+    paths = arguments.checkpoints or ["cavin"]
+    found = [predictions(path, episodes, near) for path in paths for near in arguments.neighbours]
     tables = {
         ahead: measure(episodes, ahead, {who: rows for one in found for who, rows in one[ahead].items()})
         for ahead in (1, T)

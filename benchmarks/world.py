@@ -34,7 +34,7 @@ from envs.pushing import ObservationDict, PushingEnv
 from envs.robots import ROBOTS
 from envs.scene import FALLEN, Scene
 from envs.tasks import TASKS
-from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, normalised_push
+from envs.workspace import OBJECT_SLOTS, TABLE_HIGH, TABLE_LOW, normalised_push
 
 EPISODE = 20  # pushes after which a new scene is sampled, if it has not ended before
 EVERY = 5  # physics steps between two looks at the objects
@@ -123,7 +123,7 @@ class World:
     def reset(self, number: int) -> tuple[PushingEnv, ObservationDict]:
         """Scene `number`: tasks and 1 to 5 objects take turns."""
         env = self.envs[number % len(self.envs)]
-        env.objects = 1 + number // len(self.envs) % MAXIMUM_OBJECTS
+        env.objects = 1 + number // len(self.envs) % OBJECT_SLOTS
         observation, _ = env.reset(seed=number)
         return env, observation
 

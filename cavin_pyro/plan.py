@@ -13,7 +13,7 @@ def main(config: DictConfig) -> None:
     import copy
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.evaluation.factory import announce_waiting, make_runner
+    from cavin_pyro.evaluation.factory import announce_objects, announce_waiting, make_runner
     from cavin_pyro.evaluation.outlook import outlook_of_episode
     from cavin_pyro.evaluation.success.sentences import sentence_of_episode
     from cavin_pyro.storage.files import output_folder, write_json
@@ -29,6 +29,7 @@ def main(config: DictConfig) -> None:
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
         announce_waiting(config)
+        announce_objects(config)
         row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
         if config.save_goal is not None:
             write_goal(config.save_goal, runner.env.scene)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from envs.segmentation import Pixels
 from envs.sensors import DepthImage
 from envs.sensors.camera import sample_cloud
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT
 
 MINIMUM_PIXELS = 8  # minimum to locate an object
 
 
 @dataclass(frozen=True)
 class Observation:
-    """An observation of the table, padded to `MAXIMUM_OBJECTS` (M) objects.
+    """An observation of the table, padded to M objects.
 
     Attributes:
         clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of each cloud.
@@ -36,17 +36,17 @@ class LatestClouds:
     """The latest point cloud of each of an episode's objects.
 
     Args:
-        generator: samples each cloud's points from its pixels.
+        generator: samples each cloud's points from its pixels. slots: M.
     """
 
-    def __init__(self, generator: np.random.Generator) -> None:
+    def __init__(self, generator: np.random.Generator, slots: int = OBJECT_SLOTS) -> None:
         self._generator = generator
-        self._clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), dtype=np.float32)
-        self._mask = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
+        self._clouds = np.zeros((slots, POINTS_PER_OBJECT, 3), dtype=np.float32)
+        self._mask = np.zeros(slots, dtype=np.bool_)
 
     def update(self, image: DepthImage, found: Sequence[Pixels]) -> Observation:
         """Update with an image and the pixels that each object has in it; the first object is the target."""
-        visible = np.zeros(MAXIMUM_OBJECTS, dtype=np.bool_)
+        visible = np.zeros_like(self._mask)
         for slot, (rows, columns) in enumerate(found):
             if len(rows) >= MINIMUM_PIXELS:
                 points = image.camera.points(image.depth, rows, columns)

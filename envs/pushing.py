@@ -23,7 +23,7 @@ from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
 from envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
 from envs.tasks.contract import check_functions
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, object_slots, tile_center
 
 EPISODE_STEPS = 60
 TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
@@ -36,8 +36,9 @@ ObservationDict = dict[str, NDArray[Any]]
 class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """Push objects on a table until a task's goal is reached, observed by a depth camera from above.
 
-    Observation: `clouds` [5, 256, 3] metres, `centers` [5, 3] metres, `mask` [5] (known objects, object 0 is
-    the target), `visible` [5] (objects in the current image). Action: one push (x, y, dx, dy) in [-1, 1].
+    Observation: `clouds` [M, 256, 3] metres, `centers` [M, 3] metres, `mask` [M] (known objects, object 0 is
+    the target), `visible` [M] (objects in the current image). M is 5, or `objects` if there are more.
+    Action: one push (x, y, dx, dy) in [-1, 1].
 
     `info` of a reset: `steps`, which is 0, and the episode's `task` in its layout and with its goal. `info` of a step:
     `steps` so far, `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable", not
@@ -52,7 +53,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         generated: what is wanted of `layout="generated"`, which is generated at every reset, unless it has a seed.
         reward: dense or sparse. criterion: what ends an episode as a violation, see `envs.tasks.TaskReward`. Scenes and
             observations do not depend on it.
-        objects: how many, 1 to 5. ranges: object parameters.
+        objects: how many, 1 to 10. ranges: object parameters.
         robot: one of `envs.robots.ROBOTS`.
         object_set: a key of `envs.objects.object_sets.OBJECT_SETS`.
         camera, segmentation: see `envs.scene.Scene`.
@@ -112,15 +113,18 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
         self.ranges = ranges or ObjectRanges(names=tuple(dict.fromkeys(map(plain_name, available.names))))
-        self.scene = Scene(camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets)
-        shape = (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
+        slots = object_slots(self.objects)
+        self.scene = Scene(
+            camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets, slots=slots
+        )
+        shape = (slots, POINTS_PER_OBJECT, 3)
         # Gymnasium declares that a Dict space's elements are spaces.
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
             {
                 "clouds": gymnasium.spaces.Box(-10.0, 10.0, shape, np.float32),
-                "centers": gymnasium.spaces.Box(-10.0, 10.0, (MAXIMUM_OBJECTS, 3), np.float32),
-                "mask": gymnasium.spaces.MultiBinary(MAXIMUM_OBJECTS),
-                "visible": gymnasium.spaces.MultiBinary(MAXIMUM_OBJECTS),
+                "centers": gymnasium.spaces.Box(-10.0, 10.0, (slots, 3), np.float32),
+                "mask": gymnasium.spaces.MultiBinary(slots),
+                "visible": gymnasium.spaces.MultiBinary(slots),
             }
         )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)

@@ -9,6 +9,7 @@ import colorsys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from envs.filming import FrameHook, film
 from envs.markings import LEVEL, Place, TileGroup, paint_places, paint_tiles
 from envs.objects.object_sets import BuiltinObjects, ObjectSet
-from envs.objects.sampling import Area, ObjectParameters, ObjectRanges, sample_objects
+from envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
 from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_sample_streams, sensor_stream
@@ -26,7 +27,7 @@ from envs.robots import Stopped, push, robot_maker, settle
 from envs.segmentation import Pixels, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.sensors.camera import Camera
-from envs.workspace import MAXIMUM_OBJECTS, push_endpoints
+from envs.workspace import OBJECT_SLOTS, push_endpoints
 
 MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians
@@ -34,7 +35,12 @@ FALLEN = -0.02  # metres; an object whose centre is lower has left the table
 SCENE_SAMPLES = 50  # scenes sampled, at most, to find an acceptable one
 
 # The target is orange; obstacles are cool colours.
-COLORS = ((0.93, 0.42, 0.10), *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in (0.58, 0.45, 0.72, 0.33)))
+HUES = (0.58, 0.45, 0.72, 0.33)  # of the first obstacles; the others are brighter ones of nearly the same hues
+COLORS = (
+    (0.93, 0.42, 0.10),
+    *(colorsys.hsv_to_rgb(hue, 0.55, 0.75) for hue in HUES),
+    *(colorsys.hsv_to_rgb(hue, 0.30, 0.95) for hue in (*HUES, 0.88)),
+)
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,7 @@ class Scene:
         object_set: the set of the objects' names, by default the builtin shapes.
         on_frame: called a few times during every push, to film it.
         robot: one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
+        slots: M, the objects that observations have room for.
 
     Raises:
         ValueError: unknown camera, segmentation or robot, or its files are missing.
@@ -78,9 +85,11 @@ class Scene:
         on_frame: FrameHook | None = None,
         robot: str = "stick",
         assets: str | Path | None = None,
+        slots: int = OBJECT_SLOTS,
     ) -> None:
         self.sensor = sensor_of(camera)
-        self.segmenter = segmenter_of(segmentation, self.true_masks)
+        self.segmenter = segmenter_of(segmentation, self.true_masks, slots)
+        self.slots = slots
         self.object_set = object_set or BuiltinObjects()
         self._make_robot = robot_maker(robot, assets)
         self.on_frame = on_frame
@@ -116,14 +125,14 @@ class Scene:
             generator: the scene's stream, from which those of objects and points derive (`envs.randomness`).
 
         Raises:
-            ValueError: no such scene was found.
+            NoRoomError: no such scene was found.
         """
         for _ in range(SCENE_SAMPLES):
             scene_generator, point_generator = next_sample_streams(generator)
             observation = self.reset(sample_objects(areas, ranges, scene_generator, self.object_set), point_generator)
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
-        raise ValueError(
+        raise NoRoomError(
             f"no room for {len(areas)} objects: none of {SCENE_SAMPLES} scenes sampled on its start tiles is usable"
         )
 
@@ -131,18 +140,18 @@ class Scene:
         """Build a scene, let it settle, and observe it.
 
         Raises:
-            ValueError: no object, or more than `MAXIMUM_OBJECTS`.
+            ValueError: no object, or more than `slots`.
         """
-        if not 1 <= len(objects) <= MAXIMUM_OBJECTS:
-            raise ValueError(f"a scene holds 1 to {MAXIMUM_OBJECTS} objects, not {len(objects)}")
+        if not 1 <= len(objects) <= self.slots:
+            raise ValueError(f"a scene holds 1 to {self.slots} objects, not {len(objects)}")
         began = time.process_time()
         self.world.reset()
         self.objects = list(objects)
-        self.bodies = [self._add(one, color) for one, color in zip(objects, COLORS, strict=False)]
+        self.bodies = [self._add(one, color) for one, color in zip(objects, cycle(COLORS), strict=False)]
         self.robot = self._make_robot(self.world)
         settle(self.world, self.robot, self.bodies, limit=720)
         self.sensor.reset(sensor_stream(point_generator))
-        self._latest_clouds = LatestClouds(point_generator)
+        self._latest_clouds = LatestClouds(point_generator, self.slots)
         self.seconds["physics"] += time.process_time() - began
         return self._observe(first=True)
 

@@ -25,8 +25,14 @@ TILE_COUNT = (5, 7)  # whole tiles on the table along x and y
 Tile = tuple[int, int]
 """A tile's numbers (i, j) along x and y."""
 
-MAXIMUM_OBJECTS = 5
+MAXIMUM_OBJECTS = 10  # on the table
+OBJECT_SLOTS = 5  # of observations and datasets, M, unless they are for more objects
 POINTS_PER_OBJECT = 256
+
+
+def object_slots(objects: int) -> int:
+    """M, to how many objects observations are padded in scenes of up to `objects`."""
+    return max(OBJECT_SLOTS, objects)
 
 
 def tile_center(tile: tuple[float, float]) -> tuple[float, float]:

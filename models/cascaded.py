@@ -61,7 +61,7 @@ class CascadedModel(Model):
 
         With `generate=True` it reads only the first states; it samples subgoals, actions and next states instead of
         observing them (next states push by push, see `models/transitions.py`). `encoded` is the result of `encode`.
-        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        Raises `ValueError` for windows of another shape or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded
         first = window.first

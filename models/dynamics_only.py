@@ -25,7 +25,7 @@ class DynamicsModel(Model):
 
         With `generate=True` it reads only the first states and the actions, and samples the next states. `encoded` is
         the result of `encode`.
-        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        Raises `ValueError` for windows of another shape or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded
         with windows_plate(window):

@@ -50,7 +50,7 @@ class FlatModel(Model):
         """Run the process for `window: [B]`, a batch of training examples.
 
         With `generate=True` it reads only the first states and samples everything else. `encoded` is the result of
-        `encode`. Raises `ValueError` for windows of another shape, more objects or features of another length.
+        `encode`. Raises `ValueError` for windows of another shape or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded
         first = window.first

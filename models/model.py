@@ -54,10 +54,15 @@ class Model(Program):
         feature_dimension: int = 64,
         width: int = 64,
         maximum_objects: int = 5,
+        neighbours: int | None = None,
         scales: Scales | None = None,
         dynamics: PushOutcome | None = None,
     ) -> None:
-        """T; numbers per object of a point-cloud feature; width of all layers; M at most; the likelihoods' scales; f.
+        """T; numbers per object of a point-cloud feature; width of all layers; objects in a scene of the training, at
+        most; how many others enter a relation; the likelihoods' scales; f.
+
+        A scene may have more than `maximum_objects`. `neighbours`: the nearest others that enter each sum over other
+        objects; None takes `maximum_objects - 1`, which are all others in the scenes of the training, as in the paper.
 
         Raises `ValueError` for scales that f must predict if it does not.
         """
@@ -66,9 +71,11 @@ class Model(Program):
         self.feature_dimension = feature_dimension
         self.width = width
         self.maximum_objects = maximum_objects
+        self.neighbours = maximum_objects - 1 if neighbours is None else neighbours
         self.scales = scales or LikelihoodScales()
-        self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, maximum_objects=maximum_objects)
+        self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, neighbours=self.neighbours)
         self.dynamics: PushOutcome = dynamics or Dynamics(feature_dimension=feature_dimension, width=width)
+        self.dynamics.neighbours = self.neighbours
         if isinstance(self.scales, PredictedScales) and not self.dynamics.predicts_scales:
             raise ValueError("scales=predicted needs an f that predicts them: dynamics=contact")
 
@@ -92,7 +99,7 @@ class Model(Program):
 
         The others are needed by f alone, if it reads them and the next states are observed.
 
-        Raises `ValueError` for windows of another shape, more objects or features of another length.
+        Raises `ValueError` for windows of another shape or features of another length.
         """
         if len(window.batch_shape) != 1:
             raise ValueError(f"windows come as one batch [B]; got leading dimensions {[*window.batch_shape]}")

@@ -27,7 +27,6 @@ from cavin_pyro.storage.geometry import check_fit, geometry_of
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import with_current_keys
 from cavin_pyro.training.factory import data_folders
-from envs.workspace import MAXIMUM_OBJECTS
 from guides.guide import Guide
 from models.model import Model
 from models.networks.geometry import Geometry
@@ -104,7 +103,7 @@ def load_trained(config: DictConfig, name: str) -> Loaded:
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
     geometry = geometry_of(checkpoint, path)
-    check_fit(model, geometry, MAXIMUM_OBJECTS)
+    check_fit(model, geometry)
     windows, segment_length, split = trained_windows(checkpoint, path)
     folders = data_folders(config.data)
     for folder in folders:

@@ -26,7 +26,7 @@ from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
 from envs.scene import PushReport, Scene
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+from envs.workspace import POINTS_PER_OBJECT, object_slots
 
 TIMING_FILE = "timing.csv"
 TIMING_HEADER = "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
@@ -126,7 +126,7 @@ def clutter_area(generator: np.random.Generator) -> Area:
 
 
 def _blank(config: CollectionConfig, scene: Scene) -> Arrays:
-    steps, objects = config.steps, MAXIMUM_OBJECTS
+    steps, objects = config.steps, scene.slots
     arrays: Arrays = {
         "centers": np.zeros((steps + 1, objects, 3), np.float32),
         "clouds": np.zeros((steps + 1, objects, POINTS_PER_OBJECT, 3), np.float16),
@@ -174,6 +174,7 @@ def open_scene(config: CollectionConfig) -> Scene:
             object_set=load_object_set(config.object_set, config.assets),
             camera=config.camera,
             segmentation=config.segmentation,
+            slots=object_slots(config.maximum_objects),
         )
 
 
@@ -185,7 +186,7 @@ def _scene(**parts: Any) -> Scene:
 
 def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str, float]]:
     config, shard = job
-    parts = ("object_set", "assets", "camera", "segmentation")
+    parts = ("object_set", "assets", "camera", "segmentation", "maximum_objects")
     scene = _scene(**{name: getattr(config, name) for name in parts})
     began = time.process_time()
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.declaration import check_file, check_values
-from cavin_pyro.data.sources import check_sources, source_of_shards, sources_of
+from cavin_pyro.data.sources import check_sources, has_possible_objects, source_of_shards, sources_of
 from cavin_pyro.storage.files import atomic_write, read_json, write_json
 from cavin_pyro.storage.run_directory import with_current_keys
+from envs.workspace import MAXIMUM_OBJECTS
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
@@ -80,7 +81,7 @@ def read_shard(
     configuration = (metadata or {}).get("configuration", {})
     try:
         with h5py.File(path, "r") as file:
-            check_file(file, steps=configuration.get("steps"), episodes=configuration.get("episodes_per_shard"))
+            check_file(file, configuration)
             arrays = {name: file[name][()] for name in (names or sorted(file))}
         check_values(arrays)
         return arrays
@@ -135,6 +136,8 @@ def _check_counts(path: Path, metadata: Mapping[str, Any]) -> None:
     steps, each = configuration.get("steps"), configuration.get("episodes_per_shard", 1)
     if not all(type(size) is int and size >= 1 for size in (steps, each)):
         raise UserError(f"{path} is damaged: steps and episodes_per_shard must be whole numbers; collect it again")
+    if not has_possible_objects(configuration):
+        raise UserError(f"{path} is damaged: maximum_objects must be from 1 to {MAXIMUM_OBJECTS}; collect it again")
     shards, episodes, transitions = (metadata[name] for name in ("shards", "episodes", "transitions"))
     wrong = "episodes_per_shard" in configuration and episodes != shards * each
     if wrong or not 0 <= transitions <= episodes * steps:

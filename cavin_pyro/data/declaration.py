@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, object_slots
 
 FARTHEST = 100.0  # metres; the table ends before 1
 MOST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, "F": 4096}  # of each dimension
@@ -18,12 +18,16 @@ MOST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, 
 
 @dataclass(frozen=True)
 class Declared:
-    """An array: its type, its dimensions (E episodes, S pushes, S+1 states, M objects, P points), and its range."""
+    """An array: its type, its dimensions (E episodes, S pushes, S+1 states, M objects, P points), and its range.
+
+    `padding`: its value where there is no object.
+    """
 
     dtype: str
     dimensions: tuple[str | int, ...]
     low: float = -FARTHEST
     high: float = FARTHEST
+    padding: int = 0
 
 
 OBJECTS, PUSHES, STATES = ("E", "M"), ("E", "S"), ("E", "S+1", "M")
@@ -38,7 +42,7 @@ ARRAYS = {
     "length": Declared("int64", ("E",), 0),
     "target": Declared("int8", PUSHES, -1),
     "angle": Declared("float32", PUSHES),
-    "shape": Declared("int8", OBJECTS, -1, 127),
+    "shape": Declared("int8", OBJECTS, -1, 127, padding=-1),
     "scale": Declared("float32", OBJECTS, 0.0),
     "mass": Declared("float32", OBJECTS, 0.0),
     "friction": Declared("float32", OBJECTS, 0.0),
@@ -47,16 +51,19 @@ ARRAYS = {
 }
 
 
-def check_file(file: h5py.File, *, steps: int | None, episodes: int | None) -> None:
+def check_file(file: h5py.File, configuration: Mapping[str, Any]) -> None:
     """Check types and shapes of all declared arrays of a file, before any is read.
 
     Args:
-        steps: S. episodes: E. None if they are not known; the arrays must agree with one another then.
+        configuration: of the collection, which tells S, E and M. What it lacks, the arrays must agree on.
 
     Raises:
         ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
     """
-    sizes = {name: size for name, size in (("E", episodes), ("S", steps)) if size is not None}
+    options = {"E": "episodes_per_shard", "S": "steps", "M": "maximum_objects"}
+    sizes = {name: configuration[option] for name, option in options.items() if option in configuration}
+    if "M" in sizes:
+        sizes["M"] = object_slots(sizes["M"])
     for name in sorted(file, key=lambda one: list(ARRAYS).index(one) if one in ARRAYS else -1):
         array = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
         if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external:
@@ -99,3 +106,19 @@ def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
         low, high = array.min(), array.max()  # NaN if any is
         if not (declared.low <= low and high <= declared.high):
             raise ValueError(f"{name} has values outside of {declared.low:g} to {declared.high:g}: {low:g} to {high:g}")
+
+
+def padded(arrays: Mapping[str, NDArray[Any]], objects: int) -> dict[str, NDArray[Any]]:
+    """Declared arrays of a shard with room for M = `objects`.
+
+    Raises:
+        ValueError: one has room for more.
+    """
+    wider = {}
+    for name, array in arrays.items():
+        sizes = zip(ARRAYS[name].dimensions, array.shape, strict=True)
+        ends = [(0, objects - size if dimension == "M" else 0) for dimension, size in sizes]
+        if np.min(ends) < 0:
+            raise ValueError(f"{name} has room for more than {objects} objects, of which the metadata tell")
+        wider[name] = np.pad(array, ends, constant_values=ARRAYS[name].padding) if np.any(ends) else array
+    return wider

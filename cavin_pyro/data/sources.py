@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.errors import UserError
+from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, object_slots
 
 COUNTS = ("shards", "episodes", "transitions")
 
@@ -30,6 +31,21 @@ def source_of_shards(metadata: Mapping[str, Any]) -> list[int]:
 def seed_of(source: Mapping[str, Any]) -> int:
     """The root seed of a collection; older ones do not tell the default."""
     return source["configuration"].get("seed", 0)
+
+
+def most_objects(configuration: Mapping[str, Any]) -> int:
+    """Objects in an episode of a collection, at most; configurations of older versions may not tell."""
+    return configuration.get("maximum_objects", OBJECT_SLOTS)
+
+
+def slots_of(metadata: Mapping[str, Any]) -> int:
+    """M, for how many objects the files of a dataset have room; of a merged one, the widest."""
+    return max(object_slots(most_objects(source["configuration"])) for source in sources_of(metadata))
+
+
+def has_possible_objects(configuration: Mapping[str, Any]) -> bool:
+    """Whether a collection's largest number of objects is one that a scene can hold."""
+    return type(most_objects(configuration)) is int and 1 <= most_objects(configuration) <= MAXIMUM_OBJECTS
 
 
 def check_sources(path: Path, metadata: Mapping[str, Any]) -> None:
@@ -56,5 +72,6 @@ def _is_source(source: Any) -> bool:
         isinstance(source, dict)
         and isinstance(source.get("configuration"), dict)
         and type(seed_of(source)) is int
+        and has_possible_objects(source["configuration"])
         and all(type(source.get(name)) is int and source[name] >= 1 for name in COUNTS)
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.data.dataset import Arrays, iterate_shards
 from envs.scene import MOVED
-from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, push_endpoints
+from envs.workspace import OBJECT_SLOTS, TABLE_HIGH, TABLE_LOW, push_endpoints
 
 SEGMENT = 3  # pushes; T of the paper
 DISTANCES = np.linspace(0.0, 0.30, 61)  # metres, edges of the histograms; what is farther counts in the last bin
@@ -25,7 +25,7 @@ def _histogram() -> NDArray[np.int64]:
 
 
 def _counts() -> NDArray[np.int64]:
-    return np.zeros(MAXIMUM_OBJECTS + 1, np.int64)
+    return np.zeros(OBJECT_SLOTS + 1, np.int64)
 
 
 def _map() -> NDArray[np.int64]:
@@ -40,7 +40,7 @@ class DataSummary:
         pushes, unsafe, ineffective, fallen: how many pushes were made, and how many of these ended so.
         farthest: [60] pushes by how far the object went that went farthest; `farthest_in_segment`: the same of any
             three pushes in a row, between the centres that the camera saw.
-        objects: [6] episodes by how many objects lie on the table. objects_moved: [6] pushes by how many moved.
+        objects: [M + 1] episodes by how many objects lie on the table. objects_moved: [M + 1] pushes by how many moved.
         observed: [38, 61] observed centres of objects in each cell of the table, 2 cm wide, along x and y; pushed: of
             them, before a push that moved the object; started: pushes by where the tool came down.
     """
@@ -68,8 +68,9 @@ class DataSummary:
 
         moved = np.where(mask[:, None], arrays["moved"], 0.0)  # [E, S, M]
         self.farthest += _by_distance(moved.max(axis=-1)[made])
-        self.objects_moved += np.bincount((moved > MOVED).sum(axis=-1)[made], minlength=MAXIMUM_OBJECTS + 1)
-        self.objects += np.bincount(mask.sum(axis=-1), minlength=MAXIMUM_OBJECTS + 1)
+        slots = mask.shape[-1]
+        self.objects_moved = _added(self.objects_moved, (moved > MOVED).sum(axis=-1)[made], slots)
+        self.objects = _added(self.objects, mask.sum(axis=-1), slots)
 
         there = visible & mask[:, None] & (steps[None] <= arrays["length"][:, None])[..., None]  # [E, S+1, M]
         both = there[:, SEGMENT:] & there[:, :-SEGMENT]
@@ -105,6 +106,12 @@ def summarize_data(folder: Path) -> DataSummary:
     for _, arrays in iterate_shards(folder, ARRAYS, skip_corrupt=True):
         summary.add(arrays)
     return summary
+
+
+def _added(counts: NDArray[np.int64], numbers: NDArray[np.int64], largest: int) -> NDArray[np.int64]:
+    """Counts of the numbers 0 to `largest`, or to more if `counts` go farther, with these numbers."""
+    size = max(len(counts), largest + 1)
+    return np.pad(counts, (0, size - len(counts))) + np.bincount(numbers, minlength=size)
 
 
 def _by_distance(distances: NDArray[np.floating]) -> NDArray[np.int64]:

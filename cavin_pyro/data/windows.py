@@ -17,9 +17,11 @@ from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, check_distinct, iterate_shards, read_metadata
+from cavin_pyro.data.declaration import padded
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.data.mapped import MappedArray
+from cavin_pyro.data.sources import slots_of
 from cavin_pyro.storage.progress import progress_bar
 from models.networks.geometry import Geometry
 from models.state import State, Window
@@ -132,10 +134,11 @@ def load_windows(
         )
     check_distinct(folders)
     total = sum(read_metadata(folder)["shards"] for folder in folders)
+    slots = max(slots_of(read_metadata(folder)) for folder in folders)
     held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
     with (
-        closing(_Finder(config, segment_length, seed, where, storage)) as found,
+        closing(_Finder(config, segment_length, seed, where, slots, storage)) as found,
         progress_bar("reading", total=total, unit="file") as bar,
     ):
         for folder, held_out in zip(folders, held_out_of, strict=True):
@@ -152,9 +155,11 @@ class _Finder:
     """Finds the windows in one shard after another, and holds no more of them than where they start."""
 
     def __init__(
-        self, config: WindowConfig, segment_length: int, seed: int, where: str, storage: Path | None = None
+        self, config: WindowConfig, segment_length: int, seed: int, where: str, slots: int, storage: Path | None = None
     ) -> None:
+        """`slots`: M, that of the dataset with the most objects."""
         self._config, self._length, self._seed, self._where = config, segment_length, seed, where
+        self._slots = slots
         self._turns = np.random.default_rng(seed)
         self._positions = {name: MappedArray(storage) for name in ("centers", "features", "mask", "actions", "counts")}
         self._windows: dict[str, list[NDArray[Any]]] = {"start": [], "counts": [], "episode": [], "validation": []}
@@ -164,7 +169,7 @@ class _Finder:
         """Add the episodes of a shard.
 
         Raises:
-            UserError: they are too short, or not shaped as earlier ones.
+            UserError: they are too short, or not shaped as the metadata say.
         """
         T, config, positions = self._length, self._config, episodes["visible"].shape[1]
         if positions <= T:
@@ -172,6 +177,10 @@ class _Finder:
                 f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
                 f"T={T}: collect with steps of at least that many"
             )
+        try:
+            episodes = padded(episodes, self._slots)
+        except ValueError as error:
+            raise UserError(f"dataset {self._where} is damaged: {error}") from error
         mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
         visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
         counts = _transitions_that_count(episodes, visible, config.maximum_step)
@@ -205,13 +214,8 @@ class _Finder:
 
     def _store(self, **arrays: NDArray[Any]) -> None:
         """Append arrays [E, S+1, ...]: positions in time, episode after episode."""
-        try:
-            for name, array in arrays.items():
-                self._positions[name].append(array.reshape(-1, *array.shape[2:]))
-        except ValueError as error:
-            raise UserError(
-                f"{self._where}: files with different numbers of objects cannot be joined ({error})"
-            ) from error
+        for name, array in arrays.items():
+            self._positions[name].append(array.reshape(-1, *array.shape[2:]))
 
     def close(self) -> None:
         """Close the temporary files; the table keeps what it maps."""

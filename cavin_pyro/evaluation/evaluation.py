@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.factory import EpisodeRunner, announce_waiting, make_runner
+from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.success.prospects import columns_of
@@ -41,6 +41,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     launcher = Launcher(config.launcher, config.workers, config.address)
     if missing:
         announce_waiting(config)
+        announce_objects(config)
     with (
         closing(run_jobs([(config, seed) for seed in missing], launcher)) as finished,
         progress_bar("evaluating", total=len(seeds), initial=len(seeds) - len(missing), unit="episode") as bar,

@@ -25,9 +25,10 @@ from cavin_pyro.evaluation.success.probability import NO_PROBABILITY, Probabilit
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from envs.layouts import GENERATED, RANDOM
+from envs.objects.sampling import NoRoomError
 from envs.pushing import PushingEnv
 from envs.tasks import GeneratedLayouts, Task
-from envs.workspace import MAXIMUM_OBJECTS
+from envs.workspace import OBJECT_SLOTS
 from models.model import Model
 from models.networks.geometry import Geometry
 from models.priors.flow import FlowPrior
@@ -65,8 +66,8 @@ class EpisodeRunner:
         """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`.
 
         Raises:
-            UserError: an optimizer of the user's own breaks the interface of optimizers, or the model predicts nothing
-                finite.
+            UserError: an optimizer of the user's own breaks the interface of optimizers, the model predicts nothing
+                finite, or the scene of this seed has no room for its objects.
         """
         parts = self.env, self.planner, self.geometry
         usual = {"pushes_per_plan": self.pushes_per_plan, "device": self.device, "probability": self.probability}
@@ -75,6 +76,8 @@ class EpisodeRunner:
             return rollout(*parts, seed=seed, **options)
         except (OptimizerError, NoFiniteCandidateError) as error:
             raise UserError(str(error)) from error
+        except NoRoomError as error:
+            raise UserError(f"seed={seed}: {error}") from error
 
 
 def check_options(config: DictConfig, device: torch.device) -> None:
@@ -119,6 +122,25 @@ def announce_waiting(config: DictConfig) -> None:
     target = str((planner.get("optimizer") or {}).get("_target_", "")).rpartition(".")[2]
     if target in SLOW_OPTIMIZERS:
         print(f"planner.optimizer={target}: a plan takes about twice as long as with Shooting", file=sys.stderr)
+
+
+def announce_objects(config: DictConfig) -> None:
+    """Say on standard error, before the first plan, that scenes have more objects than those of the model's training.
+
+    Raises:
+        UserError: a checkpoint that cannot be used.
+    """
+    if config.planner.model_free:
+        return
+    path = find_checkpoint(config.checkpoint)
+    model = load_checkpoint(path, trust=list(config.trust)).config["model"]
+    trained, near = model.get("maximum_objects", OBJECT_SLOTS), model.get("neighbours")
+    if config.objects > trained:
+        print(
+            f"objects={config.objects}: checkpoint {path} was trained with at most {trained}; in its relations, each "
+            f"object has its {trained - 1 if near is None else near} nearest",
+            file=sys.stderr,
+        )
 
 
 def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
@@ -169,9 +191,6 @@ def make_planner(
         return construct(options), geometry
     if "model" not in checkpoint.config:
         raise UserError(f"checkpoint {path} holds no model: give one that train has written")
-    known = checkpoint.config["model"].get("maximum_objects", MAXIMUM_OBJECTS)
-    if config.objects > known:
-        raise UserError(f"objects={config.objects}, but checkpoint {path} knows at most {known}: use objects={known}")
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = build_model(checkpoint.config)
     checkpoint.load_into("model", model, path)

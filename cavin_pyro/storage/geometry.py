@@ -15,8 +15,8 @@ from models.networks.pointnet import PointNet
 POINTNET = "models.networks.pointnet.PointNet"
 
 
-def check_fit(model: Model, geometry: Geometry, objects: int) -> None:
-    """Check that a model takes these features and this number of objects.
+def check_fit(model: Model, geometry: Geometry, objects: int | None = None) -> None:
+    """Check that a model takes these features, and says that it is trained on scenes of up to `objects`.
 
     Raises:
         UserError: it does not.
@@ -30,8 +30,11 @@ def check_fit(model: Model, geometry: Geometry, objects: int) -> None:
         )
     if model.feature_dimension != features:
         raise UserError(f"model.feature_dimension={model.feature_dimension}, but the {name}'s features have {features}")
-    if model.maximum_objects < objects:
-        raise UserError(f"model.maximum_objects={model.maximum_objects}, but datasets have room for {objects}")
+    if objects is not None and model.maximum_objects < objects:
+        raise UserError(
+            f"model.maximum_objects={model.maximum_objects}, but datasets have room for {objects}: "
+            f"pass model.maximum_objects={objects}"
+        )
 
 
 def chosen_geometry(config: Config) -> tuple[Geometry, dict[str, Any]]:

@@ -15,7 +15,8 @@ from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
-from cavin_pyro.data.dataset import content_records
+from cavin_pyro.data.dataset import content_records, read_metadata
+from cavin_pyro.data.sources import slots_of
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.storage.checkpoint import save_checkpoint, verify_checkpoint
 from cavin_pyro.storage.files import output_folder, write_json
@@ -25,7 +26,6 @@ from cavin_pyro.storage.run_directory import check_same_data, check_same_run, wr
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.factory import build_objective, data_folders
 from cavin_pyro.training.trainer import Trainer, fixed_windows
-from envs.workspace import MAXIMUM_OBJECTS
 
 DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
 
@@ -52,8 +52,8 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     guide = build_guide(config, model)
     objective = build_objective(config, model)
     geometry, origin = chosen_geometry(config)
-    check_fit(model, geometry, MAXIMUM_OBJECTS)
     data = data_folders(config.data)
+    check_fit(model, geometry, max(slots_of(read_metadata(folder)) for folder in data))
     windows = load_windows(
         data,
         geometry,

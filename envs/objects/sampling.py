@@ -19,6 +19,10 @@ from envs.workspace import TABLE_HIGH, TABLE_LOW
 ATTEMPTS = 400  # arrangements sampled before an area counts as too small
 
 
+class NoRoomError(ValueError):
+    """A layout has no room for the objects of a scene, at least of this one."""
+
+
 @dataclass(frozen=True)
 class ObjectRanges:
     """Ranges from which object parameters are sampled, uniformly.
@@ -74,7 +78,7 @@ def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Genera
     """Planar positions [M, 2] in metres, one in each area, no two closer than `clearance`.
 
     Raises:
-        ValueError: no arrangement was found.
+        NoRoomError: no arrangement was found.
     """
     for _ in range(ATTEMPTS):
         chosen: list[NDArray[np.float64]] = []
@@ -89,7 +93,7 @@ def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Genera
             chosen.append(free[0])
         if len(chosen) == len(areas):
             return np.stack(chosen)
-    raise ValueError(
+    raise NoRoomError(
         f"no room for {len(areas)} objects at least {clearance:g} m apart where the layout starts them: "
         "use fewer objects, more start tiles, or a smaller env.ranges.clearance"
     )
@@ -108,7 +112,7 @@ def sample_objects(
             one.
 
     Raises:
-        ValueError: the areas are too small for so many objects, or an unknown name.
+        NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
     """
     objects = objects or BuiltinObjects()
     names = chosen(ranges.names, objects)

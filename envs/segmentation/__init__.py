@@ -7,22 +7,23 @@ from collections.abc import Callable
 from envs.segmentation.clusters import ClusterSegmenter
 from envs.segmentation.mask import MaskSegmenter, TrueMasks
 from envs.segmentation.segmenter import Pixels, Segmenter
+from envs.workspace import OBJECT_SLOTS
 
-SEGMENTERS: dict[str, Callable[[TrueMasks], Segmenter]] = {
-    "mask": MaskSegmenter,
-    "clusters": lambda true_masks: ClusterSegmenter(),  # which does not use the simulator's masks
+SEGMENTERS: dict[str, Callable[..., Segmenter]] = {  # from the simulator's masks and M
+    "mask": lambda true_masks, slots=OBJECT_SLOTS: MaskSegmenter(true_masks),  # the scene's objects and no others
+    "clusters": lambda true_masks, slots=OBJECT_SLOTS: ClusterSegmenter(slots),  # which does not use the masks
 }
 
 
-def segmenter_of(segmentation: str, true_masks: TrueMasks) -> Segmenter:
-    """The segmenter of that name.
+def segmenter_of(segmentation: str, true_masks: TrueMasks, slots: int = OBJECT_SLOTS) -> Segmenter:
+    """The segmenter of that name, which finds at most `slots` objects.
 
     Raises:
         ValueError: unknown name.
     """
     if segmentation not in SEGMENTERS:
         raise ValueError(f"unknown segmentation {segmentation!r}: choose from {', '.join(SEGMENTERS)}")
-    return SEGMENTERS[segmentation](true_masks)
+    return SEGMENTERS[segmentation](true_masks, slots)
 
 
 __all__ = ["SEGMENTERS", "ClusterSegmenter", "MaskSegmenter", "Pixels", "Segmenter", "TrueMasks", "segmenter_of"]

@@ -15,16 +15,17 @@ from envs.segmentation.regions import AROUND, box_around, find_regions, split_at
 from envs.segmentation.segmenter import Pixels
 from envs.segmentation.tracking import Track, begin_track, follow_tracks
 from envs.sensors.sensor import DepthImage
-from envs.workspace import MAXIMUM_OBJECTS
+from envs.workspace import OBJECT_SLOTS
 
 CLICK = 8  # cells, tolerance of the person who points at the target
 NO_PIXELS: Pixels = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
 class ClusterSegmenter:
-    """Finds objects by clustering the points above the table."""
+    """Finds objects by clustering the points above the table, at most `slots` of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, slots: int = OBJECT_SLOTS) -> None:
+        self._slots = slots
         self._tracks: list[Track | None] = []
 
     def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
@@ -37,7 +38,7 @@ class ClusterSegmenter:
         regions = find_objects(heights)
         first = _confirmed(regions, image, target)
         others = [region for number, region in enumerate(regions) if number != first]
-        kept = [None if first is None else regions[first], *others][:MAXIMUM_OBJECTS]
+        kept = [None if first is None else regions[first], *others][: self._slots]
         self._tracks = [None if region is None else begin_track(region, heights) for region in kept]
         return pixels_of(kept, heights)
 

@@ -16,8 +16,8 @@ Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
 class Segmenter(Protocol):
     """Finds the objects in an episode's first image, and tracks them in later ones.
 
-    The result has the pixels of one object per entry, at most `MAXIMUM_OBJECTS` of them. An object
-    keeps its place in the list throughout the episode; the first is the target. An object out of sight has no pixels.
+    The result has the pixels of one object per entry, at most M of them. An object keeps its place in the list
+    throughout the episode; the first is the target. An object out of sight has no pixels.
     """
 
     def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:

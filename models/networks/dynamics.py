@@ -70,12 +70,14 @@ class PushOutcome(nn.Module, ABC):
 
     Attributes:
         geometry: the class of geometric features that it can read, None for any. reads_encoding: whether it needs the
-            state encoder's features. predicts_scales: whether `outcome` has scales.
+            state encoder's features. predicts_scales: whether `outcome` has scales. neighbours: how many other objects
+        may enter an object's relations, the nearest; None for all. The model sets it.
     """
 
     geometry: ClassVar[type[Geometry] | None] = None
     reads_encoding: ClassVar[bool] = True
     predicts_scales: ClassVar[bool] = False
+    neighbours: int | None = None
 
     def forward(self, state: State, encoded: Tensor | None, action: Tensor) -> State:
         """The mean: `state: [...]`, its features `encoded: [..., M, 3 * width]`, `action: [..., 4]` -> `[...]`."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.networks.layers import fully_connected, relative_positions
+from models.networks.neighbours import neighbours
 from models.state import State
 
 
@@ -20,13 +21,15 @@ class StateEncoder(nn.Module):
     geometric_i = FC(feature_i)
     relation_i  = sum over other real objects j of FC(FC(center_j - center_i))
 
-    Equivariant to the order of objects; padding does not affect the features of real objects.
+    Of more than `neighbours` others the nearest enter the sum. Equivariant to the order of objects; padding does not
+    affect the features of real objects.
     """
 
-    def __init__(self, *, feature_dimension: int = 64, width: int = 64, maximum_objects: int = 5) -> None:
+    def __init__(self, *, feature_dimension: int = 64, width: int = 64, neighbours: int | None = None) -> None:
+        """`neighbours`: None sums over all others, as in the paper."""
         super().__init__()
         self.feature_dimension = feature_dimension
-        self.maximum_objects = maximum_objects
+        self.neighbours = neighbours
         self.spatial = fully_connected(3, width)
         self.geometric = fully_connected(feature_dimension, width)
         self.difference = nn.Linear(3, width)
@@ -35,10 +38,8 @@ class StateEncoder(nn.Module):
     def forward(self, state: State) -> Tensor:
         """`state: [...]` of `M` objects -> `[..., M, 3 * width]`.
 
-        Raises `ValueError` for more objects than `maximum_objects`, or features of another length.
+        Raises `ValueError` for features of another length.
         """
-        if state.objects > self.maximum_objects:
-            raise ValueError(f"state has {state.objects} objects; this model knows at most {self.maximum_objects}")
         if state.features.shape[-1] != self.feature_dimension:
             raise ValueError(
                 f"features have {state.features.shape[-1]} numbers per object; "
@@ -49,9 +50,9 @@ class StateEncoder(nn.Module):
         # The layer is linear in the difference: W p_j - (W p_i - b) takes M products instead of M squared.
         others = functional.linear(positions, self.difference.weight)
         own = others - self.difference.bias
-        related = [  # cyclic shifts visit all pairs of different objects
-            self.relation((others.roll(-shift, -2) - own).relu_()) * state.mask.roll(-shift, -1).unsqueeze(-1)
-            for shift in range(1, state.objects)
+        related = [
+            self.relation((other.of(others) - own).relu_()) * other.real.unsqueeze(-1)
+            for other in reversed(neighbours(state.centers, state.mask, self.neighbours))
         ]
         relations = reduce(add, related) if related else torch.zeros_like(spatial)
         return torch.cat((spatial, self.geometric(state.features), relations), -1)

@@ -165,6 +165,15 @@ def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_ep
     assert refused.returncode == 2 and refused.stderr == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
 
 
+def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:
+    few = ("--objects", "2", "6", "--neighbours", "4", "9", "--repetitions", "1")
+    _, *rows = run("many_objects", *few, "--options", "planner.samples=8", "planner.horizon=6").splitlines()
+    assert [row.split()[:2] for row in rows] == [["2", "4"], ["6", "4"], ["6", "9"]]
+    for row in rows:
+        milliseconds, moved, _, apart, _, _ = row.split()[2:]
+        assert float(milliseconds) > 0 and 0 < float(moved) < 6 and 0 < float(apart) < 20
+
+
 def test_the_simulator_takes_the_place_of_f() -> None:
     small = ["planner.samples=8", "planner.horizon=3", "maximum_steps=4"]
     lines = run("oracle", "--episodes", "1", "--objects", "2", "--candidates", "2", "--seed", "5", *small).splitlines()
@@ -234,7 +243,8 @@ def test_rows_of_networks_are_counted_for_every_planner_of_a_method() -> None:
 
 
 def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -> None:
-    printed = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", "--picture", str(tmp_path / "a.png"))
+    options = ("--objects", "3", "6", "--neighbours", "4", "--picture", str(tmp_path / "a.png"))
+    printed = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", *options)
     one_push, three_pushes = printed.split("after 3 pushes")
     means = {}
     for part in (one_push, three_pushes):

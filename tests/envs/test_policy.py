@@ -13,7 +13,7 @@ from envs.observation import Observation
 from envs.policy import NEAR, NOISE, SPREAD, START_CLEARANCE, HeuristicPushingPolicy
 from envs.robots import STICK_RADIUS
 from envs.scene import Scene
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
+from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
 
 SEEDS = st.integers(0, 2**32 - 1)
 REACHABLE: Area = (((0.40, -0.40), (0.70, 0.40)),)
@@ -23,7 +23,7 @@ def blobs(seed: int, count: int = 3) -> Observation:
     """Discs of 3 cm radius within reach, with room between them: what a camera could see."""
     generator = np.random.default_rng(seed)
     places = [(x, y) for x in (0.42, 0.60) for y in (-0.40, -0.15, 0.10, 0.35)]
-    clouds = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float32)
+    clouds = np.zeros((OBJECT_SLOTS, POINTS_PER_OBJECT, 3), np.float32)
     for slot, place in enumerate(generator.permutation(places)[:count]):
         angle, radius = (
             generator.uniform(0, 2 * np.pi, POINTS_PER_OBJECT),
@@ -32,12 +32,12 @@ def blobs(seed: int, count: int = 3) -> Observation:
         clouds[slot, :, 0] = place[0] + radius * np.cos(angle)
         clouds[slot, :, 1] = place[1] + radius * np.sin(angle)
         clouds[slot, :, 2] = 0.03
-    mask = np.arange(MAXIMUM_OBJECTS) < count
+    mask = np.arange(OBJECT_SLOTS) < count
     return Observation(clouds, clouds.mean(axis=1), mask, mask)
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=SEEDS, count=st.integers(1, MAXIMUM_OBJECTS))
+@given(seed=SEEDS, count=st.integers(1, OBJECT_SLOTS))
 def test_pushes_start_clear_of_every_object(seed: int, count: int) -> None:
     observed = blobs(seed, count)
     policy = HeuristicPushingPolicy(np.random.default_rng(seed))

@@ -76,6 +76,17 @@ def test_gymnasium_finds_nothing_wrong(task: str) -> None:
     env.close()
 
 
+@pytest.mark.parametrize(("objects", "slots"), [(3, 5), (5, 5), (6, 6), (10, 10)])
+def test_observations_have_room_for_five_objects_or_for_all_that_there_are(objects: int, slots: int) -> None:
+    env = gymnasium.make("cavin/Crossing-v0", objects=objects)
+    assert env.observation_space["clouds"].shape == (slots, 256, 3)
+    observed, _ = env.reset(seed=10000)
+    assert observed["mask"].tolist() == observed["visible"].tolist() == [1] * objects + [0] * (slots - objects)
+    if objects == 10:
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
 def test_environments_can_be_stepped_side_by_side() -> None:
     envs = gymnasium.make_vec("cavin/Insertion-v0", num_envs=2, vectorization_mode="sync", objects=2)
     observed, _ = envs.reset(seed=0)
@@ -323,9 +334,9 @@ def test_a_layout_may_be_a_number_or_a_file_or_belong_to_a_task_that_has_been_bu
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"objects": 0}, r"^objects must be a whole number from 1 to 5, not 0$"),
-        ({"objects": 6}, r"^objects must be a whole number from 1 to 5, not 6$"),
-        ({"objects": 2.5}, r"^objects must be a whole number from 1 to 5, not 2.5$"),
+        ({"objects": 0}, r"^objects must be a whole number from 1 to 10, not 0$"),
+        ({"objects": 11}, r"^objects must be a whole number from 1 to 10, not 11$"),
+        ({"objects": 2.5}, r"^objects must be a whole number from 1 to 10, not 2.5$"),
         ({"maximum_steps": 0}, r"^maximum_steps must be at least 1, not 0$"),
         ({"render_mode": "human"}, r"^unknown render_mode 'human': choose rgb_array or None$"),
         ({"task": "juggling"}, rf"^unknown task 'juggling': choose from {KNOWN_TASKS}$"),

@@ -15,10 +15,10 @@ from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from envs.objects.shapes import BUILTIN_NAMES
 from envs.physics import PhysicsWorld
 from envs.robots import OFF_STAGE, SETTLED_SPEED, STICK_RADIUS
-from envs.scene import MOVED, TURNED, PushReport, Scene
+from envs.scene import COLORS, MOVED, TURNED, PushReport, Scene
 from envs.sensors import IdealSensor
 from envs.sensors.camera import Camera
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, push_endpoints
+from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
 
 ROOT = Path(__file__).parents[2]
 REACHABLE: Area = (((0.40, -0.35), (0.70, 0.35)),)
@@ -61,7 +61,7 @@ def history(scene: Scene, seed: int, pushes: int = 4) -> list[np.ndarray]:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_sampled_scene_has_settled_on_the_table(scene: Scene, seed: int) -> None:
     (sampling, _) = generators(seed)
-    count = 1 + seed % MAXIMUM_OBJECTS
+    count = 1 + seed % OBJECT_SLOTS
     observed = scene.sample([WHOLE_TABLE] * count, RANGES, sampling)
     assert scene.world.fastest(scene.bodies) < SETTLED_SPEED
     before = truth(scene)
@@ -69,7 +69,7 @@ def test_a_sampled_scene_has_settled_on_the_table(scene: Scene, seed: int) -> No
     for _ in range(240):
         scene.world.step()
     np.testing.assert_allclose(truth(scene)[:, :3], before[:, :3], atol=0.003)
-    assert observed.mask.tolist() == observed.visible.tolist() == [True] * count + [False] * (MAXIMUM_OBJECTS - count)
+    assert observed.mask.tolist() == observed.visible.tolist() == [True] * count + [False] * (OBJECT_SLOTS - count)
 
 
 @pytest.mark.parametrize("name", BUILTIN_NAMES)
@@ -214,7 +214,7 @@ def test_a_fallen_object_keeps_its_latest_cloud(scene: Scene, put: Callable, pus
 
 def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scene, put: Callable) -> None:
     observed = scene.reset([put("mug", 0.5, 0.2), put("banana", 0.6, -0.2)], np.random.default_rng(0))
-    assert observed.clouds.shape == (MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3)
+    assert observed.clouds.shape == (OBJECT_SLOTS, POINTS_PER_OBJECT, 3)
     assert observed.clouds.dtype == observed.centers.dtype == np.float32
     np.testing.assert_allclose(observed.centers, observed.clouds.mean(axis=1), atol=1e-6)
     assert not observed.clouds[2:].any() and not observed.centers[2:].any()
@@ -278,6 +278,25 @@ def test_only_acceptable_scenes_are_sampled(scene: Scene) -> None:
 def test_a_scene_holds_one_to_five_objects(scene: Scene, put: Callable, count: int) -> None:
     with pytest.raises(ValueError, match=rf"^a scene holds 1 to 5 objects, not {count}$"):
         scene.reset([put("rubiks_cube", 0.3 + 0.1 * n, 0.0) for n in range(count)], np.random.default_rng(0))
+
+
+def test_a_scene_with_more_slots_holds_more_objects_each_of_its_colour(put: Callable) -> None:
+    crowded = Scene(slots=12)
+    objects = [put("rubiks_cube", 0.35 + 0.12 * (n % 4), -0.2 + 0.2 * (n // 4)) for n in range(11)]
+    observed = crowded.reset(objects, np.random.default_rng(0))
+    assert observed.visible.tolist() == observed.mask.tolist() == [True] * 11 + [False]
+    assert observed.clouds.shape == (12, POINTS_PER_OBJECT, 3)
+    assert len(set(COLORS)) == MAXIMUM_OBJECTS
+    crowded.close()
+
+
+@pytest.mark.parametrize("seed", [10000, 10001])
+def test_clusters_find_ten_objects(seed: int) -> None:
+    crowded = Scene(segmentation="clusters", slots=10)
+    observed = crowded.sample([WHOLE_TABLE] * 10, RANGES, np.random.default_rng(seed))
+    offset = np.linalg.norm(observed.centers[:, None, :2] - crowded.ground_truth().positions[None, :, :2], axis=-1)
+    assert offset.min(axis=1).max() < 0.04
+    crowded.close()
 
 
 def test_a_photograph_shows_an_orange_target(scene: Scene, put: Callable) -> None:

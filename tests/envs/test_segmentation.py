@@ -63,7 +63,7 @@ def test_the_cluster_segmenter_gets_only_the_depth_and_the_camera() -> None:
     names = set(DepthImage.__dataclass_fields__)
     assert names == {"depth", "camera"}
     assert list(inspect.signature(ClusterSegmenter.follow).parameters) == ["self", "image"]
-    assert not inspect.signature(ClusterSegmenter).parameters
+    assert list(inspect.signature(ClusterSegmenter).parameters) == ["slots"]
 
     def betray() -> list:
         raise AssertionError("the simulator was asked")

@@ -8,7 +8,7 @@ from typing import Any
 from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import WorldConfig, collection_world
 from cavin_pyro.config.options import option, seed_option
-from envs.workspace import MAXIMUM_OBJECTS
+from envs.workspace import OBJECT_SLOTS
 
 
 @dataclass
@@ -28,7 +28,11 @@ class CollectionOptions:
         0.3, "fraction of pushes with a perturbed start", minimum=0, maximum=1, group="data"
     )
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
-    maximum_objects: int = option(MAXIMUM_OBJECTS, "objects on the table, at most", group="data")
+    maximum_objects: int = option(
+        OBJECT_SLOTS,
+        f"objects on the table, at most; with more than {OBJECT_SLOTS} the files have room for so many",
+        group="data",
+    )
     episodes_per_shard: int = option(
         50, "episodes per file, the unit of resuming", minimum=1, group="data", limit=10_000
     )

@@ -16,11 +16,11 @@ import numpy as np
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
-from cavin_pyro.data.declaration import ARRAYS
-from cavin_pyro.data.sources import seed_of, source_of_shards, sources_of
+from cavin_pyro.data.declaration import ARRAYS, padded
+from cavin_pyro.data.sources import seed_of, slots_of, source_of_shards, sources_of
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+from envs.workspace import POINTS_PER_OBJECT
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Dict
@@ -62,7 +62,7 @@ def export(folder: Path, target: Path) -> int:
         try:
             storage = MinariStorage.new(
                 partial,
-                observation_space=observation_space(),
+                observation_space=observation_space(slots_of(read_metadata(folder))),
                 action_space=_box((4,), np.float32, 1.0),
                 data_format="hdf5",
             )
@@ -83,15 +83,15 @@ def export(folder: Path, target: Path) -> int:
     return count
 
 
-def observation_space() -> Dict:
-    """What an observation is, M objects and P points each."""
+def observation_space(slots: int) -> Dict:
+    """What an observation is, M = `slots` objects and P points each."""
     from gymnasium import spaces
 
-    flags = spaces.MultiBinary(MAXIMUM_OBJECTS)
+    flags = spaces.MultiBinary(slots)
     return spaces.Dict(
         {
-            "centers": _box((MAXIMUM_OBJECTS, 3), np.float32),
-            "clouds": _box((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float16),
+            "centers": _box((slots, 3), np.float32),
+            "clouds": _box((slots, POINTS_PER_OBJECT, 3), np.float16),
             "visible": flags,
             "mask": flags,
         }
@@ -112,7 +112,8 @@ def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
     seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
     names = tuple(name for name in ARRAYS if name != "features")
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
-        for number, arrays in iterate_shards(folder, names):
+        for number, shard in iterate_shards(folder, names):
+            arrays = padded(shard, slots_of(metadata))
             for index in range(len(arrays["length"])):
                 options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}
                 options |= {name: arrays[name][index] for name in OBJECTS}

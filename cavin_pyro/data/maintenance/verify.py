@@ -67,7 +67,7 @@ def _damage(path: Path, names: tuple[str, ...], metadata: Mapping[str, Any], arr
         return
     try:
         with h5py.File(path, "r") as file:
-            check_file(file, steps=configuration.get("steps"), episodes=configuration.get("episodes_per_shard"))
+            check_file(file, configuration)
             for name in names:
                 try:
                     array = file[name][()]

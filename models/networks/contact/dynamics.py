@@ -12,6 +12,7 @@ from models.networks.contact.objects import PAIR_MEASURES, pair_contact
 from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, ToolContact, endpoints
 from models.networks.dynamics import PushOutcome
 from models.networks.layers import fully_connected, relative_positions
+from models.networks.neighbours import nearest_pairs
 from models.networks.outline import (
     FEATURES,
     HEIGHTS,
@@ -44,8 +45,8 @@ class ContactDynamics(PushOutcome):
     change of shape_i, its scale = linear of FC(FC(the same of i)): layers of their own, because 64 numbers of shape
     outweigh three of motion in the likelihood
 
-    Both changes are turned back. It takes no features of the state encoder. Equivariant to the order of objects;
-    padding does not change and does not affect other objects.
+    Of more than `neighbours` others the nearest enter relation_i. Both changes are turned back. It takes no features of
+    the state encoder. Equivariant to the order of objects; padding does not change and does not affect other objects.
     """
 
     typical: Tensor  # [2 K + 1]
@@ -140,7 +141,13 @@ class ContactDynamics(PushOutcome):
             own, other = (layer(each).unflatten(0, (objects, -1)) for layer in (self.own, self.other))
             hidden = hidden.unflatten(0, (objects, objects - 1, -1)) + own.unsqueeze(1)
             hidden = (hidden.flatten(0, 1) + other.index_select(0, second)).relu_()
-            related = self.relation(hidden) * real.expand(batch).index_select(0, second).flatten(1).unsqueeze(-1)
+            counts = real.expand(batch).index_select(0, second)
+            if self.neighbours is not None and objects - 1 > self.neighbours:
+                near = nearest_pairs(
+                    place.movedim((0, 1), (-1, -2)), real.expand(batch).movedim(0, -1), self.neighbours
+                )
+                counts = counts * near.movedim((-2, -1), (0, 1)).flatten(0, 1).index_select(0, pairs)
+            related = self.relation(hidden) * counts.flatten(1).unsqueeze(-1)
             relation = related.unflatten(0, (objects, -1)).sum(1).flatten(0, 1)
         after = self.head(self.second(torch.cat((alone, relation), -1)))
         return torch.cat((motion, torch.zeros_like(motion))) + _unflat(after, batch)

@@ -74,7 +74,6 @@ def spoil_checkpoints(folder: Path, good: Path) -> None:
     save("no_pointnet", without="pointnet")
     save_model("width", width=16)
     save_model("segment_length", segment_length=5)
-    save_model("few_objects", maximum_objects=2)
     save_model("untrusted", scales={"_target_": "numpy.save", "_args_": ["written.npy", 0]})
     save_model("smuggled", scales={"_target_": "models.networks.pointnet.torch.save", "_args_": [0, "written.pt"]})
 

@@ -39,7 +39,7 @@ SPOILT: dict[str, tuple[Callable[[Arrays], None], str]] = {
     "an episode fewer": (replaced("actions", lambda one: one[1:]), r"actions has shape \[3, 6, 4\], not \[4, 6, 4\]"),
     "a push fewer": (replaced("actions", lambda one: one[:, 1:]), r"actions has shape \[4, 5, 4\], not \[4, 6, 4\]"),
     "an object fewer": (replaced("mask", lambda one: one[:, 1:]), r"mask has shape \[4, 4\], not \[4, 5\]"),
-    "flat": (replaced("centers", np.ravel), r"centers has shape \[420\], not \[4, 7, 'M', 3\]"),
+    "flat": (replaced("centers", np.ravel), r"centers has shape \[420\], not \[4, 7, 5, 3\]"),
     "another type": (replaced("actions", lambda one: one.astype(np.float64)), "actions has type float64, not float32"),
     "numbers for flags": (replaced("mask", lambda one: one.astype(np.int64)), "mask has type int64, not bool"),
     "text": (replaced("actions", lambda one: one.astype("S8")), r"actions has type \|S8, not float32"),

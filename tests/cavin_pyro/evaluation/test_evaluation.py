@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import episode_row, evaluate
-from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
+from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import (
     OUTCOMES,
     Episode,
@@ -247,14 +248,42 @@ def test_every_builtin_layout_has_room_for_five_objects(task: str, layout: int, 
     assert len(runner.env.scene.objects) == 5
 
 
-def test_a_checkpoint_that_knows_fewer_objects_is_refused(
-    configure: Any, small: SimpleNamespace, tmp_path: Path
+@pytest.mark.parametrize("task", ["insertion", "clearing"])
+def test_more_start_tiles_make_room_for_ten_objects(task: str, configure: Any) -> None:
+    tiles = {  # as in docs/how-to/plan-with-many-objects.md
+        "insertion": "[" + ",".join(f"[{i},{j}]" for i in (1, 2, 3) for j in (2, 3, 4, 5, 6)) + "]",
+        "clearing": "[" + ",".join(f"[{i},{j}]" for i in (0, 1, 2) for j in (2, 3, 4, 5)) + "]",
+    }
+    runner = parts(
+        make_runner(configure("planner=random", f"task={task}", "objects=10", f"tiles.obstacle_start={tiles[task]}"))
+    )
+    assert len(runner.env.scene.objects) == 10
+
+
+def test_a_checkpoint_runs_with_more_objects_than_it_was_trained_with_and_says_so(
+    configure: Any, small: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = small.config()
-    config["model"]["maximum_objects"] = 2
-    path = tmp_path / "two.safetensors"
+    config["model"]["maximum_objects"] = 3
+    path = tmp_path / "three.safetensors"
     save_checkpoint(path, parts=small.parts(), config=config, provenance={})
-    parts(make_runner(configure(f"checkpoint={path}", "objects=2")))
-    with pytest.raises(UserError, match=r"objects=3, but checkpoint .*two\.safetensors knows at most 2: use objects=2"):
-        make_runner(configure(f"checkpoint={path}", "objects=3"))
-    parts(make_runner(configure(f"checkpoint={path}", "objects=3", "planner=random")))  # which asks no model
+    for objects, lines in ((3, 0), (8, 1)):
+        options = configure(*fast(f"checkpoint={path}", f"objects={objects}", "maximum_steps=1"))
+        announce_objects(options)
+        told = capsys.readouterr().err
+        assert told.count("\n") == lines
+        runner = make_runner(options)
+        assert runner.rollout(10000).plan_records[0].plan.subgoals.centers.shape[-2] == objects
+        runner.env.close()
+    assert f"objects=8: checkpoint {path} was trained with at most 3; in its relations, each object has its 2" in told
+    assert runner.planner.model.encoder.neighbours == runner.planner.model.dynamics.neighbours == 2
+    announce_objects(configure(f"checkpoint={path}", "objects=8", "planner=random"))  # which asks no model
+    assert not capsys.readouterr().err
+
+
+def test_a_later_scene_without_room_ends_the_run_in_one_line(configure: Any) -> None:
+    runner = make_runner(configure("planner=random", "task=clearing", "layout=1", "objects=8"))
+    runner.env.ranges = replace(runner.env.ranges, clearance=1.0)
+    with pytest.raises(UserError, match=r"^seed=7: no room for 8 objects at least 1 m apart"):
+        runner.rollout(7)
+    runner.env.close()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from envs.goals import Goal, assign
 from envs.goals.assignment import SHAPE_WEIGHT, outlines
 from envs.observation import Observation
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT
 
 # Half length, half width and height in metres of a book, a can and a cube.
 BOOK, CAN, CUBE = (0.09, 0.06, 0.03), (0.035, 0.035, 0.12), (0.03, 0.03, 0.06)
@@ -39,9 +39,9 @@ def goal(*clouds: np.ndarray) -> Goal:
 
 
 def observed(*clouds: np.ndarray) -> Observation:
-    padded = np.zeros((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float32)
+    padded = np.zeros((OBJECT_SLOTS, POINTS_PER_OBJECT, 3), np.float32)
     padded[: len(clouds)] = clouds
-    mask = np.arange(MAXIMUM_OBJECTS) < len(clouds)
+    mask = np.arange(OBJECT_SLOTS) < len(clouds)
     return Observation(padded, padded.mean(axis=1), mask, mask)
 
 

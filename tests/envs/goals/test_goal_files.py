@@ -100,7 +100,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "shape": ("goal.safetensors", save({"clouds": CLOUDS[:, :9].copy()}), r"must hold clouds"),
     "type": ("goal.safetensors", save({"clouds": CLOUDS.astype(np.float64)}), r"must hold clouds"),
     "none": ("goal.safetensors", save({"clouds": CLOUDS[:0].copy()}), r"shows no objects on the table$"),
-    "six": ("goal.safetensors", save({"clouds": CLOUDS.repeat(3, axis=0)}), r"shows 6 objects, .* at most 5$"),
+    "many": ("goal.safetensors", save({"clouds": CLOUDS.repeat(6, axis=0)}), r"shows 12 objects, .* at most 10$"),
     "beside": ("goal.safetensors", save({"clouds": 2.0 * CLOUDS}), r"shows an object beside the table$"),
     "nan": ("goal.safetensors", save({"clouds": np.nan * CLOUDS}), r"holds points that are not finite$"),
     "large": ("goal.safetensors", bytes(LARGEST + 1), r"has over \d+ bytes$"),

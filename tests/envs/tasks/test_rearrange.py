@@ -189,7 +189,7 @@ def test_pictures_show_a_disc_in_the_colour_of_each_object(env: PushingEnv) -> N
         ({"places": [["a", 2]]}, r"places: a point is two numbers"),
         ({"places": [[float("nan"), 0.1]]}, r"places: \[nan, 0\.1\] is off the table"),
         ({"places": [[0.1, 0.1]]}, r"places: \[0\.1, 0\.1\] is off the table, from \[0\.22, -0\.61\] to"),
-        ({"places": [[0.5, 0.1]] * 6}, r"places must be at most 5 points, not 6$"),
+        ({"places": [[0.5, 0.1]] * 11}, r"places must be at most 10 points, not 11$"),
         ({"goal": [[1, 2]]}, r"goal must be the path of a file, not \[\[1, 2\]\]$"),
         ({"goal": "nowhere.png"}, r"goal nowhere\.png cannot be read: No such file or directory$"),
         ({"clearance": -1}, r"clearance must be at least 0 metres, not -1$"),

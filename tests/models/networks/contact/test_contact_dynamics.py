@@ -127,3 +127,25 @@ def test_features_that_are_no_outlines_are_refused(random_state: Callable[..., S
     with pytest.raises(ValueError, match="dynamics=contact reads outlines with 64 numbers, not 32"):
         ContactDynamics(feature_dimension=32)
     assert standard_features(torch.zeros(63))[-1] == 1
+
+
+def test_only_the_nearest_others_matter_if_there_are_more_than_neighbours() -> None:
+    f, state, action = loud(), doubled(scene(1, objects=3)), torch.rand(1, 4).double()
+    f.neighbours = 1
+    state.centers[0, :, 0] = torch.tensor([0.4, 0.45, 0.6])
+    state.centers[0, :, 1] = 0.0
+    near = f(state, None, action).centers[:, :2]
+    state.centers[0, 2, 1] += 0.05
+    assert torch.allclose(f(state, None, action).centers[:, :2], near, atol=1e-12)
+    order = torch.tensor([2, 0, 1])
+    shuffled = f(State(*(field[:, order] for field in state)), None, action).centers
+    assert torch.allclose(shuffled, f(state, None, action).centers[:, order], atol=1e-10)
+    f.neighbours = None
+    assert not torch.allclose(f(state, None, action).centers[:, :2], near, atol=1e-6)
+
+
+def test_with_as_many_neighbours_as_others_nothing_changes() -> None:
+    f, state, action = loud(), doubled(scene(3, objects=5, real=4)), torch.rand(3, 4).double()
+    every = f(state, None, action).centers
+    f.neighbours = 4
+    assert torch.equal(f(state, None, action).centers, every)
