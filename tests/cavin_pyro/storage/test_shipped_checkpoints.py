@@ -29,6 +29,14 @@ CALIBRATED = {  # SHA-256 of the file as trained, and of its weights without the
         "594c5e6860ddf3f0c3474ed19895b2b878d2637dc546f1bdfabb43d3ffa34ca7",
         "043e7dab882b99190463df479cd205bec1575fb00dcb0b9a8725ab3afae03837",
     ),
+    "kinect": (
+        "1d79f0c190296dd1b3571cf4d55114d2132d89af4416b0c3548b6cc1b0628866",
+        "b632ef08d1143567451e2432eb5bc05d3e16adb53ef0b93f84418aa27f3e0583",
+    ),
+    "held_out": (
+        "9cb69ccc66f7534bb6c0c6eca8b9e30d82afeada3b8f624de10238b74921204d",
+        "f06c98cd2547865cc5b6ed4799578430407ebcf6c31a2ba106065f6ed38a4138",
+    ),
 }
 
 
