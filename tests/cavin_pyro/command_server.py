@@ -25,13 +25,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.core.plugins import Plugins
 from matplotlib.figure import Figure
 from PIL import Image
 
+from cavin_pyro.config.composition import check_overrides
 from tests.cavin_pyro.faults.forked_stages import fork_stages
 
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
+    "cavin_pyro.config.output",
+    "cavin_pyro.criticism.export",
+    "cavin_pyro.criticism.graph",
     "cavin_pyro.criticism.loading",
     "cavin_pyro.criticism.recalibration.run",
     "cavin_pyro.criticism.report",
@@ -40,13 +45,20 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.evaluation.comparison",
     "cavin_pyro.evaluation.evaluation",
     "cavin_pyro.reproduction.episodes.picture",
+    "cavin_pyro.reproduction.merging",
+    "cavin_pyro.reproduction.pipeline",
     "cavin_pyro.reproduction.results",
     "cavin_pyro.training.pretraining",
     "cavin_pyro.training.run",
     "cavin_pyro.visualization.data_summary",
     "cavin_pyro.visualization.rendering",
     "cavin_pyro.visualization.training",
-    "torch._dynamo",  # which torch's optimizers import
+    "guides.cascaded",
+    "hydra._internal.logging_config",
+    "imageio.plugins.ffmpeg",
+    "models.cascaded",
+    "pandas",  # by pyarrow, which writes tables
+    "torch._dynamo",  # by torch's optimizers
 )
 LIMIT = 300  # seconds per job
 
@@ -54,6 +66,7 @@ LIMIT = 300  # seconds per job
 def main() -> None:
     for name in IMPORTED:
         importlib.import_module(name)
+    _warm_up()
     gc.freeze()  # so that children's collections neither look at all of this nor copy it
     for line in sys.stdin:
         child = os.fork()
@@ -62,6 +75,13 @@ def main() -> None:
             return
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+def _warm_up() -> None:
+    """Fill what libraries cache for the whole process: Hydra's plugins, `inspect`'s modules and Pillow's formats."""
+    Plugins.instance()
+    check_overrides("evaluate", ["workers=1"])
+    Image.init()
 
 
 def run(job: dict[str, Any]) -> None:

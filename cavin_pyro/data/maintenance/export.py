@@ -55,7 +55,8 @@ def export(folder: Path, target: Path) -> int:
         raise UserError(f"--to {target} must end in a name and a version, as Minari wants: --to {target}-v0")
     read_metadata(folder)
     with output_folder(target):
-        written, partial = target / "data", target / ".data.partial"
+        # Absolute, because Minari takes the size of what it has written from the path joined with itself.
+        written, partial = target.resolve() / "data", target.resolve() / ".data.partial"
         if written.exists():
             raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
         shutil.rmtree(partial, ignore_errors=True)  # of a killed run

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from cavin_pyro.storage.provenance import provenance
 from tests.cavin_pyro.faults.commands import SUBJECTS, fast_folder
 from tests.cavin_pyro.faults.plan import plans, singles
 from tests.cavin_pyro.faults.report import table
@@ -55,7 +56,7 @@ def _soak(trials: Trials, arguments: argparse.Namespace) -> int:
         trials.unbroken(name)
     calls = {name: trials.calls[name] for name in arguments.commands}
     print(f"{sum(map(len, calls.values()))} calls, {singles(calls)} faults one at a time; then two in a trial")
-    happened = sum(len(row["ends"]) for row in rows)
+    happened, revision = sum(len(row["ends"]) for row in rows), provenance()["revision"]
     with (
         tqdm(desc="faults", total=arguments.count, initial=happened, unit=" faults") as bar,
         open(arguments.log, "a", encoding="utf-8") as log,
@@ -66,14 +67,15 @@ def _soak(trials: Trials, arguments: argparse.Namespace) -> int:
             if (name, *map(str, faults)) in done:
                 continue
             outcome = trials.run(name, faults)
-            row = {"command": name, "faults": list(map(str, faults)), **vars(outcome)}
+            row = {"command": name, "faults": list(map(str, faults)), **vars(outcome), "revision": revision}
             rows.append(row)
             happened += len(outcome.ends)
             print(json.dumps(row), file=log, flush=True)
             bar.update(len(outcome.ends))
             if outcome.wrong:
                 bar.write(f"{REPLAY} {name} {' '.join(row['faults'])}\n  " + "\n  ".join(outcome.wrong))
-    print(f"\n{happened} faults in {len(rows)} trials\n\n{table(rows)}")
+    revisions = ", ".join(dict.fromkeys(row["revision"][:7] for row in rows))
+    print(f"\n{happened} faults in {len(rows)} trials at {revisions}\n\n{table(rows)}")
     return sum(bool(row["wrong"]) for row in rows)
 
 

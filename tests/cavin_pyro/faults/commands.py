@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.cavin_pyro.faults.shim import LIMIT, Fault, armed, build
+from tests.cavin_pyro.faults.shim import LIMIT, Call, Fault, armed, build
 from tests.cavin_pyro.shell import ENVIRONMENT, ROOT, Answer
 
 EPISODES = "checkpoint=run/checkpoint.safetensors planner.samples=4 planner.horizon=3 objects=1 pushes_per_plan=null"
@@ -22,6 +22,7 @@ TRAINING = (
     "trainer.validate_every=2 trainer.batch_size=8 windows.minimum_move=0.005 windows.validation_fraction=0.3"
 )
 SECTIONS = "sections=[elbo,predictive] windows=5 sizes.predictive.replicates=2"
+CALIBRATION = "steps=2 batch_size=8 windows=5 samples=2"
 REPRODUCTION = "scale=minimal methods=[mpc] planners=[paper] workers=1"
 
 
@@ -30,8 +31,10 @@ class Subject:
     """A command that meets faults.
 
     Attributes:
-        inputs: folders of other subjects that it needs. output: the folder where it writes.
-        begun: what an earlier run of the same command has left in `output`, to save time.
+        inputs: folders that it needs, of other subjects or of `DATA`. output: the folder where it writes.
+        begun: what an earlier run of the same command has left in `output`, to save time. stage: the folder in
+            `output` that it does next, where its faults happen; without one they happen anywhere but in `begun`.
+        once: whether it refuses a folder that holds its whole result.
     """
 
     command: str
@@ -39,11 +42,19 @@ class Subject:
     output: str
     inputs: tuple[str, ...] = ()
     begun: tuple[str, ...] = ()
+    stage: str = ""
+    once: bool = False
 
     @property
     def words(self) -> list[str]:
         """The command's options."""
-        return [*self.overrides.split(), f"output={self.output}"]
+        return [*self.overrides.split(), *(("--to", self.output) if self.once else (f"output={self.output}",))]
+
+    def meets(self, call: Call) -> bool:
+        """Whether faults of this subject happen at a call."""
+        if self.stage:
+            return call.name.startswith(f"{self.output}/{self.stage}/")
+        return not any(call.name.startswith(f"{self.output}/{one}/") for one in self.begun)
 
 
 SUBJECTS = {
@@ -55,9 +66,29 @@ SUBJECTS = {
     "check": Subject(
         "check", f"checkpoint=run/checkpoint.safetensors data=pushes {SECTIONS}", "criticism", ("pushes", "run")
     ),
-    "reproduce": Subject("reproduce", REPRODUCTION, "reproduction", begun=("data",)),
+    "calibrate": Subject(
+        "calibrate", f"checkpoint=run/checkpoint.safetensors data=pushes {CALIBRATION}", "calibrated", ("pushes", "run")
+    ),
+    "merge": Subject("data", "merge pushes others", "merged", ("pushes", "others"), once=True),
+    "export": Subject("data", "export others", "exported-v0", ("others",), once=True),
+    # By its stages, so that a trial does only what comes after the fault.
+    "reproduce-pretrain": Subject("reproduce", REPRODUCTION, "reproduction", begun=("data",), stage="pretrain"),
+    "reproduce-train": Subject("reproduce", REPRODUCTION, "reproduction", begun=("data", "pretrain"), stage="train"),
+    "reproduce-evaluate": Subject(
+        "reproduce", REPRODUCTION, "reproduction", begun=("data", "pretrain", "train"), stage="evaluate"
+    ),
+    "reproduce-results": Subject(
+        "reproduce", REPRODUCTION, "reproduction", begun=("data", "pretrain", "train", "evaluate")
+    ),
 }
-DATA = Subject("collect", "transitions=40 steps=4 episodes_per_shard=5 workers=1 seed=3", "pushes")
+PUSHES = "steps=4 episodes_per_shard=5 workers=1"
+DATA = {  # what subjects need that no other subject makes, by its folder
+    "pushes": (Subject("collect", f"transitions=40 {PUSHES} seed=3", "pushes"),),
+    "others": (
+        Subject("collect", f"transitions=20 {PUSHES} seed=4", "others"),
+        Subject("train", TRAINING.replace("data=pushes", "data=others"), "unneeded", ("features",)),  # for the features
+    ),
+}
 
 
 class Commands:

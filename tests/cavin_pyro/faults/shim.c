@@ -69,7 +69,8 @@ __attribute__((constructor)) static void begin(void) {
 }
 
 static void label(const char *path, char *into, size_t size) {
-    /* The path within the folder, with * for what differs from run to run: random digits, and times and processes. */
+    /* The path within the folder, with * for what differs from run to run: random digits, times and processes, and the
+       number of a file without a name. */
     snprintf(into, size, "%s", path + strlen(folder));
     for (char *found = into; (found = strstr(found, ".cavin-")); found += 8) {
         char *digits = found + strlen(".cavin-");
@@ -77,6 +78,8 @@ static void label(const char *path, char *into, size_t size) {
     }
     char *rest = strstr(into, ".tfevents.");
     if (rest) strcpy(rest + strlen(".tfevents."), "*");
+    rest = strrchr(into, '#');
+    if (rest && strstr(rest, " (deleted)")) strcpy(rest, "*");
 }
 
 /* What happens to this call. */

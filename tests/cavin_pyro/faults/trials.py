@@ -50,29 +50,33 @@ class Trials:
 
     def unbroken(self, name: str) -> dict[str, Any]:
         """What a subject's folder holds after a run that met no fault."""
-        if name not in self._whole:
-            subject = SUBJECTS[name]
+        subject = SUBJECTS[name]
+        record = self.home / f"{subject.output}.calls"  # the same for all stages of a command
+        if subject.output not in self._whole:
             for needed in subject.inputs:
                 self._make(needed)
-            folder, record = self.home / "unbroken" / name, self.home / f"{name}.calls"
+            folder = self.home / "unbroken" / name
             self._run_whole(subject, prepare(folder, subject, self.home / "made", whole=True), record)
-            done = tuple(f"{subject.output}/{one}/" for one in subject.begun)
-            self.calls[name] = [call for call in recorded(record)[0] if not call.name.startswith(done or "/")]
-            self._whole[name] = results(folder)
-            shutil.copytree(folder / subject.output, self.home / "made" / subject.output, dirs_exist_ok=True)
+            self._whole[subject.output] = results(folder)
+            shutil.copytree(folder / subject.output, self.home / "made" / subject.output)
             shutil.rmtree(folder)
-        return self._whole[name]
+        if name not in self.calls:
+            self.calls[name] = [call for call in recorded(record)[0] if subject.meets(call)]
+        return self._whole[subject.output]
 
     def _make(self, output: str) -> None:
         """What other subjects need."""
         if (self.home / "made" / output).exists():
             return
-        if output != DATA.output:
+        if output not in DATA:
             self.unbroken(next(name for name, subject in SUBJECTS.items() if subject.output == output))
             return
         folder = self.home / "made"
         folder.mkdir(exist_ok=True)
-        self._run_whole(DATA, folder, self.home / "data.calls")
+        for subject in DATA[output]:
+            for needed in subject.inputs:
+                self._make(needed)
+            self._run_whole(subject, folder, self.home / "data.calls")
 
     def _run_whole(self, subject: Subject, folder: Path, record: Path) -> None:
         answer = self.commands.run(subject, folder, None, record)
@@ -93,7 +97,7 @@ class Trials:
                     outcome.ends.append(end)
             _age(folder)
             answer = self.commands.run(subject, folder, None, home / "record")
-            if answer.status or answer.complaints:
+            if not succeeded(subject, answer):
                 outcome.wrong.append(f"the run after it ended with {answer.status}: {' / '.join(answer.complaints)}")
             else:
                 outcome.wrong += compared(folder, whole)
@@ -106,7 +110,7 @@ class Trials:
         answer = self.commands.run(subject, folder, fault, record)
         _, happened = recorded(record)
         if not happened:
-            if answer.status or answer.complaints:
+            if not succeeded(subject, answer):
                 wrong.append(f"without {fault} the run ended with {answer.status}: {' / '.join(answer.complaints)}")
             return None
         end = ending(answer)
@@ -134,6 +138,13 @@ def ending(answer: Answer) -> str:
         return "survived"
     one_line = len(answer.complaints) == 1 and answer.complaints[0].startswith("error: ")
     return "said" if answer.status in (1, 2) and one_line else "said badly"
+
+
+def succeeded(subject: Subject, answer: Answer) -> bool:
+    """Whether a run without a fault did its work, or had nothing left to do."""
+    if subject.once and answer.status == 2 and len(answer.complaints) == 1:
+        return f"{subject.output} holds a dataset already" in answer.complaints[0]
+    return not answer.status and not answer.complaints
 
 
 def expected_ends(subject: Subject, fault: Fault) -> tuple[str, ...]:

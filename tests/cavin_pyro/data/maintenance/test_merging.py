@@ -48,6 +48,16 @@ def test_the_files_are_those_of_the_sources(merged: Path, own_pushes: Path, othe
     assert metadata["configuration"]["camera"] == "ideal"
 
 
+def test_half_written_files_of_a_killed_merge_are_cleared_away_among_features_too(
+    data: Callable, own_pushes: Path, other_pushes: Path, tmp_path: Path
+) -> None:
+    features = tmp_path / "both" / "features-0123456789ab"
+    features.mkdir(parents=True)
+    (features / ".episodes-00000.cavin-0123abcd.partial.h5").touch()
+    assert data("merge", own_pushes, other_pushes, "--to", tmp_path / "both")[0] == 0
+    assert not list(features.iterdir())
+
+
 def test_a_merged_dataset_verifies_and_describes_itself(merged: Path, data: Callable) -> None:
     assert data("verify", merged)[0] == 0
     assert "3 (12 episodes), 4 (6 episodes)" in data("info", merged)[1]

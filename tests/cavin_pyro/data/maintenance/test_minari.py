@@ -58,6 +58,14 @@ def test_minari_loads_every_episode(
         assert dataset.action_space.contains(episode.actions[0])
 
 
+def test_the_folder_may_be_relative(
+    minari: Any, data: Callable, pushes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert data("export", pushes, "--to", "pushes-v0") == (0, "12 episodes in pushes-v0\n", "")
+    assert [path.name for path in (tmp_path / "pushes-v0").iterdir()] == ["data"]
+
+
 def test_a_result_is_not_overwritten_and_has_a_name_that_minari_takes(
     minari: Any, data: Callable, pushes: Path, tmp_path: Path
 ) -> None:
