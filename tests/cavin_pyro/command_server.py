@@ -4,11 +4,13 @@ Reads jobs, a line of JSON each, and prints the exit status of each. A job has `
 and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder, or
 `cases`, which run in turn in one process, each from its own `folder`, with their answers as JSON in `output`.
 With `file_limit`, no file can grow beyond so many bytes; after `limit` seconds a job ends by SIGALRM. With `faults`, a
-part of the environment, the disk fails at a chosen call (faults/shim.py), and stages of `reproduce` are forked as well.
+part of the environment, the disk fails at a chosen call (faults/shim.py), stages of `reproduce` are forked as well, and
+nothing is composed that an earlier such job has composed.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import gc
@@ -20,16 +22,18 @@ import resource
 import runpy
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra.core.plugins import Plugins
 from matplotlib.figure import Figure
 from PIL import Image
 
 from cavin_pyro.config.composition import check_overrides
+from tests.cavin_pyro.faults.composed import Composed
 from tests.cavin_pyro.faults.forked_stages import fork_stages
 
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
@@ -67,14 +71,20 @@ def main() -> None:
     for name in IMPORTED:
         importlib.import_module(name)
     _warm_up()
-    gc.freeze()  # so that children's collections neither look at all of this nor copy it
+    composed = Composed()
     for line in sys.stdin:
+        gc.freeze()  # so that children's collections neither look at all of this nor copy it
         child = os.fork()
         if not child:
-            run(json.loads(line))
+            job = json.loads(line)
+            if "faults" in job:
+                composed.use()
+                run_and_end(job)
+            run(job)
             return
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
+        composed.learn()
 
 
 def _warm_up() -> None:
@@ -100,7 +110,7 @@ def run(job: dict[str, Any]) -> None:
             raise RuntimeError(f"the disk cannot fail so: {job['faults']}")
         Figure.savefig = save_blank  # how pictures reach the disk is tested, not what they show
         if job["command"] == "reproduce":
-            fork_stages(run)
+            fork_stages(run_and_end)
     if "cases" in job:
         sys.path[0] = ""  # the folder of each case
         print(json.dumps([run_case(**case) for case in job["cases"]]))
@@ -108,6 +118,28 @@ def run(job: dict[str, Any]) -> None:
     sys.path[0] = job["folder"]  # as `python -m` has it
     sys.argv = [job["command"], *job["overrides"]]
     runpy.run_module(f"cavin_pyro.{job['command']}", run_name="__main__", alter_sys=True)
+
+
+def run_and_end(job: dict[str, Any]) -> NoReturn:
+    """Run a job and end this process without taking the interpreter apart, which would copy all of the server's memory.
+
+    What the job has left is collected, and what is to be done at the end is done: of Python and of C libraries.
+    """
+    status: Any = 0
+    try:
+        run(job)
+    except SystemExit as stop:
+        status = stop.code
+    except BaseException:
+        status = 1
+        traceback.print_exc()
+    threading._shutdown()  # type: ignore[attr-defined]  # waits for threads
+    atexit._run_exitfuncs()
+    gc.collect()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    ctypes.CDLL(None).exit(status if isinstance(status, int) else int(status is not None))
+    raise AssertionError
 
 
 def save_blank(figure: Figure, target: Any, **_: Any) -> None:

@@ -5,9 +5,11 @@ Minari is an optional extra, imported here alone.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +18,11 @@ import numpy as np
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
-from cavin_pyro.data.declaration import ARRAYS, padded
-from cavin_pyro.data.sources import seed_of, slots_of, source_of_shards, sources_of
+from cavin_pyro.data.declaration import ARRAYS
+from cavin_pyro.data.sources import seed_of, source_of_shards, sources_of
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
-from envs.workspace import POINTS_PER_OBJECT
+from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Dict
@@ -61,22 +63,23 @@ def export(folder: Path, target: Path) -> int:
             raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
         shutil.rmtree(partial, ignore_errors=True)  # of a killed run
         try:
-            storage = MinariStorage.new(
-                partial,
-                observation_space=observation_space(slots_of(read_metadata(folder))),
-                action_space=_box((4,), np.float32, 1.0),
-                data_format="hdf5",
-            )
-            storage.update_metadata(
-                {
-                    "dataset_id": target.resolve().name,
-                    "minari_version": minari.__version__,
-                    "algorithm_name": "heuristic pushing policy",
-                    "description": DESCRIPTION,
-                    "cavin_pyro": {**read_metadata(folder), "exported_by": f"cavin_pyro {__version__}"},
-                }
-            )
-            storage.update_episodes(_episodes(folder))
+            with _one_error_of_the_disk(partial / "main_data.hdf5", written):
+                storage = MinariStorage.new(
+                    partial,
+                    observation_space=observation_space(),
+                    action_space=_box((4,), np.float32, 1.0),
+                    data_format="hdf5",
+                )
+                storage.update_metadata(
+                    {
+                        "dataset_id": target.resolve().name,
+                        "minari_version": minari.__version__,
+                        "algorithm_name": "heuristic pushing policy",
+                        "description": DESCRIPTION,
+                        "cavin_pyro": {**read_metadata(folder), "exported_by": f"cavin_pyro {__version__}"},
+                    }
+                )
+                storage.update_episodes(_episodes(folder))
             count = storage.total_episodes
             partial.rename(written)
         finally:
@@ -84,15 +87,48 @@ def export(folder: Path, target: Path) -> int:
     return count
 
 
-def observation_space(slots: int) -> Dict:
-    """What an observation is, M = `slots` objects and P points each."""
+@contextmanager
+def _one_error_of_the_disk(file: Path, result: Path) -> Iterator[None]:
+    """Raise what HDF5 tells of a disk that refuses as the error of the system behind it, and let it give the file up.
+
+    HDF5 keeps a file open that it could not write, tries again when the process ends, and crashes if it still cannot.
+
+    Args:
+        file: what HDF5 writes. result: named in the error.
+
+    Raises:
+        OSError: HDF5 or the system could not write.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        number = re.search(r"errno = (\d+)", str(error))
+        _write_into_nothing(file)
+        if number is None and not (isinstance(error, OSError) and error.errno):
+            raise
+        code = int(number[1]) if number else error.errno  # type: ignore[union-attr]
+        raise OSError(code, os.strerror(code), str(result)) from error
+
+
+def _write_into_nothing(file: Path) -> None:
+    """Let every descriptor of this process on a file lead to no file."""
+    own, nothing = file.stat() if file.exists() else None, os.open(os.devnull, os.O_RDWR)
+    for descriptor in map(int, os.listdir("/dev/fd")):
+        with suppress(OSError):  # that of the listing itself
+            if own is not None and os.path.samestat(os.fstat(descriptor), own):
+                os.dup2(nothing, descriptor)
+    os.close(nothing)
+
+
+def observation_space() -> Dict:
+    """What an observation is, M objects and P points each."""
     from gymnasium import spaces
 
-    flags = spaces.MultiBinary(slots)
+    flags = spaces.MultiBinary(MAXIMUM_OBJECTS)
     return spaces.Dict(
         {
-            "centers": _box((slots, 3), np.float32),
-            "clouds": _box((slots, POINTS_PER_OBJECT, 3), np.float16),
+            "centers": _box((MAXIMUM_OBJECTS, 3), np.float32),
+            "clouds": _box((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float16),
             "visible": flags,
             "mask": flags,
         }
@@ -113,8 +149,7 @@ def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
     seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
     names = tuple(name for name in ARRAYS if name != "features")
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
-        for number, shard in iterate_shards(folder, names):
-            arrays = padded(shard, slots_of(metadata))
+        for number, arrays in iterate_shards(folder, names):
             for index in range(len(arrays["length"])):
                 options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}
                 options |= {name: arrays[name][index] for name in OBJECTS}

@@ -6,14 +6,14 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NoReturn
 
 
-def fork_stages(run: Callable[[dict[str, Any]], None]) -> None:
+def fork_stages(run: Callable[[dict[str, Any]], NoReturn]) -> None:
     """Let `reproduce` start its stages by a process that is forked now, before threads begin; that ends with this one.
 
     Args:
-        run: what a stage's process does with its job, as in the command server.
+        run: what a stage's process does with its job, and ends, as in the command server.
     """
     from cavin_pyro.reproduction import stages
 
@@ -26,7 +26,6 @@ def fork_stages(run: Callable[[dict[str, Any]], None]) -> None:
                 child = os.fork()
                 if not child:
                     run(json.loads(line))
-                    raise SystemExit
                 _, status = os.waitpid(child, 0)
                 os.write(theirs[1], f"{os.waitstatus_to_exitcode(status)}\n".encode())
         os._exit(0)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,20 @@ def test_the_folder_may_be_relative(
     monkeypatch.chdir(tmp_path)
     assert data("export", pushes, "--to", "pushes-v0") == (0, "12 episodes in pushes-v0\n", "")
     assert [path.name for path in (tmp_path / "pushes-v0").iterdir()] == ["data"]
+
+
+@pytest.mark.parametrize("kilobytes", [2, 20, 60])
+def test_a_disk_that_is_full_ends_an_export_in_one_line(
+    minari: Any, shell: SimpleNamespace, pushes: Path, tmp_path: Path, kilobytes: int
+) -> None:
+    """HDF5 writes again what it could not when the process ends, and crashes if it cannot then."""
+    answer = shell.run_command(
+        "data", "export", str(pushes), "--to", "out-v0", folder=tmp_path, file_limit=kilobytes * 1024
+    )
+    (line,) = answer.complaints
+    assert answer.status == 2
+    assert line.startswith("error: the disk refused to store results at out-v0/data: File too large")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_result_is_not_overwritten_and_has_a_name_that_minari_takes(
