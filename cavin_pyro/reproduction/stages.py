@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from cavin_pyro.config.errors import UserError, WorkerError
 from cavin_pyro.launching.workers import killed_by
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import Scale
+from cavin_pyro.storage.files import output_folder
 
 COLLECTING_SECONDS = 0.03  # per transition and core, for the time left
 PRETRAINING_SECONDS = 300.0
@@ -142,6 +144,9 @@ def run_stages(stages: Sequence[Stage], workers: int, progress: Callable[[], Non
         UserError: one has failed; those that run go on to their end, others do not begin.
         KeyboardInterrupt: also by SIGTERM or SIGHUP; those that run are interrupted as well.
     """
+    for stage in stages:
+        if stage.finished:
+            _tidy(stage.folder)
     processes: list[subprocess.Popen[bytes]] = []
     with ThreadPoolExecutor(workers) as pool:
         running = {pool.submit(stage.run, processes.append) for stage in stages if not stage.finished}
@@ -157,6 +162,12 @@ def run_stages(stages: Sequence[Stage], workers: int, progress: Callable[[], Non
             pool.shutdown(cancel_futures=True, wait=False)
             _end(processes, running)
             raise
+
+
+def _tidy(folder: Path) -> None:
+    """Delete the lock and what is half-written, if a stage was killed after its last file and will not begin again."""
+    with suppress(UserError), output_folder(folder):  # unless it has not ended yet
+        pass
 
 
 def _end(processes: Sequence[subprocess.Popen[bytes]], running: Iterable[Future[None]]) -> None:

@@ -17,6 +17,7 @@ import gc
 import importlib
 import io
 import json
+import multiprocessing
 import os
 import resource
 import runpy
@@ -26,6 +27,7 @@ import threading
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 from hydra.core.plugins import Plugins
@@ -33,6 +35,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from cavin_pyro.config.composition import check_overrides
+from cavin_pyro.launching import workers
 from tests.cavin_pyro.faults.composed import Composed
 from tests.cavin_pyro.faults.forked_stages import fork_stages
 
@@ -109,6 +112,8 @@ def run(job: dict[str, Any]) -> None:
         if ctypes.CDLL(None).fault_arm() != 0:
             raise RuntimeError(f"the disk cannot fail so: {job['faults']}")
         Figure.savefig = save_blank  # how pictures reach the disk is tested, not what they show
+        fork = multiprocessing.get_context("fork")  # workers without a new interpreter each, too
+        workers.multiprocessing = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda _: fork})
         if job["command"] == "reproduce":
             fork_stages(run_and_end)
     if "cases" in job:

@@ -11,7 +11,7 @@ from cavin_pyro.config import composition
 
 
 class Composed:
-    """Remembers what forks have composed, so that later forks begin with it: composing only reads, and draws nothing."""
+    """Remembers what forks have composed, so that later forks begin with it: composing only reads."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, ...], DictConfig] = {}

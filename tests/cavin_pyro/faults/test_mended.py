@@ -19,6 +19,7 @@ from cavin_pyro.data.features import ABANDONED_SECONDS, geometry_fingerprint, sh
 from cavin_pyro.reproduction import pipeline
 from cavin_pyro.reproduction.cells import evaluations
 from cavin_pyro.reproduction.scales import SCALES
+from cavin_pyro.reproduction.stages import Stage, run_stages
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import ScalarLog
 from cavin_pyro.visualization import video
@@ -132,6 +133,13 @@ def test_half_written_features_are_cleared_away_when_no_training_can_be_writing_
     os.utime(old, (past, past))
     shard_features(own_pushes, 0, geometry, fingerprint)
     assert {path.name for path in folder.iterdir()} == {"episodes-00000.h5", young.name}
+
+
+def test_a_stage_that_was_killed_after_its_last_file_keeps_its_results_alone(tmp_path: Path) -> None:
+    for name in ("training.png", ".lock", ".metrics.cavin-0123abcd.partial.csv"):
+        (tmp_path / name).touch()
+    run_stages([Stage("train", (), tmp_path, "training.png", 1.0)], 1, lambda: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["training.png"]
 
 
 def test_the_configuration_of_a_cell_is_complete_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

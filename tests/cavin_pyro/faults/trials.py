@@ -148,10 +148,10 @@ def succeeded(subject: Subject, answer: Answer) -> bool:
 
 
 def expected_ends(subject: Subject, fault: Fault) -> tuple[str, ...]:
-    """How a run may end. A killed stage of `reproduce`, or a killed ffmpeg, is told by the command that started it."""
+    """How a run may end. A killed stage of `reproduce`, ffmpeg or worker is told by the command that started it."""
     if fault.kind not in KILLS:
         return ("said", "survived")
-    with_others = subject.command == "reproduce" or fault.call.name.endswith(".mp4")
+    with_others = subject.command == "reproduce" or fault.call.name.endswith((".mp4", ".hdf5"))
     return ("killed", "said", "survived") if with_others else ("killed",)
 
 
