@@ -46,11 +46,12 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
         closing(run_jobs([(config, seed) for seed in missing], launcher)) as finished,
         progress_bar("evaluating", total=len(seeds), initial=len(seeds) - len(missing), unit="episode") as bar,
     ):
+        successes = sum(row["outcome"] == "success" for row in rows.values())
         for _, row in finished:
             rows[row["seed"]] = row
             append(folder, row)
             bar.update()
-            successes = sum(one["outcome"] == "success" for one in rows.values())
+            successes += row["outcome"] == "success"
             bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
     return [rows[seed] for seed in seeds]
 

@@ -151,8 +151,8 @@ def expected_ends(subject: Subject, fault: Fault) -> tuple[str, ...]:
     """How a run may end. A killed stage of `reproduce`, ffmpeg or worker is told by the command that started it."""
     if fault.kind not in KILLS:
         return ("said", "survived")
-    with_others = subject.command == "reproduce" or fault.call.name.endswith((".mp4", ".hdf5"))
-    return ("killed", "said", "survived") if with_others else ("killed",)
+    by_others = fault.call.name.endswith(".mp4") or "/.data.partial/" in fault.call.name  # ffmpeg, export's worker
+    return ("killed", "said", "survived") if by_others or subject.command == "reproduce" else ("killed",)
 
 
 def compared(folder: Path, whole: dict[str, Any]) -> list[str]:
