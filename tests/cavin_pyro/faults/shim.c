@@ -70,7 +70,7 @@ __attribute__((constructor)) static void begin(void) {
 
 static void label(const char *path, char *into, size_t size) {
     /* The path within the folder, with * for what differs from run to run: random digits, times and processes, and the
-       number of a file without a name. */
+       names of temporary files that were deleted or never had one. */
     snprintf(into, size, "%s", path + strlen(folder));
     for (char *found = into; (found = strstr(found, ".cavin-")); found += 8) {
         char *digits = found + strlen(".cavin-");
@@ -78,8 +78,11 @@ static void label(const char *path, char *into, size_t size) {
     }
     char *rest = strstr(into, ".tfevents.");
     if (rest) strcpy(rest + strlen(".tfevents."), "*");
-    rest = strrchr(into, '#');
-    if (rest && strstr(rest, " (deleted)")) strcpy(rest, "*");
+    size_t length = strlen(into), end = strlen(" (deleted)");
+    if (length > end && !strcmp(into + length - end, " (deleted)")) {
+        rest = strrchr(into, '/');
+        strcpy(rest ? rest + 1 : into, "*");
+    }
 }
 
 /* What happens to this call. */

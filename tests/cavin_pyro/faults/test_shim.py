@@ -9,12 +9,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
+from cavin_pyro.config import composition
+from tests.cavin_pyro.faults.commands import SUBJECTS
 from tests.cavin_pyro.faults.comparison import differences, results
+from tests.cavin_pyro.faults.composed import Composed
 from tests.cavin_pyro.faults.plan import plans, singles
 from tests.cavin_pyro.faults.report import table
 from tests.cavin_pyro.faults.shim import KINDS, Call, Fault, armed, build, kinds_of, needs_faults, recorded
-from tests.cavin_pyro.faults.trials import compared, ending
+from tests.cavin_pyro.faults.trials import compared, ending, succeeded
 from tests.cavin_pyro.shell import Answer
 
 # Writes, a second write, fsync and rename; and a file elsewhere, which does not count.
@@ -31,11 +35,14 @@ os.replace(".a.cavin-0123abcd.partial.txt", "a.txt")
 descriptor = os.open("b", os.O_CREAT | os.O_WRONLY)
 os.pwrite(descriptor, b"xy", 0)
 os.writev(descriptor, [b"12", b"345"])
+descriptor = os.open("temporary-1234", os.O_CREAT | os.O_WRONLY)
+os.unlink("temporary-1234")
+os.write(descriptor, b"z")
 """
 PARTIAL = ".a.cavin-*.partial.txt"
 CALLS = [
     *(Call("write", PARTIAL, 1), Call("write", PARTIAL, 2), Call("fsync", PARTIAL, 1), Call("rename", "a.txt", 1)),
-    *(Call("write", "b", 1), Call("write", "b", 2)),
+    *(Call("write", "b", 1), Call("write", "b", 2), Call("write", "*", 1)),
 ]
 
 
@@ -99,7 +106,7 @@ def test_a_fault_does_what_its_kind_says(text: str, library: Path, tmp_path: Pat
 def test_a_plan_has_every_kind_at_every_call_once_and_depends_on_its_seed_alone() -> None:
     calls = {"one": CALLS, "other": CALLS[:2]}
     count = singles(calls)
-    assert count == sum(len(kinds_of(call)) for own in calls.values() for call in own) == 4 * 5 + 2 * 4 + 2 * 5
+    assert count == sum(len(kinds_of(call)) for own in calls.values() for call in own) == 5 * 5 + 2 * 4 + 2 * 5
     made = plans(calls, seed=1)
     first = [next(made) for _ in range(count + 20)]
     assert len(set(first[:count])) == count and all(len(faults) == 1 for _, faults in first[:count])
@@ -179,6 +186,36 @@ def test_a_file_left_over_or_cut_off_is_said(tmp_path: Path) -> None:
 )
 def test_how_a_command_ended_is_named(answer: Answer, end: str) -> None:
     assert ending(answer) == end
+
+
+@pytest.mark.parametrize(
+    ("name", "answer", "well"),
+    [
+        ("merge", Answer(0, "", ""), True),
+        ("merge", Answer(2, "", "error: merged holds a dataset already: choose another folder with --to DIR"), True),
+        ("merge", Answer(2, "", "error: pushes holds a dataset already: choose another folder with --to DIR"), False),
+        ("train", Answer(2, "", "error: run holds a dataset already"), False),
+    ],
+)
+def test_a_finished_dataset_may_be_refused_and_nothing_else(name: str, answer: Answer, well: bool) -> None:
+    assert succeeded(SUBJECTS[name], answer) is well
+
+
+def test_what_a_fork_composed_is_not_composed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def compose(name: str, overrides: list[str], config_dir: str | None = None) -> DictConfig:
+        asked.append((name, *overrides))
+        return OmegaConf.create({"seed": 3})
+
+    monkeypatch.setattr(composition, "check_overrides", compose)
+    composed = Composed()
+    composed.use()
+    first = composition.check_overrides("train", ["seed=3"])
+    composed.learn()
+    assert composition.check_overrides("train", ["seed=3"]) == first
+    assert composition.check_overrides("train", ["seed=4"]) == first
+    assert asked == [("train", "seed=3")] * 2 + [("train", "seed=4")]
 
 
 def test_the_report_counts_faults_by_command_and_kind() -> None:
