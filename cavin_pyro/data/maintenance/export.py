@@ -20,12 +20,12 @@ import numpy as np
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError, WorkerError
 from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
-from cavin_pyro.data.declaration import ARRAYS
-from cavin_pyro.data.sources import seed_of, source_of_shards, sources_of
+from cavin_pyro.data.declaration import ARRAYS, padded
+from cavin_pyro.data.sources import seed_of, slots_of, source_of_shards, sources_of
 from cavin_pyro.launching.workers import in_workers
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT
+from envs.workspace import POINTS_PER_OBJECT
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Dict
@@ -91,7 +91,7 @@ def _write(folders: tuple[Path, Path]) -> int:
     with _one_error_of_the_disk(target):
         storage = MinariStorage.new(
             target.resolve(),  # because Minari takes the size of what it has written from a relative path twice
-            observation_space=observation_space(),
+            observation_space=observation_space(slots_of(read_metadata(folder))),
             action_space=_box((4,), np.float32, 1.0),
             data_format="hdf5",
         )
@@ -135,15 +135,15 @@ def _one_error_of_the_disk(target: Path) -> Iterator[None]:
         raise OSError(errno.EIO, told[0], str(target.parent))
 
 
-def observation_space() -> Dict:
-    """What an observation is, M objects and P points each."""
+def observation_space(slots: int) -> Dict:
+    """What an observation is, M = `slots` objects and P points each."""
     from gymnasium import spaces
 
-    flags = spaces.MultiBinary(MAXIMUM_OBJECTS)
+    flags = spaces.MultiBinary(slots)
     return spaces.Dict(
         {
-            "centers": _box((MAXIMUM_OBJECTS, 3), np.float32),
-            "clouds": _box((MAXIMUM_OBJECTS, POINTS_PER_OBJECT, 3), np.float16),
+            "centers": _box((slots, 3), np.float32),
+            "clouds": _box((slots, POINTS_PER_OBJECT, 3), np.float16),
             "visible": flags,
             "mask": flags,
         }
@@ -164,7 +164,8 @@ def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
     seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
     names = tuple(name for name in ARRAYS if name != "features")
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
-        for number, arrays in iterate_shards(folder, names):
+        for number, shard in iterate_shards(folder, names):
+            arrays = padded(shard, slots_of(metadata))
             for index in range(len(arrays["length"])):
                 options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}
                 options |= {name: arrays[name][index] for name in OBJECTS}
