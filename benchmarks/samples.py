@@ -172,7 +172,7 @@ def table(found: Sequence[Point], arguments: argparse.Namespace) -> str:
 def draw(path: Path, found: Sequence[Point], title: str) -> None:
     """A column per planner, a row per criterion, with the best of the whole row for every time."""
     planners = [name for name in PLANNERS if any(one["planner"] == name for one in found)]
-    figure = Figure(figsize=(max(6.5, 5.6 * len(planners)), 7.6), dpi=120, layout="constrained")
+    figure = Figure(figsize=(max(6.8, 5.6 * len(planners)), 7.6), dpi=120, layout="constrained")
     panels = figure.subplots(2, len(planners), squeeze=False, sharex=True, sharey=True)
     for row, criterion in zip(panels, ("published", "strict"), strict=True):
         front = choices(found, criterion)
@@ -186,9 +186,9 @@ def draw(path: Path, found: Sequence[Point], title: str) -> None:
         panel.set_xlabel("processor milliseconds of a first plan (median)")
     shown = dict.fromkeys(one["method"] for one in found)
     handles = [Line2D([], [], color=METHODS[name].color, marker="o", label=METHODS[name].label) for name in shown]
-    handles.append(Line2D([], [], color="black", linestyle=":", label="the best for the time, of both columns"))
+    handles.append(Line2D([], [], color="black", linestyle=":", label="the best for the time"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
-    legend = "Numbers: samples (1k = 1,024). Rings: no setting of either column is as fast and succeeds more often"
+    legend = "Numbers: samples (1k = 1,024). Rings: no setting is as fast and succeeds more often"
     figure.suptitle(f"{title}\n{legend}", fontsize=10)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor="white", metadata={"Software": None})
