@@ -71,7 +71,7 @@ class PushOutcome(nn.Module, ABC):
     Attributes:
         geometry: the class of geometric features that it can read, None for any. reads_encoding: whether it needs the
             state encoder's features. predicts_scales: whether `outcome` has scales. neighbours: how many other objects
-        may enter an object's relations, the nearest; None for all. The model sets it.
+            may enter an object's relations, the nearest; None for all. The model sets it.
     """
 
     geometry: ClassVar[type[Geometry] | None] = None
