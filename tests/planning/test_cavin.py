@@ -10,7 +10,7 @@ from torch import Tensor
 
 from models.state import State
 from planning import Outcome, Plan, RewardFunction
-from tests.planning.conftest import tensors
+from tests.planning.conftest import same, tensors
 
 START = (0.0, 0.02)  # metres; close above the forbidden half-plane y < 0 of `near_the_edge`
 
@@ -244,4 +244,4 @@ def assert_same_plans(batch: Plan, single: Plan, index: int) -> None:
     """Environment `index` of one plan equals the only environment of the other, bit by bit."""
     for name, ours, theirs in zip(Plan._fields, batch, single, strict=True):
         for field, other in zip(tensors((ours,)), tensors((theirs,)), strict=True):
-            assert torch.equal(field[index], other[0]), name
+            assert same(field[index], other[0]), name

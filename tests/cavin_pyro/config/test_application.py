@@ -251,7 +251,7 @@ def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
     for overrides, complaint in {
         ("train", "guide=nonsense"): "unknown guide 'nonsense': choose from auto_iaf, auto_low_rank,",
         ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",
-        ("plan", "guide=flat"): "unknown override 'guide': valid are checkpoint, ",
+        ("plan", "guide=flat"): "unknown override 'guide': it is an option of train; valid are checkpoint, ",
         ("plan", "objects=many"): "objects must be a whole number, not many",
     }.items():
         with pytest.raises(UserError) as caught:

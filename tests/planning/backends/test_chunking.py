@@ -6,11 +6,10 @@ from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
-import torch
 
 from planning import CvaeMpcPlanner, Planner
 from planning.backends import chunking
-from tests.planning.conftest import tensors
+from tests.planning.conftest import same, tensors
 
 MAKERS: dict[str, Callable[[SimpleNamespace], Planner]] = {
     "cavin": lambda toy: toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.4, 0.0)), samples=32, horizon=9),
@@ -32,7 +31,7 @@ def test_plans_do_not_depend_on_the_size_of_chunks(
     monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", size)
     in_chunks = planner.plan(state, generators)
     assert in_chunks.actions.shape == (5, 3, 4)
-    assert all(torch.equal(*pair) for pair in zip(tensors(at_once), tensors(in_chunks), strict=True))
+    assert all(same(*pair) for pair in zip(tensors(at_once), tensors(in_chunks), strict=True))
 
 
 def test_a_chunk_holds_no_more_environments_than_it_should(

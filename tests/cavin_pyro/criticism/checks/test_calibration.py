@@ -193,7 +193,7 @@ class OnlyDynamics(PyroModule):
     def __init__(self) -> None:
         super().__init__()
         self.scales = LikelihoodScales()
-        self.encoder = StateEncoder(feature_dimension=4, width=8, maximum_objects=3)
+        self.encoder = StateEncoder(feature_dimension=4, width=8)
         self.dynamics = Dynamics(feature_dimension=4, width=8)
 
     def forward(self, window: Window, generate: bool = False) -> None:
