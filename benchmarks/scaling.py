@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import heapq
 import itertools
-import pickle
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,7 @@ sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")] 
 
 import numpy as np
 import pyarrow.parquet as parquet
+from omegaconf import OmegaConf
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation import evaluation
@@ -37,8 +37,9 @@ ROOT = Path(__file__).parents[1]
 EPISODES = ROOT / "docs" / "measurements" / "reproduction" / "episodes.parquet"
 OPTIONS = ("task=crossing", "objects=3", "output=-")
 START = """
-import os, pickle, sys
-config = pickle.load(open(sys.argv[1], "rb"))
+import os, sys
+from omegaconf import OmegaConf
+config = OmegaConf.load(sys.argv[1])
 from cavin_pyro.evaluation.evaluation import make_runner
 make_runner(config)
 print(sum(os.times()[:2]))
@@ -103,7 +104,7 @@ def start_of_a_worker() -> float:
     """Seconds of a new process until it could begin its first episode."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "config"
-        path.write_bytes(pickle.dumps(compose("evaluate", *OPTIONS)))
+        path.write_text(OmegaConf.to_yaml(compose("evaluate", *OPTIONS), resolve=True), encoding="utf-8")
         line = [sys.executable, "-c", START, str(path)]
         return float(subprocess.run(line, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout)
 
