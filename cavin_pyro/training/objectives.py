@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 
 from cavin_pyro.training.counterfactual import counterfactual_loss
 from cavin_pyro.training.gradients import loss_with_gradients
+from cavin_pyro.training.rollout import rollout_loss
 from guides.guide import Guide
 from models.model import Model
 from models.state import Window
@@ -29,17 +31,19 @@ COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanFi
 
 
 class Objective:
-    """A bound, with optional weights of its KL terms, their warm-up, and the counterfactual term.
+    """A bound, with optional weights of its KL terms, their warm-up, and two other terms.
 
     loss = -bound(with KL term i weighted by w_i * min(1, (step + 1) / warm_up_steps))
-           + counterfactual_weight * counterfactual_loss
+           + counterfactual_weight * counterfactual_loss + rollout_weight * rollout_loss
 
-    With weights of one, no warm-up and no counterfactual term, the defaults, this is the bound and nothing else.
+    With weights of one, no warm-up and neither term, the defaults, this is the bound and nothing else.
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: per code, positive. warm_up_steps: over which the weights of the
             codes' log densities (of prior and guide) grow from nearly zero.
         counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`.
+        rollout_weight: of the error where f reads its own predictions, see `cavin_pyro.training.rollout`. The bound
+            contains each push already, so a weight trades its density for the accuracy of rollouts.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
@@ -52,18 +56,21 @@ class Objective:
         kl_weights: Mapping[str, float] | None = None,
         warm_up_steps: int = 0,
         counterfactual_weight: float = 0.0,
+        rollout_weight: float = 0.0,
     ) -> None:
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
         self.warm_up_steps = warm_up_steps
         self.counterfactual_weight = counterfactual_weight
+        self.rollout_weight = rollout_weight
         for name, weight in self.kl_weights.items():
             if name not in CODES:
                 raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
             if not weight > 0:
                 raise ValueError(f"objective.kl_weights.{name} must be positive, not {weight:g}")
-        if warm_up_steps < 0 or counterfactual_weight < 0:
-            raise ValueError("objective.warm_up_steps and objective.counterfactual_weight must not be negative")
+        numbers = {name: getattr(self, name) for name in ("warm_up_steps", "counterfactual_weight", "rollout_weight")}
+        if wrong := [name for name, value in numbers.items() if not 0 <= value < math.inf]:
+            raise ValueError(f"objective.{wrong[0]} must be 0 or more, not {numbers[wrong[0]]:g}")
         if counterfactual_weight and elbo.num_particles != 1:
             raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
         if counterfactual_weight and not hasattr(elbo, "differentiable_loss"):
@@ -125,6 +132,12 @@ class BoundObjective(nn.Module):
 
     def forward(self, window: Window, step: int) -> Tensor:
         """The loss summed over the windows `[B]`, a scalar, at a step counted from 0."""
+        loss = self._bound(window, step)
+        if self.objective.rollout_weight:
+            loss = loss + self.objective.rollout_weight * rollout_loss(self.model, window)
+        return loss
+
+    def _bound(self, window: Window, step: int) -> Tensor:
         objective = self.objective
         weights = objective.weights(step)
         model: Any = self.model

@@ -9,6 +9,7 @@ from typing import Any
 import pyro
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device, free_memory
@@ -25,7 +26,10 @@ from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.factory import build_objective, data_folders
+from cavin_pyro.training.initial import start_from, train_only
 from cavin_pyro.training.trainer import Trainer, fixed_windows
+from guides.guide import Guide
+from models.networks.geometry import Geometry
 
 DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
 
@@ -65,6 +69,9 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     )
     with user_input():
         objective.check(model, guide)
+    started = start_from(config.initial, model, guide, geometry) if config.initial else {}
+    train_only(config.trained, model, guide)
+    signs = _mirror_signs(config.trainer.reflect, geometry, guide)
     model.to(device), guide.to(device)  # made on the CPU: one seed makes the same weights for every device
     where = _place(windows, device)
     if guide.amortized:
@@ -80,7 +87,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         )
 
     check_same_run(folder, config, ignore=("data", "output", "device"))
-    record = training_provenance(data, origin, windows)
+    record = {**training_provenance(data, origin, windows), **started}
     check_same_data(folder, record["data"])
     stored_config = write_config(folder, config)
     parts = {"model": model, "guide": guide, part_name(geometry): geometry}
@@ -90,13 +97,25 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         save_checkpoint(path, parts=parts, config=stored_config, provenance={**record, "step": step, "metrics": row})
 
     trainer = configured(TrainerConfig, config.trainer, "trainer")
-    run = Trainer(model, guide, objective, windows, folder, save, trainer, seed=config.seed)
+    run = Trainer(model, guide, objective, windows, folder, save, trainer, seed=config.seed, mirror_signs=signs)
     run.resume()
     _keep_best(run, path, save)
     run.run()
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
     return run
+
+
+def _mirror_signs(reflect: bool, geometry: Geometry, guide: Guide) -> Tensor | None:
+    signs = geometry.mirror_signs() if reflect else None
+    if reflect and signs is None:
+        raise UserError(
+            f"trainer.reflect needs geometric features whose mirror image is known, and those of "
+            f"{type(geometry).__name__} have none: pass geometry=outline, or leave trainer.reflect"
+        )
+    if reflect and not guide.amortized:
+        raise UserError(f"trainer.reflect needs a guide that infers any window, and {type(guide).__name__} does not")
+    return signs
 
 
 def _place(windows: WindowTable, device: torch.device) -> str:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from cavin_pyro.config.commands.training import TrainerConfig
+from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.data.windows import WindowTable
@@ -27,7 +28,9 @@ from cavin_pyro.storage.progress import ScalarLog, progress_bar
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.randomness import forked, random_state, set_random_state, stored_states, take_over
+from cavin_pyro.training.reflection import reflect
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
+from cavin_pyro.training.rollout import rollout_loss
 from guides.guide import Guide
 from models.model import Model
 
@@ -53,7 +56,9 @@ class Trainer:
         config: TrainerConfig | None = None,
         *,
         seed: int = 0,
+        mirror_signs: Tensor | None = None,
     ) -> None:
+        """`mirror_signs: [F]`, of geometric features: with them every other window is mirrored, at random."""
         self.model, self.guide, self.windows = model, guide, windows
         self.config = config = config or TrainerConfig()
         self.folder, self._save, self._seed = folder, save, seed
@@ -61,8 +66,10 @@ class Trainer:
         self._fixed = None if guide.amortized else fixed_windows(windows, config.batch_size, seed)
         if self._fixed is not None:
             guide(windows.batch(self._fixed))  # makes its parameters
-        self._loss = objective.bind(model, guide)
-        self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=config.learning_rate, fused=True)
+        self._objective, self._loss = objective, objective.bind(model, guide)
+        self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
+        trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
+        self._optimizer = torch.optim.Adam(trained, lr=config.learning_rate, fused=True)
         self._batches = torch.Generator().manual_seed(seed)
         set_matmul_precision(config.matmul_precision)
         torch.manual_seed(seed)
@@ -113,6 +120,9 @@ class Trainer:
         if numbers is None:
             numbers = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
         window = self.windows.batch(numbers)
+        if self._mirror_signs is not None:
+            mirrored = torch.rand(len(numbers), generator=self._batches) < 0.5
+            window = reflect(window, send(mirrored, self.windows.device), self._mirror_signs)
         for group in self._optimizer.param_groups:
             group["lr"] = config.rate(self.step)
         self._optimizer.zero_grad(set_to_none=True)
@@ -168,6 +178,9 @@ class Trainer:
                 loss += sum(
                     value.item() for value in elbo_terms(self.model, self.guide, window, encoded=encoded).values()
                 )
+                if weight := self._objective.rollout_weight:
+                    rollout = weight * rollout_loss(self.model, window).item()
+                    loss, totals["rollout"] = loss + rollout, totals.get("rollout", 0.0) + rollout
         count = sum(len(part) for part in parts)
         return {name: value / count for name, value in totals.items()}, loss / count
 

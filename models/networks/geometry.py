@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import nn
+from torch import Tensor, nn
 
 
 class Geometry(nn.Module):
@@ -13,3 +13,7 @@ class Geometry(nn.Module):
     """
 
     feature_dimension: int
+
+    def mirror_signs(self) -> Tensor | None:
+        """Signs `[F]` by which a feature becomes that of the object mirrored in the plane y = 0; None if none do."""
+        return None

@@ -16,6 +16,7 @@ OUTLINES = 3
 HEIGHTS = 12
 OUTLINE_UNIT = 0.05  # metres; about the size of an object
 TOP = 0.01  # metres below the highest point
+PRODUCT = 10  # of the heights' part, the mean of x y
 SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of the points, for quantiles of their heights
 PER_OUTLINE = 2 * HARMONICS + 1
 FEATURES = OUTLINES * PER_OUTLINE + HEIGHTS + 1
@@ -77,6 +78,13 @@ class Outline(Geometry):
         typical, unit_spread = self.scaling
         values = torch.cat((values, top, spread / OUTLINE_UNIT**2), -1)
         return unit(torch.cat(((values - typical) / unit_spread, torch.ones_like(top)), -1))
+
+    def mirror_signs(self) -> Tensor:
+        """A mirrored outline's series is the conjugate one, and the mean of x y changes its sign."""
+        outline = torch.cat((torch.ones(HARMONICS + 1), -torch.ones(HARMONICS)))
+        heights = torch.ones(HEIGHTS)
+        heights[PRODUCT] = -1.0
+        return torch.cat((outline.repeat(OUTLINES), heights, torch.ones(1)))
 
 
 def series(angles: Tensor) -> Tensor:

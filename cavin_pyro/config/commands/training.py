@@ -43,6 +43,11 @@ class TrainerConfig:
         above=0,
         group="trainer",
     )
+    reflect: bool = option(
+        False,
+        "mirror every other window in the table's plane of symmetry, at random; for geometry=outline",
+        group="trainer",
+    )
     validate_every: int = option(
         1000,
         "steps between validations, at which a killed run can resume",
@@ -119,6 +124,14 @@ class TrainConfig(DeviceOptions):
         group="data",
     )
     skip_corrupt: bool = option(False, "skip corrupt files of the dataset instead of stopping", group="data")
+    initial: str | None = option(
+        None,
+        "checkpoint whose weights training starts from: a shipped one, or the path of one from train",
+        group="run",
+    )
+    trained: list[str] = option(
+        [], "parts that training changes, [dynamics], while others stay as they are; by default all", group="run"
+    )
     model: Any = None
     guide: Any = None
     prior: Any = None

@@ -66,7 +66,7 @@ BAD_OPTIONS = [
         "train",
         "objective=nonsense",
         "unknown objective 'nonsense': choose from counterfactual, iwae, mean_field_elbo, renyi, "
-        "trace_elbo, trace_enum_elbo, trace_graph_elbo",
+        "rollout, trace_elbo, trace_enum_elbo, trace_graph_elbo",
     ),
     ("train", "trainer.schedule=linear", "unknown trainer.schedule 'linear': choose from constant, cosine"),
     ("evaluate", "task=juggling", f"choose from {', '.join(TASKS)}"),

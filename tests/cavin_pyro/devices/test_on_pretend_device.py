@@ -135,7 +135,7 @@ TRAININGS = {
     "flows": ["prior=flow", "guide=flow"],
     "contact": [
         *("geometry=outline", "dynamics=contact", "scales=predicted", "prior=mixture"),
-        *("trainer.batches=bucketed", "trainer.matmul_precision=bfloat16"),
+        *("trainer.batches=bucketed", "trainer.matmul_precision=bfloat16", "objective=rollout", "trainer.reflect=true"),
     ],
     "baselines": ["model=single_latent", "guide=single_latent", "scales=learned"],
     "flat": ["model=flat", "guide=flat", "prior=conditional", "objective=iwae"],

@@ -108,7 +108,7 @@ def test_every_preset_is_covered() -> None:
     assert set(GUIDES) == set().union(*FITTING.values())
     assert {"standard", "conditional", "flow", "mixture"} <= set(PRIORS)
     assert {"trace_elbo", "mean_field_elbo", "trace_graph_elbo", "trace_enum_elbo"} <= set(OBJECTIVES)
-    assert {"iwae", "renyi", "counterfactual"} <= set(OBJECTIVES)
+    assert {"iwae", "renyi", "counterfactual", "rollout"} <= set(OBJECTIVES)
 
 
 def test_the_representatives_cover_every_guide_with_every_prior_and_every_objective() -> None:

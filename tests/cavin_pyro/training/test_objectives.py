@@ -21,6 +21,7 @@ from cavin_pyro.training.counterfactual import counterfactual_loss
 from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.objectives import Objective, as_objective
 from cavin_pyro.training.renyi import DifferentiableRenyiELBO
+from cavin_pyro.training.rollout import rollout_loss
 from models.state import State, Window
 
 KL = {"kl_effect_code", "kl_motion_code"}
@@ -220,13 +221,44 @@ def test_the_counterfactual_term_uses_the_codes_of_the_bound(programs: tuple, wi
     assert_same_gradients(loss, expected, programs)
 
 
+def test_the_rollout_term_is_the_distance_of_predictions_from_predictions(programs: tuple, window: Window) -> None:
+    model, _ = programs
+    counts = torch.tensor([[True, True, True], [True, False, True], [False, True, True]]).repeat(2, 1)
+    window = window._replace(transition_mask=counts)
+    total = 0.0
+    for number in range(6):
+        state = State(*(field[number : number + 1] for field in window.first))
+        for step in range(3):
+            if not counts[number, step]:
+                break  # no later push is counted: f would start from a state that nothing was compared with
+            state = model.next_state(state, window.actions[number : number + 1, step])
+            real = window.first.mask[number]
+            for field, unit in (("centers", 0.005), ("features", 0.1)):
+                away = getattr(state, field)[0][real] - getattr(window.states, field)[number, step + 1][real]
+                total += ((away**2).sum(-1) + 1e-6).sqrt().sum().item() / unit
+    assert rollout_loss(model, window).item() == pytest.approx(total, rel=1e-9)
+
+
+def test_the_rollout_term_is_added_to_the_bound_and_reaches_f_alone(programs: tuple, window: Window) -> None:
+    plain = loss_at(Objective(Trace_ELBO(max_plate_nesting=1)), programs, window)
+    both = loss_at(Objective(Trace_ELBO(max_plate_nesting=1), rollout_weight=0.3), programs, window)
+    assert (both - plain).item() == pytest.approx(0.3 * rollout_loss(programs[0], window).item(), rel=1e-9)
+    model = programs[0]
+    found = torch.autograd.grad(rollout_loss(model, window), list(model.parameters()), allow_unused=True)
+    reached = {
+        name.split(".")[0] for (name, _), one in zip(model.named_parameters(), found, strict=True) if one is not None
+    }
+    assert reached == {"encoder", "dynamics"}  # the paper's f reads the state encoder
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"kl_weights": {"code": 1.0}}, "kl_weights has no 'code': choose from effect_code, motion_code"),
         ({"kl_weights": {"effect_code": 0.0}}, "kl_weights.effect_code must be positive, not 0"),
-        ({"warm_up_steps": -1}, "must not be negative"),
-        ({"counterfactual_weight": -0.1}, "must not be negative"),
+        ({"warm_up_steps": -1}, "objective.warm_up_steps must be 0 or more, not -1"),
+        ({"counterfactual_weight": -0.1}, "objective.counterfactual_weight must be 0 or more, not -0.1"),
+        ({"rollout_weight": float("nan")}, "objective.rollout_weight must be 0 or more, not nan"),
         ({"elbo": Trace_ELBO(num_particles=2), "counterfactual_weight": 1.0}, "takes one particle, not 2"),
         ({"elbo": RenyiELBO(), "kl_weights": {"effect_code": 0.5}}, "has no KL terms to weight"),
         ({"elbo": RenyiELBO(), "warm_up_steps": 10}, "has no KL terms to weight"),
