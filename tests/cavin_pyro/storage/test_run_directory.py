@@ -118,3 +118,12 @@ def test_an_evaluation_belongs_to_a_device_which_is_the_cpu_where_it_does_not_sa
     check_same_run(tmp_path, config(**now, device="cpu"), ignore=())
     with pytest.raises(UserError, match="a run with device=cpu, not cuda"):
         check_same_run(tmp_path, config(**now, device="cuda"), ignore=())
+
+
+def test_a_training_of_an_older_version_mirrored_nothing_and_trained_all_parts(tmp_path: Path) -> None:
+    write_config(tmp_path, config(trainer={"schedule": "cosine"}))
+    (tmp_path / "metrics.csv").touch()
+    now = {"schedule": "cosine", "reflect": False}
+    check_same_run(tmp_path, config(trainer=now, trained=[], initial=None), ignore=())
+    with pytest.raises(UserError, match="a run with trainer.reflect=False, not True"):
+        check_same_run(tmp_path, config(trainer={**now, "reflect": True}, trained=[]), ignore=())
