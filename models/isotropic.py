@@ -1,4 +1,4 @@
-"""Distributions of vectors with one scale for all their components."""
+"""Distributions of vectors with one scale for all their components, or with another for the last."""
 
 from __future__ import annotations
 
@@ -109,3 +109,42 @@ class IsotropicStudentT(Isotropic):
         squared_error = self._squared_error(value) / self.scale.square()
         constant = math.lgamma((df + dimension) / 2) - math.lgamma(df / 2) - dimension / 2 * math.log(math.pi * df)
         return constant - dimension * self.scale.log() - (df + dimension) / 2 * (squared_error / df).log1p()
+
+
+class UprightStudentT(IsotropicStudentT):
+    """The same for positions (x, y, z), whose height z has a scale of its own: `ratio` times that of x and y.
+
+    A push along the table hardly changes heights; one scale for all three would be too narrow for x and y.
+    """
+
+    def __init__(self, df: float, loc: Tensor, scale: Tensor, ratio: float, validate_args: bool | None = None) -> None:
+        """Raises `ValueError` for a ratio that is not positive, and as `IsotropicStudentT`."""
+        if not 0 < ratio < math.inf:
+            raise ValueError(f"ratio must be positive, not {ratio:g}")
+        self.ratio = ratio
+        super().__init__(df, loc, scale, validate_args=validate_args)
+
+    @property
+    def variance(self) -> Tensor:
+        return super().variance * self._ratios().square()
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> UprightStudentT:
+        new = super().expand(batch_shape, _instance)
+        assert isinstance(new, UprightStudentT)
+        new.ratio = self.ratio
+        return new
+
+    def rsample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
+        return self.loc + (super().rsample(sample_shape) - self.loc) * self._ratios()
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return super().log_prob(value) - math.log(self.ratio)
+
+    def _squared_error(self, value: Tensor) -> Tensor:
+        if self._validate_args:
+            self._validate_sample(value)
+        x, y, z = (value - self.loc).square().unbind(-1)
+        return x + y + z * self.ratio**-2
+
+    def _ratios(self) -> Tensor:
+        return self.loc.new_tensor((1.0, 1.0, self.ratio))

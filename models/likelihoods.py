@@ -11,7 +11,7 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from models.isotropic import Isotropic, IsotropicNormal, IsotropicStudentT
+from models.isotropic import Isotropic, IsotropicNormal, IsotropicStudentT, UprightStudentT
 from models.state import State
 
 
@@ -32,17 +32,20 @@ class Scales:
         centres (metres) and features that the network of the mean predicts; only `PredictedScales` reads them.
         """
         own = None if predicted is None else predicted[..., 0]
-        return self._around(mean.centers, self.center, own).mask(mask).to_event(event_dims)
+        return self._around_centers(mean.centers, own).mask(mask).to_event(event_dims)
 
     def features(
         self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
     ) -> TorchDistribution:
         """Observed features around `mean`: event `[M, F]`, or `[T, M, F]` for `event_dims=2`."""
         own = None if predicted is None else predicted[..., 1]
-        return self._around(mean.features, self.feature, own).mask(mask).to_event(event_dims)
+        return self._around_features(mean.features, own).mask(mask).to_event(event_dims)
 
-    def _around(self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None) -> Isotropic:
-        return IsotropicNormal(mean, scale)
+    def _around_centers(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
+        return IsotropicNormal(mean, self.center)
+
+    def _around_features(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
+        return IsotropicNormal(mean, self.feature)
 
     def planar_errors(self, uniform: Tensor, predicted: Tensor | None = None) -> Tensor:
         """Errors of centres in x and y, metres, as of `centers`: the sample that `uniform: [..., M, 2]` determines.
@@ -86,10 +89,16 @@ class PredictedScales(LikelihoodScales):
     """
 
     degrees_of_freedom: float = 3.0
+    height_ratio: float = 1.0  # scale of a centre's height over that of its place on the table
 
-    def _around(self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None) -> Isotropic:
+    def _around_centers(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
         if predicted is None:
-            return super()._around(mean, scale, predicted)
+            return super()._around_centers(mean, predicted)
+        return UprightStudentT(self.degrees_of_freedom, mean, predicted, self.height_ratio)
+
+    def _around_features(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
+        if predicted is None:
+            return super()._around_features(mean, predicted)
         return IsotropicStudentT(self.degrees_of_freedom, mean, predicted)
 
     def _radius(self, exceeding: Tensor, predicted: Tensor | None) -> Tensor:
