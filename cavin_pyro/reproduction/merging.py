@@ -14,7 +14,8 @@ from cavin_pyro.reproduction.pipeline import chosen_scale
 from cavin_pyro.reproduction.table import TABLE, episode_key, read_table, row_key, write_table
 from cavin_pyro.storage.run_directory import check_same_run
 
-EXTENDED = ("planners", "episodes", "bottom_episodes", "extends")  # options that may change when a run goes on
+# Options that may change when a run goes on.
+EXTENDED = ("planners", "tasks", "objects", "episodes", "bottom_episodes", "extends")
 IGNORED = ("output", "workers", "shard", "merge", "pictures", *EXTENDED)
 
 

@@ -20,7 +20,7 @@ from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_j
 from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations, in_order
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.scales import SCALES, Scale
+from cavin_pyro.reproduction.scales import OBJECT_COUNTS, SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
 from cavin_pyro.reproduction.table import TABLE, Row, episode_key, episode_row, read_table, row_key, write_table
 from cavin_pyro.storage.files import clear_abandoned
@@ -63,16 +63,16 @@ def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
             run_stages(stages, config.workers, bar.update_stages)
         rows = _evaluate(scale, own, home, models, config.workers, bar, known)
     own_keys = {row_key(row) for row in rows}
-    rows = in_order([*rows, *(row for key, row in known.items() if key not in own_keys)], scale)
+    rows = in_order([*rows, *(row for key, row in known.items() if key not in own_keys)], SCALES[config.scale])
     write_table(home / TABLE, rows)
     return rows
 
 
 def chosen_scale(config: DictConfig) -> Scale:
-    """The scale by its name, with the numbers of episodes that replace its own.
+    """The scale by its name, with the numbers of episodes, and the tasks and numbers of objects, that are given.
 
     Raises:
-        UserError: more episodes than there are scenes.
+        UserError: more episodes than there are scenes, or no task or number of objects that the scale has.
     """
     scale = SCALES[config.scale]
     given = {name: config[name] for name in ("episodes", "bottom_episodes") if config[name] is not None}
@@ -80,7 +80,14 @@ def chosen_scale(config: DictConfig) -> Scale:
     for name, value in given.items():
         if value > most:
             raise UserError(f"{name} must be at most {most} with scale={config.scale}, not {value}")
-    return replace(scale, **given)
+    if odd := [one for one in config.objects if one not in OBJECT_COUNTS]:
+        raise UserError(f"objects has {odd[0]}: choose from {', '.join(map(str, OBJECT_COUNTS))}")
+    for name, own in (("tasks", scale.tasks), ("objects", scale.object_counts)):
+        if not set(own) & set(config[name]):
+            raise UserError(f"{name} has none of scale={config.scale}: choose from {', '.join(map(str, own))}")
+    tasks = tuple(one for one in scale.tasks if one in config.tasks)
+    counts = tuple(one for one in scale.object_counts if one in config.objects)
+    return replace(scale, **given, tasks=tasks, object_counts=counts)
 
 
 def as_typed(config: DictConfig) -> str:
@@ -88,10 +95,10 @@ def as_typed(config: DictConfig) -> str:
     if config.table:
         return shlex.join(["python", "-m", "cavin_pyro.reproduce", f"table={config.table}"])
     default, words = ReproduceConfig(), [f"scale={config.scale}"]
-    for name in ("methods", "planners", "episodes", "bottom_episodes", "models", "extends"):
+    for name in ("methods", "planners", "tasks", "objects", "episodes", "bottom_episodes", "models", "extends"):
         if config[name] != getattr(default, name):
             value = config[name]
-            words.append(f"{name}={value if isinstance(value, int | str) else '[' + ','.join(value) + ']'}")
+            words.append(f"{name}={value if isinstance(value, int | str) else '[' + ','.join(map(str, value)) + ']'}")
     return shlex.join(["python", "-m", "cavin_pyro.reproduce", *words])
 
 
@@ -122,7 +129,7 @@ def _known(config: DictConfig, scale: Scale) -> dict[tuple[Any, ...], Row]:
     if not config.extends:
         return {}
     rows = read_table(Path(config.extends))
-    whole = replace(scale, episodes=1, bottom_episodes=1)
+    whole = replace(SCALES[config.scale], episodes=1, bottom_episodes=1)
     own = {episode_key(one, one.seed)[:-1]: one.seed for one in evaluations(whole, list(METHODS))}
     for row in rows:
         first = own.get(row_key(row)[:-1])

@@ -33,6 +33,15 @@ class ReproduceConfig:
         choices="cavin_pyro.reproduction.cells.PLANNERS",
         group="run",
     )
+    tasks: list[str] = option(
+        ["clearing", "insertion", "crossing"],
+        "tasks to evaluate",
+        choices="cavin_pyro.reproduction.scales.TASKS",
+        group="run",
+    )
+    objects: list[int] = option(
+        [1, 2, 3, 4, 5], "numbers of objects to evaluate with sparse rewards, at most those of the scale", group="run"
+    )
     episodes: int | None = option(
         None,
         "per cell of the top row; by default the scale's. A finished run goes on to more",

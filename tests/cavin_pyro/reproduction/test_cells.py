@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+import re
 from dataclasses import asdict, replace
 
 import pytest
@@ -98,6 +99,28 @@ def test_rows_have_one_order_whatever_was_run_first() -> None:
 def test_more_episodes_than_scenes_are_refused() -> None:
     with pytest.raises(UserError, match="episodes must be at most 3000 with scale=medium, not 3001"):
         chosen_scale(compose("reproduce", "scale=medium", "episodes=3001", "output=-"))
+
+
+def test_some_tasks_and_numbers_of_objects_can_be_chosen() -> None:
+    some = ("tasks=[crossing,clearing]", "objects=[5,1]")
+    scale = chosen_scale(compose("reproduce", "scale=medium", *some, "output=-"))
+    found = {(cell.task, cell.reward, cell.objects) for cell in cells(scale, ["cavin"], ["paper"])}
+    sparse = {(task, "sparse", objects) for task in ("clearing", "crossing") for objects in (1, 5)}
+    assert found == sparse | {("clearing", "dense", 3), ("crossing", "dense", 3)}
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("objects=[6]", "objects has 6: choose from 1, 2, 3, 4, 5"),
+        ("objects=[]", "objects has none of scale=medium: choose from 1, 2, 3, 4, 5"),
+        ("tasks=[]", "tasks has none of scale=medium: choose from clearing, insertion, crossing"),
+        ("tasks=[juggling]", "unknown tasks 'juggling': choose from clearing, insertion, crossing"),
+    ],
+)
+def test_cells_that_the_figure_lacks_are_refused(option: str, said: str) -> None:
+    with pytest.raises(UserError, match=re.escape(said)):
+        chosen_scale(compose("reproduce", "scale=medium", option, "output=-"))
 
 
 def test_the_papers_planners_have_no_additions_and_ours_have_some() -> None:
