@@ -53,3 +53,11 @@ def test_the_prose_about_the_claims_quotes_the_page_of_results() -> None:
     page = (PUBLISHED / PAGE).read_text()
     assert len(quoted) > 10
     assert not {number for number in quoted if not re.search(rf"(?<![\d.]){re.escape(number)}(?!\d)", page)}
+
+
+def test_the_explanation_of_the_reports_quotes_rows_of_the_measurements() -> None:
+    explanation = (ROOT / "docs" / "explanation" / "model-criticism.md").read_text(encoding="utf-8")
+    measured = (PUBLISHED.parent / "criticism.md").read_text(encoding="utf-8").partition("\n## cavin with")[0]
+    rows = [line for line in explanation.splitlines() if line.startswith("| ")]
+    assert len(rows) > 30
+    assert not [row for row in rows if row not in measured.splitlines()]
