@@ -28,6 +28,7 @@ from omegaconf import DictConfig
 
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.imports import without_collections
 
 PACKAGES = ("models", "guides", "planning", "envs")
 REPEATING_SECONDS = 1.0
@@ -51,7 +52,8 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
                 print(f"cavin_pyro {__version__}")
                 return
             guarded(check_packages)
-            line, composed = guarded(lambda: _check(name))
+            with without_collections():  # importing the parts takes longer than all else here
+                line, composed = guarded(lambda: _check(name))
             if line.help:
                 guarded(lambda: _show_help(name, body.__doc__ or "", composed))
             elif _is_one_run(sys.argv[1:]):  # as usual: Hydra's application would compose the same again

@@ -21,6 +21,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, TypeVar
 
 from cavin_pyro.config.errors import WorkerError
+from cavin_pyro.config.imports import without_collections
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -142,10 +143,12 @@ class _Workers:
     def _start(self) -> _Worker:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(self._function, theirs), daemon=True)
+        process = context.Process(target=_work, args=(theirs,), daemon=True)
         with _blocked(signal.SIGINT):  # Ctrl-C goes to the whole group; workers inherit the mask and leave it to us
             process.start()
         theirs.close()
+        with suppress(OSError):  # it is dead: `collect` tells how it ended
+            ours.send(self._function)
         worker = _Worker(process, ours)
         self._workers.append(worker)
         return worker
@@ -193,9 +196,14 @@ def _blocked(number: signal.Signals) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(function: Callable[[Any], Any], pipe: Connection) -> None:
-    """What a worker does: a job at a time, until the parent closes the pipe or ends in any way."""
+def _work(pipe: Connection) -> None:
+    """What a worker does: it is sent a function, then a job at a time, until the parent closes the pipe or ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    with without_collections():  # unpickling imports the function's module, and most of the program with it
+        try:
+            function = pipe.recv()
+        except (EOFError, OSError):
+            return
     while True:
         try:
             job = pipe.recv()
