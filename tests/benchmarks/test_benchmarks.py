@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import re
 import subprocess
 import sys
@@ -20,17 +19,30 @@ from cavin_pyro.evaluation.factory import make_environment
 from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
 from cavin_pyro.reproduction.stages import preparation
 from envs.workspace import push_endpoints
+from tests.cavin_pyro.conftest import run_script
 from tests.cavin_pyro.evaluation.success.made_up import evaluation
+from tests.cavin_pyro.shell import ENVIRONMENT
 
 ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted(path for path in (ROOT / "benchmarks").glob("*.py") if "argparse" in path.read_text())
+
+
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(path, id=path.stem, marks=[] if path.stem == "rates" else pytest.mark.soak) for path in SCRIPTS],
+)
+def test_a_benchmark_starts_with_an_interpreter_of_its_own(script: Path) -> None:
+    """The tests below fork theirs from a process that has imported what they need."""
+    ended = subprocess.run(
+        [sys.executable, str(script), "--help"], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert ended.returncode == 0 and ended.stdout.startswith(f"usage: {script.name}") and ended.stderr == ""
 
 
 def run(name: str, *arguments: str) -> str:
-    command = [sys.executable, str(ROOT / "benchmarks" / f"{name}.py"), *arguments]
-    surroundings = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        command, cwd=ROOT, env=surroundings, check=True, capture_output=True, text=True, timeout=300
-    ).stdout
+    ended = run_script(ROOT / "benchmarks" / f"{name}.py", *arguments, folder=ROOT)
+    assert ended.status == 0, ended.errors
+    return ended.output
 
 
 def test_training_by_hand_has_the_same_loss_and_is_timed_against_pyro() -> None:
@@ -158,11 +170,8 @@ def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_ep
     assert list(table) == ["all", "planner: fresh", "fresh"]  # the other planner was not fitted
     assert table["all"][0] == "400" and float(table["all"][4].split()[0]) < 0.08
     assert picture.stat().st_size > 10_000
-    refused = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "success_probability.py"), "fit", file, str(tmp_path)],
-        **{"cwd": ROOT, "capture_output": True, "text": True},
-    )
-    assert refused.returncode == 2 and refused.stderr == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
+    refused = run_script(ROOT / "benchmarks" / "success_probability.py", "fit", file, str(tmp_path), folder=ROOT)
+    assert refused.status == 2 and refused.errors == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
 
 
 def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:

@@ -1,11 +1,13 @@
 """A process that has imported what commands need and forks one process per command: a start costs seconds otherwise.
 
 Reads jobs, a line of JSON each, and prints the exit status of each. A job has `folder`, `output` and `errors` (files),
-and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder, or
-`cases`, which run in turn in one process, each from its own `folder`, with their answers as JSON in `output`.
-With `file_limit`, no file can grow beyond so many bytes; after `limit` seconds a job ends by SIGALRM. With `faults`, a
-part of the environment, the disk fails at a chosen call (faults/shim.py), stages of `reproduce` are forked as well, and
-nothing is composed that an earlier such job has composed.
+and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder; or
+`script` and `overrides`, which runs as `python <script> <overrides>`; or `cases`, which run in turn in one process,
+each from its own `folder`, with their answers as JSON in `output`.
+With `file_limit`, no file can grow beyond so many bytes; after `limit` seconds a job ends by SIGALRM. With `stages`
+"forked", `reproduce` starts no interpreters; with `pictures` "blank", matplotlib draws none. With `faults`, a part of
+the environment, the disk fails at a chosen call (faults/shim.py), both hold as well, and nothing is composed that an
+earlier such job has composed.
 """
 
 from __future__ import annotations
@@ -71,9 +73,11 @@ LIMIT = 300  # seconds per job
 
 
 def main() -> None:
+    gc.disable()  # what imports make stays
     for name in IMPORTED:
         importlib.import_module(name)
     _warm_up()
+    gc.enable()
     composed = Composed()
     for line in sys.stdin:
         gc.freeze()  # so that children's collections neither look at all of this nor copy it
@@ -111,14 +115,20 @@ def run(job: dict[str, Any]) -> None:
         os.environ.update(job["faults"])
         if ctypes.CDLL(None).fault_arm() != 0:
             raise RuntimeError(f"the disk cannot fail so: {job['faults']}")
-        Figure.savefig = save_blank  # how pictures reach the disk is tested, not what they show
         fork = multiprocessing.get_context("fork")  # workers without a new interpreter each, too
         workers.multiprocessing = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda _: fork})
-        if job["command"] == "reproduce":
-            fork_stages(run_and_end)
+    if "faults" in job or job.get("pictures") == "blank":  # how they reach the disk is tested, not what they show
+        Figure.savefig = save_blank
+    if job.get("command") == "reproduce" and ("faults" in job or job.get("stages") == "forked"):
+        fork_stages(run_and_end)
     if "cases" in job:
         sys.path[0] = ""  # the folder of each case
         print(json.dumps([run_case(**case) for case in job["cases"]]))
+        return
+    if "script" in job:
+        sys.path[0] = str(Path(job["script"]).parent)
+        sys.argv = [job["script"], *job["overrides"]]
+        runpy.run_path(job["script"], run_name="__main__")
         return
     sys.path[0] = job["folder"]  # as `python -m` has it
     sys.argv = [job["command"], *job["overrides"]]

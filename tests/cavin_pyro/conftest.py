@@ -74,24 +74,33 @@ def run_as_users(command: str, *overrides: str, folder: Path) -> Answer:
     return Answer(process.returncode, output, errors)
 
 
-def run_command(command: str, *overrides: str, folder: Path, file_limit: int | None = None) -> Answer:
+def run_command(
+    command: str, *overrides: str, folder: Path, file_limit: int | None = None, stages: str = "started"
+) -> Answer:
     """Run a command in a process of its own, from the folder, without waiting for its imports (command_server.py).
 
     Args:
         file_limit: bytes beyond which a file cannot grow.
+        stages: those of `reproduce` are `started` with an interpreter each, or `forked` as this command is.
     """
-    job = {"command": command, "overrides": overrides, "file_limit": file_limit}
+    job = {"command": command, "overrides": overrides, "file_limit": file_limit, "stages": stages}
     status, output, errors = _forked(job, folder)
     return Answer(status, output, errors)
 
 
-def run_in_turn(cases: Mapping[str, Case], folder: Path) -> dict[str, Answer]:
-    """Run many commands in one process, each from `folder / its name`."""
+def run_script(path: Path, *arguments: str, folder: Path) -> Answer:
+    """Run a script that is no part of a package, as `python path arguments` from the folder, likewise forked."""
+    status, output, errors = _forked({"script": str(path), "overrides": arguments}, folder)
+    return Answer(status, output, errors)
+
+
+def run_in_turn(cases: Mapping[str, Case], folder: Path, *, pictures: str = "drawn") -> dict[str, Answer]:
+    """Run many commands in one process, each from `folder / its name`; pictures are `drawn` or left `blank`."""
     jobs = [
         {"command": case.command, "overrides": list(case.overrides), "folder": str(folder / name)}
         for name, case in cases.items()
     ]
-    status, output, errors = _forked({"cases": jobs}, folder)
+    status, output, errors = _forked({"cases": jobs, "pictures": pictures}, folder)
     assert status == 0, errors
     answers: list[dict[str, Any]] = json.loads(output.splitlines()[-1])
     return {name: Answer(**answer) for name, answer in zip(cases, answers, strict=True)}

@@ -78,8 +78,12 @@ def test_what_is_no_command_of_ours_is_there(line: Line) -> None:
 
 
 def run_in_order(pages: Sequence[str], folder: Path) -> None:
-    """Paste the pages' commands one after another, in short sizes, all in one folder."""
+    """Paste the pages' commands one after another, in short sizes, all in one folder; one that comes again, once.
+
+    Pictures are built but not drawn, which would take as long as all else: tests of each command draw them.
+    """
     lines = [line for page in pages for line in composable(LINES) if line.page == page]
+    lines = [*{line.tokens: line for line in lines}.values()]
     lines = [line for line in lines if not any(word.startswith("env.assets=") for word in line.options)]  # files
     cases = {}
     for number, line in enumerate(lines):
@@ -95,7 +99,7 @@ def run_in_order(pages: Sequence[str], folder: Path) -> None:
             short.append("device=auto")
         cases[f"{number}/.."] = Case(line.command, [*line.options, *short])
     assert cases
-    for line, answer in zip(lines, run_in_turn(cases, folder).values(), strict=True):
+    for line, answer in zip(lines, run_in_turn(cases, folder, pictures="blank").values(), strict=True):
         assert answer.status == 0, f"{line}\n{answer.errors}"
 
 

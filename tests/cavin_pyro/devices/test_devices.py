@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -27,11 +28,6 @@ needs_gpu = pytest.mark.skipif(not GPU, reason="needs a GPU that torch can use b
 without_gpu = pytest.mark.skipif(GPU, reason="says what happens without a GPU, and there is one")
 
 
-def command(name: str, *options: str) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", f"cavin_pyro.{name}", *options]
-    return subprocess.run(line, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
-
-
 @pytest.mark.parametrize(
     ("chosen", "least"), [("found or mistake or paper or default", 10), pytest.param("", 40, marks=pytest.mark.soak)]
 )
@@ -46,22 +42,22 @@ def test_everything_works_on_a_device_that_is_not_the_cpu(chosen: str, least: in
 
 
 @without_gpu
-def test_cuda_without_a_gpu_is_one_line_that_names_the_choices() -> None:
-    ended = command("plan", "device=cuda")
-    assert ended.returncode == 2 and ended.stdout == ""
+def test_cuda_without_a_gpu_is_one_line_that_names_the_choices(shell: SimpleNamespace, tmp_path: Path) -> None:
+    ended = shell.run_command("plan", "device=cuda", folder=tmp_path)
+    assert ended.status == 2 and ended.output == ""
     assert re.fullmatch(
         r"error: device=cuda, but torch .*: choose device=cpu, or device=auto, which takes a GPU where there is one\n",
-        ended.stderr,
+        ended.errors,
     )
 
 
 @without_gpu
-def test_auto_without_a_gpu_says_what_it_took_and_plans_as_the_cpu_does(tmp_path: Path) -> None:
+def test_auto_without_a_gpu_says_what_it_took_and_plans_as_the_cpu_does(shell: SimpleNamespace, tmp_path: Path) -> None:
     options = ["task=crossing", "objects=1", "maximum_steps=1", "planner.samples=8", "video=false"]
-    automatic = command("plan", *options, "device=auto", f"output={tmp_path / 'auto'}")
-    usual = command("plan", *options, f"output={tmp_path / 'cpu'}")
-    assert automatic.returncode == usual.returncode == 0
-    assert re.fullmatch(r"device=auto takes cpu: torch .*\n", automatic.stderr) and usual.stderr == ""
+    automatic = shell.run_command("plan", *options, "device=auto", "output=auto", folder=tmp_path)
+    usual = shell.run_command("plan", *options, "output=cpu", folder=tmp_path)
+    assert automatic.status == usual.status == 0
+    assert re.fullmatch(r"device=auto takes cpu: torch .*\n", automatic.errors) and usual.errors == ""
     assert "device: cpu\n" in (tmp_path / "auto" / "config.yaml").read_text()
     assert pushes(tmp_path / "auto") == pushes(tmp_path / "cpu")
 

@@ -42,11 +42,12 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     cut.write_bytes(episodes[cut][:-20])  # as a machine that lost its power leaves it
     for name in RESULTS:
         (home / name).unlink()
-    again = shell.run_command("reproduce", *WHOLE, folder=tmp_path)
+    later = {"folder": tmp_path, "stages": "forked"}  # the first run has started each with an interpreter of its own
+    again = shell.run_command("reproduce", *WHOLE, **later)
     assert again.status == 0, again.errors
     assert contents(home) == made
     assert finished == {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
-    more = shell.run_command("reproduce", *WHOLE, "bottom_episodes=2", folder=tmp_path)
+    more = shell.run_command("reproduce", *WHOLE, "bottom_episodes=2", **later)
     assert more.status == 0, more.errors
     longer = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
     assert all(longer[path].startswith(kept) for path, kept in episodes.items() if path != cut)
@@ -59,12 +60,12 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     models = tmp_path / "models"
     models.mkdir()
     shutil.copy(home / "train" / "mpc-0" / "checkpoint.safetensors", models / "mpc-0.safetensors")
-    trained = shell.run_command("reproduce", *WHOLE[:-1], "models=models", "output=trained", folder=tmp_path)
+    trained = shell.run_command("reproduce", *WHOLE[:-1], "models=models", "output=trained", **later)
     assert trained.status == 0, trained.errors
     assert not (tmp_path / "trained" / "data").exists() and not (tmp_path / "trained" / "train").exists()
     assert contents(tmp_path / "trained") == made
     extended = ("models=models", "bottom_episodes=3", "extends=whole/episodes.parquet", "output=extended")
-    joined = shell.run_command("reproduce", *WHOLE[:-1], *extended, folder=tmp_path)
+    joined = shell.run_command("reproduce", *WHOLE[:-1], *extended, **later)
     assert joined.status == 0, joined.errors
     rows, known = (read_table(path / "episodes.parquet") for path in (tmp_path / "extended", home))
     assert len(rows) == 5 and [row for row in rows if row in known] == known
