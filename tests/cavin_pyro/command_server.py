@@ -27,7 +27,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -70,6 +70,29 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "torch._dynamo",  # by torch's optimizers
 )
 LIMIT = 300  # seconds per job
+
+
+def _forking() -> SimpleNamespace:
+    """A context whose workers are forks, without a new interpreter each. Of their pipes they keep their own ends alone.
+
+    With a copy of the parent's end a worker would never see it closed, and the parent would wait for the worker.
+    """
+    fork, opened = multiprocessing.get_context("fork"), []
+
+    def pipe() -> tuple[Any, Any]:
+        ours, theirs = fork.Pipe()
+        opened.append(ours)
+        return ours, theirs
+
+    def process(*, target: Callable[..., None], **options: Any) -> Any:
+        def work(*arguments: Any) -> None:
+            for one in opened:
+                one.close()
+            target(*arguments)
+
+        return fork.Process(target=work, **options)
+
+    return SimpleNamespace(Pipe=pipe, Process=process)
 
 
 def main() -> None:
@@ -115,8 +138,7 @@ def run(job: dict[str, Any]) -> None:
         os.environ.update(job["faults"])
         if ctypes.CDLL(None).fault_arm() != 0:
             raise RuntimeError(f"the disk cannot fail so: {job['faults']}")
-        fork = multiprocessing.get_context("fork")  # workers without a new interpreter each, too
-        workers.multiprocessing = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda _: fork})
+        workers.multiprocessing = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda _: _forking()})
     if "faults" in job or job.get("pictures") == "blank":  # how they reach the disk is tested, not what they show
         Figure.savefig = save_blank
     if job.get("command") == "reproduce" and ("faults" in job or job.get("stages") == "forked"):
