@@ -17,14 +17,17 @@ from models.model import Model
 from models.networks.geometry import Geometry
 
 
-def start_from(name: str, model: Model, guide: Guide, geometry: Geometry) -> dict[str, Any]:
+def start_from(
+    name: str, model: Model, guide: Guide, geometry: Geometry, trained: Sequence[str] = ()
+) -> dict[str, Any]:
     """Copy the weights of a checkpoint into model and guide, which must be of its architecture.
 
     Args:
-        name: of a shipped checkpoint, or the path of one that train has written.
+        name: of a shipped checkpoint, or the path of one that train has written. trained: see `train_only`.
 
     Returns:
-        Its digest and provenance, for that of the new one.
+        Its digest and provenance, for that of the new one. What a calibration has found stays true where f alone is
+        trained: neither the codes' priors nor what a guide reads depends on f.
 
     Raises:
         UserError: there is no such file, it holds other parts, or features of another geometry.
@@ -35,7 +38,9 @@ def start_from(name: str, model: Model, guide: Guide, geometry: Geometry) -> dic
     checkpoint.load_into("guide", guide, path)
     if geometry_fingerprint(geometry_of(checkpoint, path)) != geometry_fingerprint(geometry):
         raise UserError(f"checkpoint {path} was trained with other geometric features: give its geometry= or pointnet=")
-    return {"initial": {"sha256": file_digest(path), "provenance": checkpoint.provenance}}
+    about = checkpoint.provenance
+    kept = {name: about[name] for name in ("calibrated",) if name in about and list(trained) == ["dynamics"]}
+    return {**kept, "initial": {"sha256": file_digest(path), "provenance": about}}
 
 
 def parts_of(model: Model, guide: Guide) -> dict[str, nn.Module]:

@@ -69,7 +69,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     )
     with user_input():
         objective.check(model, guide)
-    started = start_from(config.initial, model, guide, geometry) if config.initial else {}
+    started = start_from(config.initial, model, guide, geometry, config.trained) if config.initial else {}
     train_only(config.trained, model, guide)
     signs = _mirror_signs(config.trainer.reflect, geometry, guide)
     model.to(device), guide.to(device)  # made on the CPU: one seed makes the same weights for every device

@@ -39,7 +39,7 @@ FITTING = {
 }
 COMBINATIONS_WITHOUT_CODES = {
     ("dynamics", "none", "standard", objective)
-    for objective in ("trace_elbo", "mean_field_elbo", "trace_graph_elbo", "trace_enum_elbo")
+    for objective in ("trace_elbo", "mean_field_elbo", "trace_graph_elbo", "trace_enum_elbo", "rollout")
 }
 ALL = list(itertools.product(MODELS, GUIDES, PRIORS, OBJECTIVES))
 VALID = [

@@ -10,7 +10,7 @@ import torch
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.checkpoint import load_checkpoint
+from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint
 from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.training.run import train
 
@@ -52,6 +52,16 @@ def test_without_names_all_parts_go_on_from_the_checkpoint(folder: Path) -> None
     slow = run(folder, "all", f"initial={first}", "trainer.learning_rate=1e-9")
     for name, value in load_checkpoint(first).tensors.items():
         torch.testing.assert_close(load_checkpoint(slow).tensors[name], value, atol=1e-6, rtol=0)
+
+
+def test_what_a_calibration_has_found_stays_where_f_alone_is_trained(folder: Path) -> None:
+    first = load_checkpoint(folder / "first" / "checkpoint.safetensors")
+    calibrated = folder / "calibrated.safetensors"
+    records = {**first.provenance, "calibrated": [{"steps": 3}]}
+    calibrated.write_bytes(checkpoint_bytes(first.tensors, first.config, records))
+    for number, (trained, kept) in enumerate({"[dynamics]": True, "[guide]": False, "[]": False}.items()):
+        path = run(folder, f"after-{number}", f"initial={calibrated}", f"trained={trained}", "trainer.steps=2")
+        assert (load_checkpoint(path).provenance.get("calibrated") == [{"steps": 3}]) is kept
 
 
 @pytest.mark.parametrize(
