@@ -90,12 +90,16 @@ def test_signals_that_end_a_command_do_so_in_one_line_once_everything_is_saved(
             os.kill(os.getpid(), number)  # as schedulers do, which signal a process and its group
             done.append("saved")
 
-    with pytest.raises(SystemExit) as stop:
-        guarded(act)
+    before = signal.signal(number, signal.SIG_DFL)  # also where the tests run under nohup
+    try:
+        with pytest.raises(SystemExit) as stop:
+            guarded(act)
+        assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
     assert (stop.value.code, done) == (128 + number, ["saved"])
     said = f"error: interrupted by {number.name}; rerun the same command to resume, if it can\n"
     assert capsys.readouterr() == ("", said)
-    assert signal.getsignal(number) == signal.SIG_DFL
 
 
 def test_a_signal_that_is_ignored_stays_so() -> None:
