@@ -103,8 +103,8 @@ def rollout(selections: Sequence[Values], effect: str, motion: str) -> Values:
     return next(one for one in selections if one["effect"] == effect and one["motion"] in names)
 
 
-def left(selections: Sequence[Values], effect: str, motion: str) -> str:
-    return whole(rollout(selections, effect, motion), mean="relative")
+def way_left(effect: str, motion: str) -> Callable[[Sequence[Values]], str]:
+    return lambda selections: whole(rollout(selections, effect, motion), mean="relative")
 
 
 def expected(selections: Sequence[Values]) -> str:
@@ -172,22 +172,10 @@ FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("h is off after 1 and 10 segments, cm", "growth/errors/h", ends),
     ("f after 10 segments, of the error if nothing moves", "growth/relative", whole),
     ("f is off along the prior's pushes; objects move, cm", "consistency/selections", missed),
-    (
-        "way left: sampled effect and motion",
-        "consistency/selections",
-        partial(left, effect="sampled", motion="sampled"),
-    ),
-    (
-        "way left: sampled effect, closest motion",
-        "consistency/selections",
-        partial(left, effect="sampled", motion="closest"),
-    ),
+    ("way left: sampled effect and motion", "consistency/selections", way_left("sampled", "sampled")),
+    ("way left: sampled effect, closest motion", "consistency/selections", way_left("sampled", "closest")),
     ("f expects to be left; is left, cm", "consistency/selections", expected),
-    (
-        "way left: chosen effect, closest motion",
-        "consistency/selections",
-        partial(left, effect="chosen", motion="closest"),
-    ),
+    ("way left: chosen effect, closest motion", "consistency/selections", way_left("chosen", "closest")),
 )
 
 

@@ -45,6 +45,12 @@ class PlanRecord:
     prospects: Prospects | None = None
     success_probability: float | None = None
 
+    @property
+    def chance(self) -> str:
+        """The probability of success, to append to a line; "" where none is known."""
+        known = self.success_probability
+        return "" if known is None else f", success {100 * known:.0f} %"
+
 
 @dataclass(frozen=True)
 class Transition:

@@ -117,6 +117,10 @@ class Objective:
         ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
         return {name: ramp * self.kl_weights.get(name, 1.0) for name in CODES}
 
+    def rollout_term(self, model: Model, window: Window) -> Tensor | None:
+        """The weighted `rollout_loss`, summed over the windows `[B]`, a scalar; None without weight."""
+        return self.rollout_weight * rollout_loss(model, window) if self.rollout_weight else None
+
     def bind(self, model: Model, guide: Guide) -> BoundObjective:
         """The loss of one model and guide, as a module with the parameters of both."""
         self.check(model, guide)
@@ -132,10 +136,9 @@ class BoundObjective(nn.Module):
 
     def forward(self, window: Window, step: int) -> Tensor:
         """The loss summed over the windows `[B]`, a scalar, at a step counted from 0."""
-        loss = self._bound(window, step)
-        if self.objective.rollout_weight:
-            loss = loss + self.objective.rollout_weight * rollout_loss(self.model, window)
-        return loss
+        rollout = self.objective.rollout_term(self.model, window)
+        bound = self._bound(window, step)
+        return bound if rollout is None else bound + rollout
 
     def _bound(self, window: Window, step: int) -> Tensor:
         objective = self.objective

@@ -30,7 +30,6 @@ from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.randomness import forked, random_state, set_random_state, stored_states, take_over
 from cavin_pyro.training.reflection import reflect
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
-from cavin_pyro.training.rollout import rollout_loss
 from guides.guide import Guide
 from models.model import Model
 
@@ -178,9 +177,9 @@ class Trainer:
                 loss += sum(
                     value.item() for value in elbo_terms(self.model, self.guide, window, encoded=encoded).values()
                 )
-                if weight := self._objective.rollout_weight:
-                    rollout = weight * rollout_loss(self.model, window).item()
-                    loss, totals["rollout"] = loss + rollout, totals.get("rollout", 0.0) + rollout
+                if (rollout := self._objective.rollout_term(self.model, window)) is not None:
+                    loss += rollout.item()
+                    totals["rollout"] = totals.get("rollout", 0.0) + rollout.item()
         count = sum(len(part) for part in parts)
         return {name: value / count for name, value in totals.items()}, loss / count
 

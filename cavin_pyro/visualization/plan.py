@@ -100,8 +100,7 @@ def draw_plan_record(
     view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)
     draw_overlay(panel, record, task, view, scale, reached)
     about = evidence_text(record.plan)
-    chance = "" if record.success_probability is None else f", success {100 * record.success_probability:.0f} %"
-    title = f"after {counted(record.step)}{chance}{_error(record, reached)}"
+    title = f"after {counted(record.step)}{record.chance}{_error(record, reached)}"
     panel.set_title("\n".join([title, about] if about else [title]), fontsize=10)
 
 

@@ -42,8 +42,7 @@ class EpisodeProgress(EpisodeCallback):
 
 def about_plan(record: PlanRecord) -> str:
     """How long a plan took, and the probability of success that it gives, if one is known."""
-    chance = "" if record.success_probability is None else f", success {100 * record.success_probability:.0f} %"
-    return f"planned in {record.milliseconds / 1e3:.2f} s{chance}"
+    return f"planned in {record.milliseconds / 1e3:.2f} s{record.chance}"
 
 
 def ended(transition: Transition) -> bool:
