@@ -247,9 +247,12 @@ def main() -> None:
     parser.add_argument("--no-grid", action="store_true", help="the public planners only")
     parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
+    parser.add_argument("--samples", type=int, nargs="+", help="numbers of samples (256, 1024 and 8192 by default)")
+    parser.add_argument("--objects", type=int, nargs="+", help="numbers of objects (1, 3 and 5 by default)")
     arguments = parser.parse_args()
     ways = ["eager"] if arguments.no_compile else ["eager", "compiled"]
     samples, objects, repetitions = ([32], [2], 2) if arguments.quick else ([256, 1024, 8192], [1, 3, 5], 4)
+    samples, objects = arguments.samples or samples, arguments.objects or objects
     if not arguments.no_grid:
         grid(samples, objects, repetitions, ways, size=512 if arguments.quick else 2048)
     if not arguments.no_flat:

@@ -13,7 +13,9 @@ from planning.backends.chunking import chunked
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.guidance import guided_tracking
 from planning.extensions.idle_pushes import idle_last
+from planning.extensions.nearest_objects import NearestObjects, nearest_objects
 from planning.extensions.perturbed_rollouts import most_robust
+from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
@@ -22,7 +24,7 @@ from planning.rollouts.dynamics import predict_states
 from planning.rollouts.ranking import best_of, squared_distance
 from planning.rollouts.returns import interpolate
 from planning.rollouts.sampling import sample_codes
-from planning.rollouts.segment import Objective, SegmentRollout, select_segment
+from planning.rollouts.segment import Objective, SegmentRollout, actions_of, select_segment
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
@@ -49,17 +51,21 @@ class CavinPlanner(SearchingPlanner):
         `first_segment` plans and compares only the executed segment (published implementation).
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
+    nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
+        nearest to it, this many in all; None plans for all objects (paper).
     warm_start: our addition to line 5: the last plan's noise is among the candidates.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
     idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
         last; 0 keeps g's order (paper).
+    touchdown_distance: metres; our addition to line 10: motions whose first push starts nearer to a point that the
+        camera sees are left out, as far as the caller gives such points; 0 in the paper.
     guidance: our addition to lines 7 and 10: `layout` prefers, among plans that miss the goal, those that leave the
         shortest way to it along allowed places; `none` in the paper.
     compile: compile the inner functions to native code, which takes one or two minutes once and is kept on disk.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
-    `reward_at`, limits out of order, and a `feature_weight` or an `idle_distance` that is negative or not finite.
+    `reward_at`, limits out of order, and a weight or a distance that is negative or not finite.
     """
 
     requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "subgoal", "actions", "next_state"))
@@ -75,6 +81,7 @@ class CavinPlanner(SearchingPlanner):
         motion_samples: int | None = None,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
+        nearest_objects: int | None = 2,
         avoid_failures: bool = True,
         **options: Any,
     ) -> None:
@@ -88,29 +95,39 @@ class CavinPlanner(SearchingPlanner):
         self.motion_optimizer = make_optimizer(motion_optimizer or self.optimizer, samples=self.motion_samples)
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
+        if nearest_objects is not None:
+            check_positive("nearest_objects", nearest_objects)
+        self.nearest_objects = nearest_objects
         self.avoid_failures = avoid_failures
 
     @chunked
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
+    def plan(
+        self,
+        state: State,
+        generators: Sequence[torch.Generator],
+        previous: Plan | None = None,
+        observed: ObservedPoints | None = None,
+    ) -> Plan:
         """Algorithm 1 for observed scenes `state: [B]`; the call advances `generators`, one per environment.
 
-        `previous`: the last plans of the same episodes, whose first pushes have been executed, for the warm start. An
-        environment's plan depends on its own state, generator and last plan only. For errors see
-        `planning.backends.chunking.chunked`.
+        `previous`: the last plans of the same episodes, whose first pushes have been executed, for the warm start.
+        `observed`: points of the objects that the camera sees, where no push may touch down. An
+        environment's plan depends on its own arguments only. For errors see `planning.backends.chunking.chunked`.
         """
         reward = self.reward
         # Line 1 (K = H / T) is in the constructor. Lines 2, 3 and 12, the loop over t, are the caller's.
         # Line 4: receive the new s_t from the environment.
         s_t, T = state, self.segment_length
+        near = nearest_objects(s_t, self.nearest_objects, reward)
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
-        effects = self.search_by_reward(EffectSpace(self.model), s_t, generators, previous)
+        effects = self.search_by_reward(EffectSpace(self.model), near.of(s_t), generators, previous)
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
         chosen = effects.take(i.unsqueeze(-1))
-        c_star, subgoals = chosen.codes[:, 0], chosen.states.map(lambda field: field[:, 0])
+        c_star, subgoals = chosen.codes[:, 0], near.among(s_t, chosen.states.map(lambda field: field[:, 0]))
 
         # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
         ends = effects.score_state.segments.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
@@ -120,7 +137,7 @@ class CavinPlanner(SearchingPlanner):
         if self.avoid_failures:
             tracking_cost = AvoidFailures(tracking_cost, ends, reward)
         motions = self.search(
-            MotionSpace(self.model, c_star),
+            MotionSpace(self.model, c_star, near),
             tracking_cost,
             s_t,
             generators,
@@ -133,6 +150,7 @@ class CavinPlanner(SearchingPlanner):
         tracking, scores = motions.score_state, motions.returns
         if self.avoid_failures:
             tracking, scores = prefer_no_failure(motions.score_state)
+        scores = self.prefer_free(scores, motions.at(0, actions_of), observed)
         j = best_of(scores, "distances of motion plans to the subgoals")
         failures = None
         if self.robustness is not None:
@@ -183,6 +201,7 @@ class MotionSpace(NamedTuple):
 
     model: PlanningModel
     effect_codes: Tensor  # [B, K, C] c*, with which every sequence is paired
+    near: NearestObjects  # the objects that they are about
 
     @property
     def dimension(self) -> int:
@@ -195,9 +214,9 @@ class MotionSpace(NamedTuple):
         """See `planning.rollouts.segment.SearchSpace`."""
         c = select_segment(self.effect_codes, segment).expand(-1, plans.batch_shape[-1], -1)
         # Line 8: sample z_k, a segment at a time, as in line 5.
-        z = sample_codes(self.model.motion_prior, [plans, c], noise, generators)
+        z = sample_codes(self.model.motion_prior, [self.near.of(plans), c], noise, generators)
         # Line 9: generate T actions by equation 3, and predict a state after each by equation 1.
-        a = self.model.actions(here, c, z)
+        a = self.model.actions(self.near.of(here), c, z)
         states, path = predict_states(self.model, here, a)
         return SegmentRollout(z, a, states, path)
 

@@ -52,7 +52,9 @@ class Plan(NamedTuple):
     predicted_centers: Tensor  # [B, S T, M, 3] metres, predicted by f after each of the planned actions
     expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
     expected_success: Tensor  # [B] bool: the chosen plan reaches the goal
-    candidate_centers: Tensor  # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies
+    # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies; of the nearest objects alone, the
+    # target first, where plans are about these
+    candidate_centers: Tensor
     noise: Tensor  # [B, K, D] of the searched codes or pushes, or [B, 0, 0]; see `extensions.warm_start`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
     evidence: Evidence | None = None  # of the search by return; None for optimizers that do not sample by weights

@@ -168,6 +168,15 @@ class EpisodicReward(RewardFunction, Protocol):
 
 
 @runtime_checkable
+class TargetedReward(RewardFunction, Protocol):
+    """A reward function that knows which objects its goal is about."""
+
+    @property
+    def about(self) -> str:
+        """`target`, which is object 0, or `all`."""
+
+
+@runtime_checkable
 class PathReward(RewardFunction, Protocol):
     """A reward function that can also evaluate whole paths, which reads every state once instead of twice."""
 
@@ -209,3 +218,10 @@ class Planner(Protocol):
 
         `previous`: the plans whose `actions`, or the first of them, have just been executed, for the warm start.
         """
+
+
+@runtime_checkable
+class SeeingPlanner(Planner, Protocol):
+    """A planner whose method `plan` also takes what the camera sees: `planning.extensions.touchdown.ObservedPoints`."""
+
+    touchdown_distance: float

@@ -13,6 +13,7 @@ from planning.backends.compiled import Compiled
 from planning.backends.eager import Backend, eager
 from planning.extensions.guidance import check_guidance, guided_return, way_of
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
+from planning.extensions.touchdown import ObservedPoints, prefer_free
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
@@ -54,6 +55,7 @@ class SearchingPlanner:
         warm_start: bool = True,
         robustness: PerturbedRollouts | None = ROBUSTNESS,
         idle_distance: float = 0.01,
+        touchdown_distance: float = 0.015,
         guidance: str = "none",
         compile: bool = False,
     ) -> None:
@@ -61,6 +63,7 @@ class SearchingPlanner:
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
         check_weight("idle_distance", idle_distance)
+        check_weight("touchdown_distance", touchdown_distance)
         check_guidance(guidance)
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward, self.guidance = model, reward, guidance
@@ -71,6 +74,7 @@ class SearchingPlanner:
             raise ValueError("outcomes=sampled needs a model that samples f: it has no sampled_next_state")
         _ = self.cumulative_reward(), self.way  # refuse bad options now, not in the first plan
         self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
+        self.touchdown_distance = touchdown_distance
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
 
@@ -134,6 +138,13 @@ class SearchingPlanner:
         warm_start = warm_start_noise(previous, generators) if self.warm_start else None
         objective = guided_return(self.cumulative_reward(), self.way)
         return self.search(space, objective, state, generators, warm_start=warm_start, best_only=True)
+
+    def prefer_free(self, scores: Tensor, pushes: Tensor, observed: ObservedPoints | None) -> Tensor:
+        """Scores `[B, N]` that leave out candidates whose first push would touch down on an object.
+
+        pushes: `[B, N, T, 4]`, their first segments.
+        """
+        return prefer_free(scores, pushes[..., 0, :], observed, self.touchdown_distance)
 
 
 def summary(

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from cavin_pyro.evaluation.success.prospects import Prospects, prospects_of
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
+from envs.workspace import REACH_HIGH, REACH_LOW
 from models.networks.geometry import Geometry
 from models.state import State
 from planning import Plan, Planner
+from planning.extensions.touchdown import ObservedPoints
+from planning.protocol import SeeingPlanner
 from planning.records import apply
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
@@ -126,6 +129,14 @@ def observed_state(observation: ObservationDict, geometry: Geometry, device: str
     return state.map(lambda field: field.to(device))
 
 
+def observed_points(observation: ObservationDict, device: str | torch.device = "cpu") -> ObservedPoints:
+    """The points of real objects in an observation, a batch of one: `points: [1, P, 2]` metres."""
+    real = observation["mask"].astype(np.bool_)
+    points = torch.from_numpy(observation["clouds"][real][..., :2].reshape(1, -1, 2))
+    low, high = (torch.tensor([corner], dtype=points.dtype) for corner in (REACH_LOW, REACH_HIGH))
+    return ObservedPoints(*(field.to(device) for field in (points, low, high)))
+
+
 class EpisodeCallback:
     """Callbacks of `rollout` during an episode. A subclass overrides the methods that it needs."""
 
@@ -178,7 +189,8 @@ def rollout(
     while not ended:
         began = time.perf_counter()
         state = observed_state(observation, geometry, device)
-        previous = planner.plan(state, [generator], previous)
+        seen = {"observed": observed_points(observation, device)} if isinstance(planner, SeeingPlanner) else {}
+        previous = planner.plan(state, [generator], previous, **seen)
         plan = apply(previous, lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),

@@ -9,6 +9,7 @@ WITHOUT_ADDITIONS = (
     "planner.warm_start=false",
     "planner.robustness=null",
     "planner.idle_distance=0.0",
+    "planner.touchdown_distance=0.0",
     "pushes_per_plan=null",
     "margin=0",
     "matmul_precision=float32",

@@ -147,6 +147,11 @@ class TaskReward:
         reward = reduce(add, terms.values())
         return Outcome(reward.to(states.dtype), terms, success, violation, fall)
 
+    @property
+    def about(self) -> str:
+        """The objects that the goal is about: the `target` (object 0), or `all`."""
+        return self.task.about
+
     @cached_property
     def way(self) -> WayToGoal:
         """The way that is left to the goal, for planners; the margin counts. Takes about 0.1 s, once."""

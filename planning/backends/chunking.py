@@ -11,6 +11,7 @@ import torch
 from models.state import State
 from planning import records
 from planning.backends.eager import Backend
+from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import NoFiniteCandidateError, check_scenes
 from planning.plan import Plan
 
@@ -28,7 +29,7 @@ class Sampling(Protocol):
     backend: Backend
 
 
-PlanMethod = Callable[..., Plan]  # (self, state, generators, previous)
+PlanMethod = Callable[..., Plan]  # (self, state, generators, previous, observed)
 
 
 def chunked(plan: PlanMethod) -> PlanMethod:
@@ -40,7 +41,11 @@ def chunked(plan: PlanMethod) -> PlanMethod:
 
     @wraps(plan)
     def planned(
-        self: Sampling, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None
+        self: Sampling,
+        state: State,
+        generators: Sequence[torch.Generator],
+        previous: Plan | None = None,
+        observed: ObservedPoints | None = None,
     ) -> Plan:
         check_scenes(state, generators)
         size = ENVIRONMENTS_ON_PROCESSOR
@@ -50,8 +55,9 @@ def chunked(plan: PlanMethod) -> PlanMethod:
         def plan_of(start: int) -> Plan:
             chunk = slice(start, start + size)
             last = previous and records.apply(previous, lambda field: field[chunk])
+            seen = observed and records.apply(observed, lambda field: field[chunk])
             try:
-                return plan(self, state.scene(chunk), generators[chunk], last)
+                return plan(self, state.scene(chunk), generators[chunk], last, seen)
             except NoFiniteCandidateError as error:
                 raise NoFiniteCandidateError(start + error.environment, error.what) from error
 

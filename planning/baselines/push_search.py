@@ -11,6 +11,7 @@ from models.state import State
 from planning.backends.chunking import chunked
 from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
+from planning.extensions.touchdown import ObservedPoints
 from planning.plan import Plan
 from planning.protocol import DynamicsModel, RewardFunction
 from planning.rollouts.ranking import best_of, prefer
@@ -26,7 +27,7 @@ class PushSearch(SearchingPlanner):
 
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
 
-    Our additions, as in `CavinPlanner`: `warm_start`, `robustness` and `idle_distance`. There is no subgoal to come
+    Our additions, as in `CavinPlanner`: `warm_start`, `robustness`, `idle_distance` and `touchdown_distance`. There is no subgoal to come
     close to, so perturbed rollouts of the executed segment only tell how often it fails. The chosen sequence has the
     highest return minus `failure_cost / RETURN_WEIGHT` times the share of failed rollouts. By default that is 200 times
     the share: a failure earns -100 where a sequence that reaches the goal promised +100. So the score of a sequence
@@ -44,18 +45,24 @@ class PushSearch(SearchingPlanner):
 
     @chunked
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
+    def plan(
+        self,
+        state: State,
+        generators: Sequence[torch.Generator],
+        previous: Plan | None = None,
+        observed: ObservedPoints | None = None,
+    ) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
         candidates = self.search_by_reward(self.space, state, generators, previous)
         # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
-        scores = torch.where(finite, candidates.returns, -torch.inf)
+        scores, pushes = torch.where(finite, candidates.returns, -torch.inf), candidates.at(0, actions_of)
+        scores = self.prefer_free(scores, pushes, observed)
         best = best_of(scores, "returns of push sequences")
         failures = None
         if self.robustness is not None:
             scores = prefer(scores, candidates.score_state.succeeded)
-            pushes, cost = candidates.at(0, actions_of), -RETURN_WEIGHT * scores
-            what = state, None, scores, pushes, cost, generators
+            what = state, None, scores, pushes, -RETURN_WEIGHT * scores, generators
             robust = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
             best, failures = robust
         chosen = candidates.take(best.unsqueeze(-1))

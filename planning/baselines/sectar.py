@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from models.state import State
 from planning.backends.chunking import chunked
 from planning.cavin import EffectSpace
 from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, MostRobust, sequential_halving
+from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import NoFiniteCandidateError
 from planning.plan import Plan
 from planning.protocol import ModelRequirements, RewardFunction, SingleLatentModel
@@ -27,7 +29,7 @@ class SectarPlanner(SearchingPlanner):
     There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). Without our additions, f
     only predicts the states after the pushes, for pictures.
 
-    Our additions, as in `CavinPlanner`: `warm_start`, `robustness` and `idle_distance`. An effect has one motion here,
+    Our additions, as in `CavinPlanner`: `warm_start`, `robustness`, `idle_distance` and `touchdown_distance`. An effect has one motion here,
     so perturbed rollouts compare effect plans: of those that reach the goal, the `robustness.candidates` with the
     highest return. Their cost is the distance of the pushes' outcome to the plan's own first subgoal and `failure_cost`
     for failures, as in `CavinPlanner`, minus `RETURN_WEIGHT` times the return. Without the return the pushes that do
@@ -49,20 +51,29 @@ class SectarPlanner(SearchingPlanner):
 
     @chunked
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
+    def plan(
+        self,
+        state: State,
+        generators: Sequence[torch.Generator],
+        previous: Plan | None = None,
+        observed: ObservedPoints | None = None,
+    ) -> Plan:
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
         effects = self.search_by_reward(self.space, state, generators, previous)
-        best = best_of(effects.returns, "returns of effect plans")
+        here = state.expand_plans(1)
+        pushes = self._actions(here, effects.at(0, lambda segment: segment.rollout.code))
+        returns = self.prefer_free(effects.returns, pushes, observed)
+        best = best_of(returns, "returns of effect plans")
         failures = None
         if self.robustness is not None:
-            hopeful, robust = effects.score_state.succeeded.any(-1), self._most_robust(effects, generators)
+            returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
+            hopeful, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, pushes, returns, generators)
             best = torch.where(hopeful, robust.number, best)
             failures = torch.where(hopeful, robust.failures, torch.nan)
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
         # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
-        here = state.expand_plans(1)
         actions = self._actions(here, effect_codes[:, :1])
         _, path = predict_states(self.model, here, actions)
         broken = (~torch.isfinite(actions).flatten(1).all(-1)).nonzero().flatten().tolist()
@@ -70,10 +81,10 @@ class SectarPlanner(SearchingPlanner):
             raise NoFiniteCandidateError(
                 broken[0], "the pushes of the chosen effect are not finite; check the model's weights"
             )
-        pushes, centers = idle_last(actions[:, 0], path[:, 0], state, self.segment_length, self.idle_distance)
+        first, centers = idle_last(actions[:, 0], path[:, 0], state, self.segment_length, self.idle_distance)
         return Plan(
-            actions=pushes,
-            planned_actions=pushes,
+            actions=first,
+            planned_actions=first,
             effect_codes=effect_codes,
             motion_codes=effect_codes.new_empty(len(actions), 0, 0),
             subgoals=chosen.states.map(lambda field: field[:, 0]),
@@ -81,14 +92,18 @@ class SectarPlanner(SearchingPlanner):
             **summary(effects, best, self.way, failures),
         )
 
-    def _most_robust(self, effects: Candidates, generators: Sequence[torch.Generator]) -> MostRobust:
-        """The successful effect plan whose first segment costs least on average; needs `robustness`."""
+    def _most_robust(
+        self, effects: Candidates, pushes: Tensor, returns: Tensor, generators: Sequence[torch.Generator]
+    ) -> MostRobust:
+        """The effect plan whose first segment `pushes: [B, N, T, 4]` costs least on average; needs `robustness`.
+
+        returns: `[B, N]`, -inf for plans that are not to be chosen.
+        """
         robustness, state = self.robustness, effects.problem.state
         assert robustness is not None
-        returns = torch.where(effects.score_state.succeeded, effects.returns, -torch.inf)
         best = returns.topk(min(robustness.candidates, effects.count), -1)
         first = effects.take(best.indices)
-        actions = self._actions(state.expand_plans(1), first.at(0, lambda segment: segment.rollout.code))
+        actions = pushes.take_along_dim(best.indices[..., None, None], 1)
         scores = torch.where(torch.isfinite(actions).all(-1).all(-1), best.values, -torch.inf)
         subgoals = State(
             first.at(0, lambda segment: segment.rollout.states.centers),

@@ -1,0 +1,61 @@
+"""Plans about the target and the objects nearest to it (our addition to Algorithm 1, line 5)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.protocol import RewardFunction, TargetedReward
+
+
+class NearestObjects(NamedTuple):
+    """The target and the m - 1 objects nearest to it, of M.
+
+    h, g and the priors read and move only these, so that a model meets no more objects than in its training. f still
+    predicts all M: an object that is left out can be in the way of a push.
+    """
+
+    numbers: Tensor | None = None  # [B, m] int64, ascending: the target, object 0, comes first; None for all objects
+
+    def of(self, state: State) -> State:
+        """These objects alone: `[B, ...]` of M objects -> `[B, ...]` of m."""
+        if self.numbers is None:
+            return state
+        numbers = _along(self.numbers, state)
+        return State(
+            state.centers.take_along_dim(numbers, -2),
+            state.features.take_along_dim(numbers, -2),
+            state.mask.take_along_dim(numbers.squeeze(-1), -1),
+        )
+
+    def among(self, others: State, these: State) -> State:
+        """States `these: [B, n]` of m objects, with all `others: [B]` of M where they are: `[B, n]` of M."""
+        if self.numbers is None:
+            return these
+        numbers, everything = _along(self.numbers, these), others.expand_plans(these.batch_shape[-1])
+        return State(
+            everything.centers.scatter(-2, numbers.expand_as(these.centers), these.centers),
+            everything.features.scatter(-2, numbers.expand_as(these.features), these.features),
+            everything.mask,
+        )
+
+
+def _along(numbers: Tensor, state: State) -> Tensor:
+    """`numbers: [B, m]` of objects, to index the fields of `state: [B, ...]`: `[B, 1 ..., m, 1]`."""
+    return numbers.reshape(len(numbers), *(1,) * (len(state.batch_shape) - 1), -1, 1)
+
+
+def nearest_objects(state: State, most: int | None, reward: RewardFunction) -> NearestObjects:
+    """The target and the objects nearest to it, `most` in all.
+
+    All objects in scenes `state: [B]` of up to `most`, and for tasks whose goal is about every object.
+    """
+    about_target = isinstance(reward, TargetedReward) and reward.about == "target"
+    if most is None or state.objects <= most or not about_target:
+        return NearestObjects()
+    distances = (state.centers[..., :2] - state.centers[:, :1, :2]).norm(dim=-1)  # [B, M] metres
+    distances = torch.where(state.mask, distances, torch.inf)
+    return NearestObjects(distances.topk(most, largest=False).indices.sort(-1).values)

@@ -1,0 +1,39 @@
+"""No push that would touch down on an object (our addition to Algorithm 1, line 10, and to the baselines).
+
+A robot does not begin such a push. f has seen them fail in its data, but reads an object's centre and feature only, and
+of a thousand motions the search finds those about which f errs. The camera sees where the objects are.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from planning.rollouts.ranking import prefer
+
+
+class ObservedPoints(NamedTuple):
+    """Points of the objects that the camera sees, and the box that normalised starts of pushes span."""
+
+    points: Tensor  # [B, P, 2] metres; infinite for no point
+    low: Tensor  # [B, 2] metres, the start -1
+    high: Tensor  # [B, 2] metres, the start 1
+
+    def blocked(self, pushes: Tensor, distance: float) -> Tensor:
+        """`[B, N]` bool: `pushes: [B, N, 4]` that start nearer than `distance` metres to a point."""
+        low, high = self.low.unsqueeze(1), self.high.unsqueeze(1)
+        starts = low + (pushes[..., :2].clamp(-1.0, 1.0) + 1.0) / 2.0 * (high - low)
+        return torch.cdist(starts, self.points).amin(-1) < distance
+
+
+def prefer_free(scores: Tensor, pushes: Tensor, observed: ObservedPoints | None, distance: float) -> Tensor:
+    """Scores `[B, N]` that leave out candidates whose first push would touch down on an object.
+
+    pushes: `[B, N, 4]`, the first of each candidate. observed: None where nothing is known. distance: metres between
+    the push's start and a point; 0 leaves out none. Where nothing would be left, the scores stay as they are.
+    """
+    if observed is None or not distance or observed.points.shape[1] == 0:
+        return scores
+    return prefer(scores, ~observed.blocked(pushes, distance))
