@@ -112,8 +112,8 @@ class CavinPlanner(SearchingPlanner):
         """Algorithm 1 for observed scenes `state: [B]`; the call advances `generators`, one per environment.
 
         `previous`: the last plans of the same episodes, whose first pushes have been executed, for the warm start.
-        `observed`: points of the objects that the camera sees, where no push may touch down. An
-        environment's plan depends on its own arguments only. For errors see `planning.backends.chunking.chunked`.
+        `observed`: points of the objects that the camera sees, where no push may touch down. An environment's plan
+        depends on its own arguments only. For errors see `planning.backends.chunking.chunked`.
         """
         reward = self.reward
         # Line 1 (K = H / T) is in the constructor. Lines 2, 3 and 12, the loop over t, are the caller's.

@@ -219,6 +219,8 @@ def test_what_we_added_to_the_papers_planner_can_be_left_out(
         "planner.avoid_failures=false",
         "planner.warm_start=false",
         "planner.idle_distance=0",
+        "planner.touchdown_distance=0",
+        "planner.nearest_objects=null",
         "pushes_per_plan=null",
         "margin=0",
         "planner.samples=8",

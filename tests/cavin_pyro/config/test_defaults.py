@@ -32,6 +32,8 @@ PAPER = {  # Algorithm 1 as it is printed
     "planner.avoid_failures": False,
     "planner.robustness": None,
     "planner.idle_distance": 0.0,
+    "planner.touchdown_distance": 0.0,
+    "planner.nearest_objects": None,
     "planner.optimizer._target_": "planning.optimizers.Shooting",
     "pushes_per_plan": None,
     "margin": 0.0,
