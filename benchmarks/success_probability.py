@@ -1,12 +1,13 @@
 """The probability of success that plans are given: its episodes, its fit and its calibration.
 
     python benchmarks/success_probability.py collect DIR --seed 10000 [--share 0.5]
-    python benchmarks/success_probability.py fit FILE FOLDER ...
-    python benchmarks/success_probability.py report FILE FOLDER ... [--picture PNG]
+    python benchmarks/success_probability.py fit FILE FOLDER ... [--half first]
+    python benchmarks/success_probability.py report FILE FOLDER ... [--half second] [--picture PNG]
 
 `collect` evaluates the shipped planners in every family of scenes, each in a folder of its own under DIR; a stopped run
 resumes. `fit` writes a regression for each planner in any folders of `python -m cavin_pyro.evaluate`, also of your own;
-`plan` and `evaluate` read it with success_probability=FILE. `report` says how well a fit predicts other episodes.
+`plan` and `evaluate` read it with success_probability=FILE. `report` says how well a fit predicts other episodes: of
+other folders, or with `--half`, by seed, of the half of each folder that the fit has not seen.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ COLUMNS = (
     *("Brier score", "base rate's", "skill"),
 )
 STYLES = (("o", "#000000"), ("s", "#0072B2"), ("^", "#D55E00"), ("v", "#009E73"), ("D", "#CC79A7"))
+HORIZON = 30  # pushes, by default
+HALVES = ("all", "first", "second")
 GENERATED = ("layout=generated", "maximum_steps=120")
 GUIDED = ("planner.guidance=layout",)
 PAPER = ("planner=paper",)
@@ -101,15 +104,28 @@ def collect(home: Path, seed: int, share: float) -> None:
         print(f"{name}: {won} of {len(rows)}, {sum(row['plans'] for row in rows)} plans", flush=True)
 
 
-def planner_of(folder: Path) -> str:
-    """The name of a planner, for people: of a cell, or the folder's."""
-    return CELLS[folder.name].planner if folder.name in CELLS else folder.name
+def read(folder: Path, half: str) -> Evaluated:
+    """An evaluation, or half of it: the episodes of lower seeds (`first`) or of higher ones (`second`)."""
+    one = read_evaluation(folder)
+    rows = sorted(one.rows, key=lambda row: int(row["seed"]))
+    middle = len(rows) // 2
+    return one._replace(rows={"all": rows, "first": rows[:middle], "second": rows[middle:]}[half])
 
 
-def fit_all(path: Path, folders: Sequence[Path], ridge: float) -> None:
+def planner_of(folder: Path, one: Evaluated) -> str:
+    """The name of a planner, for people: of a cell, or by its guidance and horizon."""
+    if folder.name in CELLS:
+        return CELLS[folder.name].planner
+    options = one.situation.planner
+    name = "default" if options.get("planner.guidance", "none") == "none" else "guided"
+    horizon = options.get("planner.horizon", HORIZON)
+    return name if horizon == HORIZON else f"{name}, horizon {horizon}"
+
+
+def fit_all(path: Path, folders: Sequence[Path], ridge: float, half: str) -> None:
     """Fit a regression for each planner, and write them."""
-    evaluations = [read_evaluation(folder) for folder in folders]
-    names = {id(one): planner_of(folder) for one, folder in zip(evaluations, folders, strict=True)}
+    evaluations = [read(folder, half) for folder in folders]
+    names = {id(one): planner_of(folder, one) for one, folder in zip(evaluations, folders, strict=True)}
     regressions = [fit(group, names[id(group[0])], ridge=ridge) for group in by_planner(evaluations)]
     seeds = sorted(row["seed"] for one in evaluations for row in one.rows)
     command = f"python benchmarks/success_probability.py {' '.join(sys.argv[1:])}"
@@ -144,14 +160,15 @@ def compared(lines: Lines) -> Calibration:
     return calibration([told for told, _ in lines], [ended for _, ended in lines])
 
 
-def report(path: Path, folders: Sequence[Path], picture: Path | None) -> None:
+def report(path: Path, folders: Sequence[Path], picture: Path | None, half: str) -> None:
     """Print the calibration overall, by planner, by family and by cell, and draw it."""
     regressions = read_regressions(path)
-    lines = {folder: predictions(regressions, read_evaluation(folder)) for folder in folders}
+    evaluations = {folder: read(folder, half) for folder in folders}
+    lines = {folder: predictions(regressions, one) for folder, one in evaluations.items()}
     groups: dict[str, Lines] = {"all": [line for some in lines.values() for line in some]}
     for folder, some in lines.items():
         cell = CELLS.get(folder.name)
-        for name in (f"planner: {planner_of(folder)}", cell.family if cell else folder.name):
+        for name in (f"planner: {planner_of(folder, evaluations[folder])}", cell.family if cell else folder.name):
             groups.setdefault(name, []).extend(some)
     print(f"| | {' | '.join(COLUMNS)} |\n|{' --- |' * (1 + len(COLUMNS))}")
     for name, some in sorted(groups.items(), key=lambda one: (one[0] != "all", not one[0].startswith("planner"))):
@@ -215,6 +232,7 @@ def main() -> None:
         one = commands.add_parser(name, help=about)
         one.add_argument("file", type=Path, help="of the fit, .json")
         one.add_argument("folders", type=Path, nargs="+", help="of python -m cavin_pyro.evaluate")
+        one.add_argument("--half", choices=HALVES, default="all", help="of the episodes of each folder, by seed")
         if name == "fit":
             one.add_argument("--ridge", type=float, default=RIDGE, help="inverse variance of the slopes' prior")
         else:
@@ -224,9 +242,9 @@ def main() -> None:
         if given.command == "collect":
             collect(given.folder, given.seed, given.share)
         elif given.command == "fit":
-            fit_all(given.file, given.folders, given.ridge)
+            fit_all(given.file, given.folders, given.ridge, given.half)
         else:
-            report(given.file, given.folders, given.picture)
+            report(given.file, given.folders, given.picture, given.half)
     except UserError as error:
         parser.exit(2, f"{error}\n")
 

@@ -61,14 +61,15 @@ class SectarPlanner(SearchingPlanner):
         """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
         effects = self.search_by_reward(self.space, state, generators, previous)
-        here = state.expand_plans(1)
-        pushes = self._actions(here, effects.at(0, lambda segment: segment.rollout.code))
-        returns = self.prefer_free(effects.returns, pushes, observed)
+        here, returns = state.expand_plans(1), effects.returns
+        if observed is not None and self.touchdown_distance:
+            pushes = self._actions(here, effects.at(0, lambda segment: segment.rollout.code))
+            returns = self.prefer_free(returns, pushes, observed)
         best = best_of(returns, "returns of effect plans")
         failures = None
         if self.robustness is not None:
             returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
-            hopeful, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, pushes, returns, generators)
+            hopeful, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, returns, generators)
             best = torch.where(hopeful, robust.number, best)
             failures = torch.where(hopeful, robust.failures, torch.nan)
         chosen = effects.take(best.unsqueeze(-1))
@@ -92,10 +93,8 @@ class SectarPlanner(SearchingPlanner):
             **summary(effects, best, self.way, failures),
         )
 
-    def _most_robust(
-        self, effects: Candidates, pushes: Tensor, returns: Tensor, generators: Sequence[torch.Generator]
-    ) -> MostRobust:
-        """The effect plan whose first segment `pushes: [B, N, T, 4]` costs least on average; needs `robustness`.
+    def _most_robust(self, effects: Candidates, returns: Tensor, generators: Sequence[torch.Generator]) -> MostRobust:
+        """The effect plan whose first segment costs least on average; needs `robustness`.
 
         returns: `[B, N]`, -inf for plans that are not to be chosen.
         """
@@ -103,7 +102,7 @@ class SectarPlanner(SearchingPlanner):
         assert robustness is not None
         best = returns.topk(min(robustness.candidates, effects.count), -1)
         first = effects.take(best.indices)
-        actions = pushes.take_along_dim(best.indices[..., None, None], 1)
+        actions = self._actions(state.expand_plans(1), first.at(0, lambda segment: segment.rollout.code))
         scores = torch.where(torch.isfinite(actions).all(-1).all(-1), best.values, -torch.inf)
         subgoals = State(
             first.at(0, lambda segment: segment.rollout.states.centers),

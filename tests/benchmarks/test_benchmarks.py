@@ -164,12 +164,14 @@ def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_ep
     )
     file, picture = str(tmp_path / "fit.json"), tmp_path / "reliability.png"
     printed = run("success_probability", "fit", file, str(fitted))
-    assert re.search(r"^fit: \d+ of 400 episodes succeeded, \d+ plans$", printed, re.M)
+    assert re.search(r"^default: \d+ of 400 episodes succeeded, \d+ plans$", printed, re.M)
     lines = run("success_probability", "report", file, str(fresh), str(other), "--picture", str(picture)).splitlines()
     table = {line.split(" | ")[0].strip("| "): line.split(" | ")[1:] for line in lines[2:]}
-    assert list(table) == ["all", "planner: fresh", "fresh"]  # the other planner was not fitted
+    assert list(table) == ["all", "planner: default", "fresh"]  # the other planner was not fitted
     assert table["all"][0] == "400" and float(table["all"][4].split()[0]) < 0.08
     assert picture.stat().st_size > 10_000
+    halves = [run("success_probability", "report", file, str(fresh), "--half", half) for half in ("first", "second")]
+    assert [text.splitlines()[2].split(" | ")[1] for text in halves] == ["200", "200"] and halves[0] != halves[1]
     refused = run_script(ROOT / "benchmarks" / "success_probability.py", "fit", file, str(tmp_path), folder=ROOT)
     assert refused.status == 2 and refused.errors == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
 
