@@ -177,7 +177,7 @@ def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_ep
 
 
 def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:
-    few = ("--objects", "2", "6", "--neighbours", "4", "9", "--repetitions", "1")
+    few = ("--objects", "2", "6", "--neighbours", "4", "9", "--nearest", "2", "--repetitions", "1")
     _, *rows = run("many_objects", *few, "--options", "planner.samples=8", "planner.horizon=6").splitlines()
     assert [row.split()[:2] for row in rows] == [["2", "4"], ["6", "4"], ["6", "9"]]
     for row in rows:
