@@ -128,11 +128,16 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
     torch.set_float32_matmul_precision("highest")
     monkeypatch.setattr(Distribution, "_validate_args", True)  # as torch has it, and other tests may not
     monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", 1)
-    state = toy.scenes([[(0.1 * number, 0.0), (0.3, 0.2)] for number in range(4)], gains=(1.0, 0.0))
+    # The last object is not among the nearest two, and moves.
+    places = [[(0.1 * number, 0.0), (0.3, 0.2), (0.9, 0.9)] for number in range(4)]
+    state = toy.scenes(places, gains=(1.0, 0.0, 0.5))
+    reward = toy.GoalDisc(goal=(0.4, 0.1), forbidden_below=-0.05)
+    reward.about = "target"
     eager_planner, compiled = (
         toy.plain(
             toy.PointMass(),
-            toy.GoalDisc(goal=(0.4, 0.1), forbidden_below=-0.05),
+            reward,
+            nearest_objects=2,
             samples=64,
             horizon=9,
             warm_start=True,
@@ -142,6 +147,7 @@ def test_a_compiled_planner_makes_the_plans_of_a_direct_one(
         for compile in (False, True)
     )
     expected = eager_planner.plan(state, toy.generators(*range(4)))
+    assert expected.candidate_centers.shape[-2] == 2 < expected.predicted_centers.shape[-2]
     threads = torch.get_num_threads()
     torch.set_num_threads(2)  # so that two environments are planned at once
     try:
