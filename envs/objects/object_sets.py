@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -14,6 +11,7 @@ from envs.objects.asset import ObjectAsset, listed, plain_name
 from envs.objects.random_shapes import RANDOM_NAMES, random_shape
 from envs.objects.scans import ScannedObjects
 from envs.objects.shapes import BUILTIN_NAMES, Shape, builtin_shape, write_mesh
+from envs.process_folder import process_folder
 
 
 class ObjectSet(Protocol):
@@ -112,6 +110,4 @@ def _asset(shape: Shape) -> ObjectAsset:
 
 @cache
 def _mesh_folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="cavin_pyro_meshes_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+    return process_folder("meshes")

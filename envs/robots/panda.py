@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 from envs.physics import PYBULLET_DATA, ArmDescription
 from envs.physics.arm import STICK, TIP
+from envs.process_folder import process_folder
 from envs.robots.robot import STICK_LENGTH, STICK_RADIUS
 
 POSTURE = (0.0, 0.3, 0.0, -1.8, 0.0, 2.2, 0.78)  # radians
@@ -63,8 +61,6 @@ def _urdf() -> Path:
         _JOINT.format(parent=STICK, child=TIP, height=STICK_LENGTH),
     ):
         robot.append(ElementTree.fromstring(text))
-    folder = Path(tempfile.mkdtemp(prefix="cavin_pyro_panda_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    path = folder / "panda_stick.urdf"
+    path = process_folder("panda") / "panda_stick.urdf"
     tree.write(path)
     return path
