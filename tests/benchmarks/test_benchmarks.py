@@ -177,11 +177,12 @@ def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_ep
 
 
 def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:
-    few = ("--objects", "2", "6", "--neighbours", "4", "9", "--nearest", "2", "--repetitions", "1")
+    few = ("--objects", "2", "6", "--neighbours", "4", "9", "--nearest", "0", "2", "--repetitions", "1")
     _, *rows = run("many_objects", *few, "--options", "planner.samples=8", "planner.horizon=6").splitlines()
-    assert [row.split()[:2] for row in rows] == [["2", "4"], ["6", "4"], ["6", "9"]]
+    cases = [["2", "4"], ["6", "4"], ["6", "9"]]
+    assert [row.split()[:3] for row in rows] == [[*case, nearest] for case in cases for nearest in ("0", "2")]
     for row in rows:
-        milliseconds, moved, _, apart, _, _ = row.split()[2:]
+        milliseconds, moved, _, apart, _, _ = row.split()[3:]
         assert float(milliseconds) > 0 and 0 < float(moved) < 6 and 0 < float(apart) < 20
 
 
