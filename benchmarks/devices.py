@@ -28,9 +28,9 @@ from torch.nn import functional
 from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import free_memory
+from cavin_pyro.data.observed import observed_state
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.evaluation.factory import make_runner
-from cavin_pyro.evaluation.rollout import observed_state
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.trainer import Trainer
 from guides.cascaded import CascadedGuide

@@ -29,8 +29,8 @@ def first_plan(began: float, options: list[str]) -> None:
     import torch
 
     from cavin_pyro.config.composition import compose
+    from cavin_pyro.data.observed import observed_state
     from cavin_pyro.evaluation.factory import make_runner
-    from cavin_pyro.evaluation.rollout import observed_state
 
     runner = make_runner(compose("plan", *options, "output=unused"))
     state = observed_state(runner.env.reset(seed=0)[0], runner.geometry)

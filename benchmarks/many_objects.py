@@ -23,8 +23,8 @@ sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")
 import torch
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.factory import make_runner
-from cavin_pyro.evaluation.rollout import observed_points, observed_state
 from models.cascaded import CascadedModel
 from models.state import State
 from planning import CavinPlanner

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.data.observed import observed_state
 from cavin_pyro.evaluation.factory import make_runner
-from cavin_pyro.evaluation.rollout import observed_state
 from planning.extensions import perturbed_rollouts as extension
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts, sequential_halving
 

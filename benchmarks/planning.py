@@ -27,8 +27,8 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.data.observed import observed_state
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
-from cavin_pyro.evaluation.rollout import observed_state
 from envs.tasks import TaskReward
 from models.state import State
 from planning import MpcPlanner, Planner, PlanningModel

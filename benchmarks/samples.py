@@ -33,9 +33,9 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.observed import observed_state
 from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
 from cavin_pyro.evaluation.factory import make_runner
-from cavin_pyro.evaluation.rollout import observed_state
 from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.pipeline import SHARED

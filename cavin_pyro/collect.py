@@ -11,13 +11,13 @@ from cavin_pyro.config.application import command
 
 @command("collect")
 def main(config: DictConfig) -> None:
-    """Collect random pushes by the heuristic policy into a dataset folder, with a picture of their statistics.
+    """Collect pushes by the heuristic policy, or by a model, into a dataset folder, with a picture of their statistics.
 
     Resumes an interrupted run.
     """
     from cavin_pyro.config.commands.collection import CollectionOptions
     from cavin_pyro.config.errors import UserError
-    from cavin_pyro.data.collection import collect, repair
+    from cavin_pyro.data.collection import check_policy, collect, repair
     from cavin_pyro.data.summary import summarize_data
     from cavin_pyro.data.world import collecting_world
     from cavin_pyro.launching.launcher import Launcher
@@ -34,6 +34,7 @@ def main(config: DictConfig) -> None:
         collecting_world(config.env),
         **{one.name: config[one.name] for one in fields(CollectionOptions)},
     )
+    check_policy(collection)
     with output_folder(config.output) as folder:
         if config.repair:
             print(f"{repair(collection, folder)} files collected again")

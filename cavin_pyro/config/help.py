@@ -46,6 +46,7 @@ HEADINGS = {  # of the groups, in the order of the page
     "planning": "Planning",
     "model": "Model",
     "data": "Data",
+    "policy": "Policy",
     "training": "Training",
     "trainer": "Trainer",
     "windows": "Training windows",

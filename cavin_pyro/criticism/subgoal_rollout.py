@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.data.collection import clutter_area, open_scene
-from cavin_pyro.evaluation.rollout import observed_state
+from cavin_pyro.data.observed import observed_state
 from envs.objects.sampling import ObjectRanges
 from envs.observation import Observation
 from envs.scene import Scene

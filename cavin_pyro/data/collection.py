@@ -17,7 +17,10 @@ from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptio
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
+from cavin_pyro.data.model_policy import ModelPushingPolicy, PushingPolicy, load_pusher
 from cavin_pyro.launching.launcher import Launcher, as_launcher
+from cavin_pyro.storage.checkpoint import find_checkpoint
+from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.object_sets import load_object_set
@@ -27,9 +30,12 @@ from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
 from envs.scene import PushReport, Scene
 from envs.workspace import POINTS_PER_OBJECT, object_slots
+from models.model import Model
+from models.networks.geometry import Geometry
 
 TIMING_FILE = "timing.csv"
 TIMING_HEADER = "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
+PUSHER = "contact"  # the checkpoint of policy=model, without another
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
 
 
@@ -39,7 +45,7 @@ class CollectionConfig(CollectionOptions):
 
     Attributes:
         ranges: object parameters. object_set: by name. assets: folder of meshes, for a set that needs one; its path
-            does not affect the data.
+            does not affect the data. Of a checkpoint its content does, not its path.
         camera, segmentation: by name, see `envs.scene.Scene`.
     """
 
@@ -98,9 +104,7 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
     count = int(scene_generator.integers(config.minimum_objects, config.maximum_objects + 1))
     with user_input():
         observation = scene.sample([clutter_area(scene_generator)] * count, config.ranges, scene_generator)
-    policy = HeuristicPushingPolicy(
-        policy_generator, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
-    )
+    policy = _policy(config, policy_generator)
     arrays = _blank(config, scene)
     arrays["mask"][:] = observation.mask
     arrays["episode"] = np.array(episode, np.int64)
@@ -115,6 +119,26 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
         if report.fallen:
             break
     return arrays
+
+
+def check_policy(config: CollectionConfig) -> None:
+    """Check that the pushes can be chosen, before anything is written.
+
+    Raises:
+        UserError: the checkpoint cannot be used, or there is one for nothing.
+    """
+    if config.policy == "model":
+        _pusher(config.checkpoint or PUSHER)
+    elif config.checkpoint is not None:
+        raise UserError(f"checkpoint={config.checkpoint} is of policy=model: add that, or leave checkpoint")
+
+
+def _policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:
+    if config.policy == "model":
+        return ModelPushingPolicy(generator, *_pusher(config.checkpoint or PUSHER), motions=config.motions)
+    return HeuristicPushingPolicy(
+        generator, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
+    )
 
 
 def clutter_area(generator: np.random.Generator) -> Area:
@@ -153,9 +177,7 @@ def _record_observation(arrays: Arrays, step: int, observation: Observation) -> 
     arrays["visible"][step] = observation.visible
 
 
-def _record_push(
-    arrays: Arrays, step: int, action: np.ndarray, report: PushReport, policy: HeuristicPushingPolicy
-) -> None:
+def _record_push(arrays: Arrays, step: int, action: np.ndarray, report: PushReport, policy: PushingPolicy) -> None:
     arrays["actions"][step] = action
     arrays["moved"][step, : len(report.moved)] = report.moved
     arrays["unsafe"][step], arrays["ineffective"][step] = report.unsafe, report.ineffective
@@ -182,6 +204,12 @@ def open_scene(config: CollectionConfig) -> Scene:
 def _scene(**parts: Any) -> Scene:
     """One per worker process."""
     return open_scene(CollectionConfig(**parts))
+
+
+@cache
+def _pusher(checkpoint: str) -> tuple[Model, Geometry]:
+    """One per worker process."""
+    return load_pusher(checkpoint)
 
 
 def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str, float]]:
@@ -212,6 +240,7 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
     """Metadata of the dataset so far, checked against the requested configuration."""
     wanted, usual = (_plain(asdict(one)) for one in (config, CollectionConfig()))
     del wanted["assets"], usual["assets"]
+    wanted["checkpoint"] = _digest(config)
     if not (folder / "metadata.json").exists():
         metadata = {
             "configuration": wanted,
@@ -240,6 +269,13 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
                 "resume with the same options, or choose another output=DIR"
             )
     return metadata
+
+
+def _digest(config: CollectionConfig) -> str | None:
+    """The SHA-256 of the checkpoint that chooses the pushes, which counts in place of its name."""
+    if config.policy != "model":
+        return None
+    return file_digest(find_checkpoint(config.checkpoint or PUSHER))
 
 
 def _write(folder: Path, metadata: dict[str, Any]) -> None:

@@ -9,8 +9,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from cavin_pyro.data.observed import observed_state
 from cavin_pyro.evaluation.factory import make_runner
-from cavin_pyro.evaluation.rollout import observed_state
 from envs.randomness import planner_seed
 from models.state import State
 

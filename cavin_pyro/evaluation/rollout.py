@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.success.prospects import Prospects, prospects_of
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
-from envs.workspace import REACH_HIGH, REACH_LOW
 from models.networks.geometry import Geometry
-from models.state import State
 from planning import Plan, Planner
-from planning.extensions.touchdown import ObservedPoints
 from planning.protocol import SeeingPlanner
 from planning.records import apply
 
@@ -112,29 +110,6 @@ class Episode:
         transitions = self.transitions[record.step : min(later, default=len(self.transitions))]
         centers = np.array([transition.centers for transition in transitions], dtype=np.float32)
         return centers.reshape(-1, *record.centers.shape)
-
-
-@torch.inference_mode()
-def observed_state(observation: ObservationDict, geometry: Geometry, device: str | torch.device = "cpu") -> State:
-    """The planner's state, a batch of one, from an observation, without needless padding.
-
-    Args:
-        observation: as of `envs.pushing.PushingEnv`, [M, ...]. device: of the state; `geometry` is on the CPU.
-    """
-    objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1
-    centers = torch.from_numpy(observation["centers"][:objects])
-    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
-    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
-    state = State(centers[None], geometry(clouds)[None], mask[None])
-    return state.map(lambda field: field.to(device))
-
-
-def observed_points(observation: ObservationDict, device: str | torch.device = "cpu") -> ObservedPoints:
-    """The points of real objects in an observation, a batch of one: `points: [1, P, 2]` metres."""
-    real = observation["mask"].astype(np.bool_)
-    points = torch.from_numpy(observation["clouds"][real][..., :2].reshape(1, -1, 2))
-    low, high = (torch.tensor([corner], dtype=points.dtype) for corner in (REACH_LOW, REACH_HIGH))
-    return ObservedPoints(*(field.to(device) for field in (points, low, high)))
 
 
 class EpisodeCallback:

@@ -19,11 +19,13 @@ from pyro.infer import (
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
+from cavin_pyro.training.consistency import consistency_loss
 from cavin_pyro.training.counterfactual import counterfactual_loss
 from cavin_pyro.training.gradients import loss_with_gradients
 from cavin_pyro.training.rollout import rollout_loss
 from guides.guide import Guide
 from models.model import Model
+from models.priors.standard import StandardPrior
 from models.state import Window
 
 CODES = ("effect_code", "motion_code")
@@ -31,12 +33,13 @@ COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanFi
 
 
 class Objective:
-    """A bound, with optional weights of its KL terms, their warm-up, and two other terms.
+    """A bound, with optional weights of its KL terms, their warm-up, and three other terms.
 
     loss = -bound(with KL term i weighted by w_i * min(1, (step + 1) / warm_up_steps))
            + counterfactual_weight * counterfactual_loss + rollout_weight * rollout_loss
+           + consistency_weight * consistency_loss
 
-    With weights of one, no warm-up and neither term, the defaults, this is the bound and nothing else.
+    With weights of one, no warm-up and no other term, the defaults, this is the bound and nothing else.
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: per code, positive. warm_up_steps: over which the weights of the
@@ -44,6 +47,9 @@ class Objective:
         counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`.
         rollout_weight: of the error where f reads its own predictions, see `cavin_pyro.training.rollout`. The bound
             contains each push already, so a weight trades its density for the accuracy of rollouts.
+        consistency_weight: of how likely sampled motions reach the subgoal, see `cavin_pyro.training.consistency`; it
+            changes the prior of motions alone.
+        consistency_motions, consistency_windows: how many motions for each effect, and how many windows of a batch.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
@@ -57,18 +63,24 @@ class Objective:
         warm_up_steps: int = 0,
         counterfactual_weight: float = 0.0,
         rollout_weight: float = 0.0,
+        consistency_weight: float = 0.0,
+        consistency_motions: int = 32,
+        consistency_windows: int = 32,
     ) -> None:
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
         self.warm_up_steps = warm_up_steps
         self.counterfactual_weight = counterfactual_weight
         self.rollout_weight = rollout_weight
+        self.consistency_weight = consistency_weight
+        self.consistency_sizes = {"motions": consistency_motions, "windows": consistency_windows}
         for name, weight in self.kl_weights.items():
             if name not in CODES:
                 raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
             if not weight > 0:
                 raise ValueError(f"objective.kl_weights.{name} must be positive, not {weight:g}")
-        numbers = {name: getattr(self, name) for name in ("warm_up_steps", "counterfactual_weight", "rollout_weight")}
+        weights = ("counterfactual_weight", "rollout_weight", "consistency_weight")
+        numbers = {name: getattr(self, name) for name in ("warm_up_steps", *weights)}
         if wrong := [name for name, value in numbers.items() if not 0 <= value < math.inf]:
             raise ValueError(f"objective.{wrong[0]} must be 0 or more, not {numbers[wrong[0]]:g}")
         if counterfactual_weight and elbo.num_particles != 1:
@@ -106,6 +118,16 @@ class Objective:
                 "choose model= from cascaded, single_latent, flat"
             )
 
+        if self.consistency_weight and set(CODES) - set(model.codes):
+            raise ValueError(
+                "objective consistent needs a model whose motions have a prior of their own, given the effect, and "
+                f"{type(model).__name__} has none: choose model=cascaded"
+            )
+        if self.consistency_weight and isinstance(model.get_submodule("prior_of_motions"), StandardPrior):
+            raise ValueError(
+                "objective consistent fits the prior of motions, and prior=standard has nothing to fit: choose "
+                "prior=conditional, mixture or flow"
+            )
         if self.elbo.num_particles > 1 and not model.codes:
             raise ValueError(
                 f"objective with {self.elbo.num_particles} particles needs a model with codes, and "
@@ -117,9 +139,14 @@ class Objective:
         ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
         return {name: ramp * self.kl_weights.get(name, 1.0) for name in CODES}
 
-    def rollout_term(self, model: Model, window: Window) -> Tensor | None:
-        """The weighted `rollout_loss`, summed over the windows `[B]`, a scalar; None without weight."""
-        return self.rollout_weight * rollout_loss(model, window) if self.rollout_weight else None
+    def terms_of_model(self, model: Model, window: Window) -> dict[str, Tensor]:
+        """The weighted terms beside the bound that read the model alone, summed over the windows `[B]`, scalars."""
+        terms = {}
+        if self.rollout_weight:
+            terms["rollout"] = self.rollout_weight * rollout_loss(model, window)
+        if self.consistency_weight:
+            terms["consistency"] = self.consistency_weight * consistency_loss(model, window, **self.consistency_sizes)
+        return terms
 
     def bind(self, model: Model, guide: Guide) -> BoundObjective:
         """The loss of one model and guide, as a module with the parameters of both."""
@@ -136,9 +163,8 @@ class BoundObjective(nn.Module):
 
     def forward(self, window: Window, step: int) -> Tensor:
         """The loss summed over the windows `[B]`, a scalar, at a step counted from 0."""
-        rollout = self.objective.rollout_term(self.model, window)
         bound = self._bound(window, step)
-        return bound if rollout is None else bound + rollout
+        return sum(self.objective.terms_of_model(self.model, window).values(), bound)
 
     def _bound(self, window: Window, step: int) -> Tensor:
         objective = self.objective

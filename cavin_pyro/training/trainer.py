@@ -177,9 +177,9 @@ class Trainer:
                 loss += sum(
                     value.item() for value in elbo_terms(self.model, self.guide, window, encoded=encoded).values()
                 )
-                if (rollout := self._objective.rollout_term(self.model, window)) is not None:
-                    loss += rollout.item()
-                    totals["rollout"] = totals.get("rollout", 0.0) + rollout.item()
+                for name, term in self._objective.terms_of_model(self.model, window).items():
+                    loss += term.item()
+                    totals[name] = totals.get(name, 0.0) + term.item()
         count = sum(len(part) for part in parts)
         return {name: value / count for name, value in totals.items()}, loss / count
 

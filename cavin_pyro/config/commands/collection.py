@@ -10,6 +10,8 @@ from cavin_pyro.config.commands.world import WorldConfig, collection_world
 from cavin_pyro.config.options import option, seed_option
 from envs.workspace import OBJECT_SLOTS
 
+POLICIES = ("heuristic", "model")
+
 
 @dataclass
 class CollectionOptions:
@@ -27,6 +29,17 @@ class CollectionOptions:
     perturbation_rate: float = option(
         0.3, "fraction of pushes with a perturbed start", minimum=0, maximum=1, group="data"
     )
+    policy: str = option(
+        "heuristic",
+        "what chooses the pushes; model takes effects of a checkpoint's prior, and of its motions for each the one "
+        "that comes nearest by its f",
+        choices=POLICIES,
+        group="policy",
+    )
+    checkpoint: str | None = option(
+        None, "of policy=model: a shipped one, or the path of one from train; by default contact", group="policy"
+    )
+    motions: int = option(256, "for each effect, of policy=model", minimum=1, group="policy", limit=10**6)
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
     maximum_objects: int = option(
         OBJECT_SLOTS,

@@ -65,7 +65,7 @@ BAD_OPTIONS = [
     (
         "train",
         "objective=nonsense",
-        "unknown objective 'nonsense': choose from counterfactual, iwae, mean_field_elbo, renyi, "
+        "unknown objective 'nonsense': choose from consistent, counterfactual, iwae, mean_field_elbo, renyi, "
         "rollout, trace_elbo, trace_enum_elbo, trace_graph_elbo",
     ),
     ("train", "trainer.schedule=linear", "unknown trainer.schedule 'linear': choose from constant, cosine"),

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.observed import observed_state
 from cavin_pyro.evaluation.evaluation import episode_row, evaluate
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import (
@@ -19,7 +20,6 @@ from cavin_pyro.evaluation.rollout import (
     EpisodeCallback,
     PlanRecord,
     Transition,
-    observed_state,
     rollout,
 )
 from cavin_pyro.storage.checkpoint import save_checkpoint

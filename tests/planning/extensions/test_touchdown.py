@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavin_pyro.evaluation.rollout import observed_points
+from cavin_pyro.data.observed import observed_points
 from envs.pushing import PushingEnv
 from envs.workspace import push_endpoints
 from models.state import State

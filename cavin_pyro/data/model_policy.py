@@ -1,0 +1,114 @@
+"""Pushes by a trained cascade, to collect data where its f is asked: among motions that it takes for the best.
+
+A planner picks of a thousand motions the one with the best prediction, and so those about which f errs. The heuristic
+makes few such pushes. Rounds of collection with the model, and training on them, show f what came of its choices
+(Ross, Gordon and Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret online
+learning").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.parts import build_model
+from cavin_pyro.data.observed import observed_points, observed_state
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
+from cavin_pyro.storage.geometry import geometry_of
+from envs.observation import Observation
+from envs.policy import Intent
+from models.model import Model
+from models.networks.geometry import Geometry
+from planning.extensions.touchdown import prefer_free
+from planning.rollouts.dynamics import predict_states
+from planning.rollouts.ranking import best_of, squared_distance
+from planning.rollouts.sampling import sample_each
+
+TOUCHDOWN_DISTANCE = 0.015  # metres, the default of planner.touchdown_distance
+
+
+class PushingPolicy(Protocol):
+    """Chooses the pushes of a collection. `intent`: what its latest push was for."""
+
+    intent: Intent
+
+    def act(self, observation: Observation) -> NDArray[np.floating]:
+        """The next normalised push [4]."""
+
+
+class ModelPushingPolicy:
+    """One segment of Algorithm 1 without a task: an effect of the prior, and the motion that by f comes nearest to it.
+
+    c ~ p(c | s); z_n ~ p(z | s, c), a_n = mean of g, for n = 1, ..., N; the T pushes of the best n by line 10, of those
+    whose first push touches down on no object. Then it observes the table and begins again.
+
+    Args:
+        generator: all of the policy's randomness. motions: N.
+    """
+
+    def __init__(self, generator: np.random.Generator, model: Model, geometry: Geometry, *, motions: int) -> None:
+        self._random = torch.Generator().manual_seed(int(generator.integers(2**62)))
+        self._model, self._geometry, self._motions = model, geometry, motions
+        self._left: list[NDArray[np.float32]] = []
+        self.intent = Intent(0, 0.0)
+
+    def act(self, observation: Observation) -> NDArray[np.floating]:
+        """See `PushingPolicy`."""
+        if not self._left:
+            with _one_thread():  # sums of several threads may differ in the last digit
+                self._left = self._segment(observation)
+        return self._left.pop(0)
+
+    @torch.inference_mode()
+    def _segment(self, observation: Observation) -> list[NDArray[np.float32]]:
+        model, seen = self._model, vars(observation)
+        state = observed_state(seen, self._geometry)
+        here, plans = state.expand_plans(1), state.expand_plans(self._motions)
+        effect_code = sample_each(model.effect_prior, [here], [self._random])
+        subgoal = model.subgoal(here, effect_code)
+        codes = effect_code.expand(-1, self._motions, -1)
+        motion_code = sample_each(model.motion_prior, [plans, codes], [self._random])
+        pushes = model.actions(here, effect_code=codes, motion_code=motion_code)
+        ends, _ = predict_states(model, here, pushes)
+        scores = prefer_free(
+            -squared_distance(ends, subgoal), pushes[:, :, 0], observed_points(seen), TOUCHDOWN_DISTANCE
+        )
+        best = int(best_of(scores, "distances of motions to the subgoal"))
+        moves = (subgoal.centers - here.centers)[0, 0, :, :2] * state.mask[0, :, None]
+        target = int(moves.norm(dim=-1).argmax())
+        self.intent = Intent(target, float(torch.atan2(moves[target, 1], moves[target, 0])))
+        return list(pushes[0, best].clamp(-1.0, 1.0).numpy())
+
+
+def load_pusher(name: str) -> tuple[Model, Geometry]:
+    """The model and the geometric features of a checkpoint, for `ModelPushingPolicy`.
+
+    Raises:
+        UserError: it cannot be used, or its model has not both codes.
+    """
+    path = find_checkpoint(name)
+    checkpoint = load_checkpoint(path)
+    geometry = geometry_of(checkpoint, path)
+    if "model" not in checkpoint.config:
+        raise UserError(f"checkpoint {path} holds no model: give one that train has written")
+    model = build_model(checkpoint.config)
+    if model.codes != ("effect_code", "motion_code"):
+        raise UserError(f"policy=model needs a cascade, and checkpoint {path} has model {model.name}: choose cavin")
+    checkpoint.load_into("model", model, path)
+    return model.requires_grad_(False).eval(), geometry
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,41 @@
+"""From an observation of the table to what models and planners read: the state, and the points that the camera sees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from envs.workspace import REACH_HIGH, REACH_LOW
+from models.networks.geometry import Geometry
+from models.state import State
+from planning.extensions.touchdown import ObservedPoints
+
+
+@torch.inference_mode()
+def observed_state(
+    observation: Mapping[str, NDArray[Any]], geometry: Geometry, device: str | torch.device = "cpu"
+) -> State:
+    """The planner's state, a batch of one, from an observation, without needless padding.
+
+    Args:
+        observation: `centers`, `clouds` and `mask` of `envs.observation.Observation`, [M, ...].
+        device: of the state; `geometry` is on the CPU.
+    """
+    objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1
+    centers = torch.from_numpy(observation["centers"][:objects])
+    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
+    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
+    state = State(centers[None], geometry(clouds)[None], mask[None])
+    return state.map(lambda field: field.to(device))
+
+
+def observed_points(observation: Mapping[str, NDArray[Any]], device: str | torch.device = "cpu") -> ObservedPoints:
+    """The points of real objects in an observation, a batch of one: `points: [1, P, 2]` metres."""
+    real = observation["mask"].astype(np.bool_)
+    points = torch.from_numpy(observation["clouds"][real][..., :2].reshape(1, -1, 2))
+    low, high = (torch.tensor([corner], dtype=points.dtype) for corner in (REACH_LOW, REACH_HIGH))
+    return ObservedPoints(*(field.to(device) for field in (points, low, high)))

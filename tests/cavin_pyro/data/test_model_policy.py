@@ -1,0 +1,141 @@
+"""Pushes that a model chooses: what they are, that the seed alone determines them, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.collection import check_policy, collect
+from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path
+from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
+from cavin_pyro.data.observed import observed_points, observed_state
+from cavin_pyro.storage.checkpoint import find_checkpoint
+from cavin_pyro.storage.digests import file_digest
+from envs.objects.sampling import WHOLE_TABLE, ObjectRanges
+from envs.observation import Observation
+from envs.scene import Scene
+from models.model import Model
+from models.networks.geometry import Geometry
+from planning.rollouts.dynamics import predict_states
+
+MOTIONS = 32
+
+
+@pytest.fixture(scope="module")
+def pusher() -> tuple[Model, Geometry]:
+    return load_pusher("cavin")
+
+
+@pytest.fixture(scope="module")
+def observation() -> Observation:
+    scene = Scene()
+    generator = np.random.default_rng(1)
+    seen = scene.sample([WHOLE_TABLE] * 3, ObjectRanges(clearance=0.15), generator)
+    scene.close()
+    return seen
+
+
+def chosen(pusher: tuple[Model, Geometry], observation: Observation, seed: int, motions: int) -> np.ndarray:
+    policy = ModelPushingPolicy(np.random.default_rng(seed), *pusher, motions=motions)
+    return np.stack([policy.act(observation) for _ in range(3)])
+
+
+@torch.inference_mode()
+def distance_to_where_the_intent_points(
+    pusher: tuple[Model, Geometry], observation: Observation, seed: int, motions: int
+) -> float:
+    """How far f sees the intended object from its place in the subgoal, after the pushes of one segment."""
+    model, geometry = pusher
+    policy = ModelPushingPolicy(np.random.default_rng(seed), model, geometry, motions=motions)
+    pushes = np.stack([policy.act(observation) for _ in range(3)])
+    state = observed_state(vars(observation), geometry)
+    random = torch.Generator().manual_seed(int(np.random.default_rng(seed).integers(2**62)))
+    code = model.effect_prior(state).base_dist
+    effect = code.loc + code.scale * torch.randn(1, 16, generator=random)
+    subgoal = model.subgoal(state, effect).centers[0, policy.intent.target, :2]
+    ends, _ = predict_states(model, state.expand_plans(1), torch.from_numpy(pushes)[None, None])
+    return float((ends.centers[0, 0, policy.intent.target, :2] - subgoal).norm())
+
+
+def test_of_more_motions_the_best_comes_nearer_to_the_subgoal(
+    pusher: tuple[Model, Geometry], observation: Observation
+) -> None:
+    one, many = (
+        np.mean([distance_to_where_the_intent_points(pusher, observation, seed, motions) for seed in range(12)])
+        for motions in (1, 256)
+    )
+    assert many < 0.4 * one
+
+
+def test_no_segment_begins_on_an_object(pusher: tuple[Model, Geometry], observation: Observation) -> None:
+    first = torch.from_numpy(np.stack([chosen(pusher, observation, seed, 64)[0] for seed in range(20)]))
+    assert not observed_points(vars(observation)).blocked(first[None], 0.015).any()
+
+
+def test_pushes_lie_in_the_box_and_the_intent_names_an_object(
+    pusher: tuple[Model, Geometry], observation: Observation
+) -> None:
+    policy = ModelPushingPolicy(np.random.default_rng(2), *pusher, motions=MOTIONS)
+    for _ in range(9):
+        push = policy.act(observation)
+        assert push.shape == (4,)
+        assert (np.abs(push) <= 1).all()
+        assert observation.mask[policy.intent.target]
+        assert -np.pi <= policy.intent.angle <= np.pi
+
+
+def test_the_seed_determines_the_pushes_whatever_the_number_of_threads(
+    pusher: tuple[Model, Geometry], observation: Observation
+) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        two = chosen(pusher, observation, 4, MOTIONS)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    np.testing.assert_array_equal(chosen(pusher, observation, 4, MOTIONS), two)
+    assert not np.array_equal(chosen(pusher, observation, 5, MOTIONS), two)
+
+
+def test_a_collection_by_a_model_is_the_same_for_any_number_of_workers(
+    small: SimpleNamespace, pushes: Path, tmp_path: Path
+) -> None:
+    config = replace(small.pushes, policy="model", checkpoint="cavin", motions=8)
+    for workers in (1, 2):
+        folder = tmp_path / str(workers)
+        folder.mkdir()
+        collect(config, folder, transitions=30, workers=workers)
+    one, two = (read_shard(shard_path(tmp_path / str(workers), 1)) for workers in (1, 2))
+    for name, array in one.items():
+        np.testing.assert_array_equal(array, two[name], err_msg=name)
+    assert not np.array_equal(one["actions"], read_shard(shard_path(pushes, 1))["actions"])  # the heuristic's
+    stored = read_metadata(tmp_path / "1")["configuration"]
+    assert (stored["policy"], stored["motions"]) == ("model", 8)
+    assert stored["checkpoint"] == file_digest(find_checkpoint("cavin"))
+
+
+def test_a_dataset_of_another_policy_is_refused(small: SimpleNamespace, own_pushes: Path) -> None:
+    held = json.loads((own_pushes / "metadata.json").read_text())["transitions"]
+    with pytest.raises(UserError, match="holds a dataset with policy=heuristic, not model"):
+        collect(replace(small.pushes, policy="model"), own_pushes, transitions=held, workers=1)
+
+
+def test_a_checkpoint_that_cannot_choose_pushes_is_refused(small: SimpleNamespace) -> None:
+    for changes, said in (
+        ({"checkpoint": "cavin"}, "checkpoint=cavin is of policy=model: add that, or leave checkpoint"),
+        (
+            {"policy": "model", "checkpoint": "mpc"},
+            "needs a cascade, and checkpoint .* has model dynamics",
+        ),
+        ({"policy": "model", "checkpoint": "nothing"}, "unknown checkpoint 'nothing'"),
+    ):
+        with pytest.raises(UserError, match=said):
+            check_policy(replace(small.pushes, **changes))
