@@ -14,6 +14,7 @@ The floor has two parts. Hidden: the distance between what happened and the mean
 in a second world, from the same poses, with mass and friction drawn anew within their ranges (those that leave the
 object on the table). Camera: the distance
 between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
+`--policy model` has pushes that `--pusher CHECKPOINT` chooses, as in `collect policy=model`.
 `--objects 8 10` is for other numbers of objects than 1 to 5, and `--neighbours 4 9` predicts once with the nearest 4
 other objects in each relation, and once with the nearest 9.
 """
@@ -36,14 +37,14 @@ import torch
 from numpy.typing import NDArray
 from pyro import poutine
 
+from cavin_pyro.config.commands.collection import POLICIES
 from cavin_pyro.criticism.loading import load_programs
-from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene
+from cavin_pyro.data.collection import CollectionConfig, check_policy, clutter_area, open_scene, pushing_policy
 from cavin_pyro.data.features import cloud_features
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.progress import progress_bar
 from envs.observation import Observation
-from envs.policy import HeuristicPushingPolicy
 from envs.randomness import collection_streams
 from envs.robots import STICK_RADIUS
 from envs.scene import FALLEN, Scene
@@ -95,9 +96,7 @@ def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redra
     generator, policy_generator = collection_streams(config.seed, number)
     count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
     seen = [scene.sample([clutter_area(generator)] * count, config.ranges, generator)]
-    policy = HeuristicPushingPolicy(
-        policy_generator, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
-    )
+    policy = pushing_policy(config, policy_generator)
     there, actions = [poses(scene)], []
     for _ in range(config.steps):
         action = policy.act(seen[-1]).astype(np.float32)
@@ -293,10 +292,14 @@ def main() -> None:
     parser.add_argument("--redraws", type=int, default=8)
     parser.add_argument("--objects", type=int, nargs=2, default=(1, OBJECT_SLOTS), help="at least, and at most")
     parser.add_argument("--neighbours", type=int, nargs="+", default=(None,))
+    parser.add_argument("--policy", choices=POLICIES, default="heuristic", help="what chooses the pushes")
+    parser.add_argument("--pusher", help="the checkpoint of --policy model")
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     fewest, most = arguments.objects
-    config = CollectionConfig(seed=arguments.seed, perturbation_rate=0.3, minimum_objects=fewest, maximum_objects=most)
+    chooser = {"policy": arguments.policy, "checkpoint": arguments.pusher}
+    config = CollectionConfig(seed=arguments.seed, minimum_objects=fewest, maximum_objects=most, **chooser)
+    check_policy(config)
     episodes = []
     with (
         closing(open_scene(config)) as scene,

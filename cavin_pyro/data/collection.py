@@ -104,7 +104,7 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
     count = int(scene_generator.integers(config.minimum_objects, config.maximum_objects + 1))
     with user_input():
         observation = scene.sample([clutter_area(scene_generator)] * count, config.ranges, scene_generator)
-    policy = _policy(config, policy_generator)
+    policy = pushing_policy(config, policy_generator)
     arrays = _blank(config, scene)
     arrays["mask"][:] = observation.mask
     arrays["episode"] = np.array(episode, np.int64)
@@ -133,7 +133,8 @@ def check_policy(config: CollectionConfig) -> None:
         raise UserError(f"checkpoint={config.checkpoint} is of policy=model: add that, or leave checkpoint")
 
 
-def _policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:
+def pushing_policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:
+    """What chooses the pushes of one episode; `generator`: its randomness, see `envs.randomness.collection_streams`."""
     if config.policy == "model":
         return ModelPushingPolicy(generator, *_pusher(config.checkpoint or PUSHER), motions=config.motions)
     return HeuristicPushingPolicy(

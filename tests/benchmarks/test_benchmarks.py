@@ -268,6 +268,13 @@ def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
+def test_pushes_of_a_model_are_others_than_the_heuristics() -> None:
+    options = ("mpc", "--episodes", "1", "--redraws", "1", "--seed", "10000")
+    heuristic, chosen = run("accuracy", *options), run("accuracy", *options, "--policy", "model", "--pusher", "cavin")
+    assert "after 3 pushes" in chosen
+    assert chosen != heuristic
+
+
 @pytest.mark.parametrize(
     ("table", "page"),
     [
