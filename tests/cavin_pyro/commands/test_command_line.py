@@ -143,11 +143,12 @@ def test_checkpoints_have_names() -> None:
 @pytest.mark.parametrize(
     ("overrides", "name"),
     [
-        ("", "cavin"),
+        ("", "contact"),
         ("planner=paper", "cavin"),
-        ("planner=cavin_evolution", "cavin"),
+        ("planner=cavin_evolution", "contact"),
+        ("planner=cavin_without_effects", "contact"),
         ("planner=random", "cavin"),
-        ("planner._target_=my_lab.Mine", "cavin"),
+        ("planner._target_=my_lab.Mine", "contact"),
         ("planner=sectar", "sectar"),
         ("planner=cvae_mpc", "cvae_mpc"),
         ("planner=sectar planner.samples=8 planner.optimizer=cem", "sectar"),
@@ -175,7 +176,7 @@ def test_a_planner_preset_of_the_users_own_takes_cavin(tmp_path: Path) -> None:
 
 
 def test_help_names_the_checkpoint_of_the_planner() -> None:
-    for overrides, name in (([], "cavin"), (["planner=sectar"], "sectar")):
+    for overrides, name in (([], "contact"), (["planner=paper"], "cavin"), (["planner=sectar"], "sectar")):
         page = help_page("plan", "What it does.", check_overrides("plan", overrides))
         assert f"\n  checkpoint={name} " in page
         assert all(f"{one}" in page for one in CHECKPOINTS)

@@ -50,7 +50,7 @@ def plain(config: Any) -> dict[str, Any]:
 def test_a_planner_without_options_is_that_of_the_command(small: SimpleNamespace) -> None:
     model, reward = build_model(small.config()), object()
     section = plain(compose("plan").planner)
-    del section["model_free"]
+    del section["model_free"], section["default_checkpoint"]
     ours, theirs = CavinPlanner(model, reward), construct(section, model=model, reward=reward)
     assert {**vars(ours), "optimizer": None} == {**vars(theirs), "optimizer": None}
     assert vars(ours.optimizer) == vars(theirs.optimizer)
@@ -66,7 +66,8 @@ def test_collecting_without_options_is_that_of_the_command() -> None:
     config = compose("collect")
     usual = CollectionConfig()
     assert collecting_world(config.env) == usual
-    for name in ("seed", "steps", "intent_length", "perturbation_rate", "maximum_objects", "episodes_per_shard"):
+    shared = ("seed", "steps", "policy", "checkpoint", "motions", "intent_length", "perturbation_rate")
+    for name in (*shared, "maximum_objects", "episodes_per_shard"):
         assert config[name] == getattr(usual, name)
 
 

@@ -12,14 +12,14 @@ from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.geometry import geometry_of, part_name
 
 SHIPPED = sorted(default_checkpoint().parent.glob("*.safetensors"))
-CALIBRATED = {  # SHA-256 of the file as trained, and of its weights without the guide's (`contact`: nor f's)
+CALIBRATED = {  # SHA-256 of the file as trained, and of its weights without the guide's
     "cavin": (
         "d4b6913946ac23b195c8f748e349ce02e102b2ff02720bb75cf22047ae52c94a",
         "a85e55a3b18410551a34c7a2f9600460e3ae97d6809acdaf92484089c16d918c",
     ),
     "contact": (
-        "76fa0302ea4d34476b19753db6d08a2f517cc6b506022cdb418a395244fd2bde",
-        "b07aeb4cf2a20177114ce6ec4bd95a3be4e432de200e1b997874e75bb708db26",
+        "bfacefda07de10b0e2a6021967597a837cbb57d5dd42768d5cadf89b3ada0bc3",
+        "e752f649a5f351b0d4c704c873a7bf07fd0ac8effdc0550ea2ac4ddd8e6d0d03",
     ),
     "sectar": (
         "b5993e55f856ec1c2d1bcea18a11df7f46f8488c9a7947aec6f92e479ff671fe",
@@ -66,8 +66,7 @@ def test_a_shipped_checkpoint_holds_its_provenance(path: Path) -> None:
 def test_calibration_has_left_the_model_as_it_was_trained(name: str) -> None:
     checkpoint = load_checkpoint(default_checkpoint().with_stem(name))
     trained, without_guide = CALIBRATED[name]
-    changed = ("guide.", "model.dynamics.") if "initial" in checkpoint.provenance else ("guide.",)
-    others = {key: value for key, value in checkpoint.tensors.items() if not key.startswith(changed)}
+    others = {key: value for key, value in checkpoint.tensors.items() if not key.startswith("guide.")}
     assert tensors_digest(others) == without_guide
     assert checkpoint.provenance["calibrated"][0]["checkpoint"] == trained
 
@@ -77,7 +76,8 @@ def test_a_calibrated_guide_tells_what_its_intervals_hold(name: str) -> None:
     (record,) = load_checkpoint(default_checkpoint().with_stem(name)).provenance["calibrated"]
     assert record["command"].startswith("python -m cavin_pyro.calibrate ")
     assert {"revision", "date", "packages", "data", "steps", "wake_weight", "seed"} <= set(record)
-    assert min(one["held_informed"]["high"] for one in record["before"]["codes"].values()) < 0.86
+    if name != "contact":  # whose guide had been calibrated before its prior of motions and f were trained on
+        assert min(one["held_informed"]["high"] for one in record["before"]["codes"].values()) < 0.86
     for code, after in record["after"]["codes"].items():
         for dimensions in ("held", "held_informed"):
             held = after[dimensions]
