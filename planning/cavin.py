@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from models.state import State
+from planning import records
 from planning.backends.chunking import chunked
+from planning.extensions.effect_retries import first_moves, is_unmoved, leave_out_similar
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.guidance import guided_tracking
 from planning.extensions.idle_pushes import idle_last
@@ -20,6 +22,7 @@ from planning.inputs import check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
 from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction
+from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
 from planning.rollouts.ranking import best_of, squared_distance
 from planning.rollouts.returns import interpolate
@@ -53,6 +56,8 @@ class CavinPlanner(SearchingPlanner):
         centres only.
     nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
         nearest to it, this many in all; None plans for all objects (paper).
+    effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
+        paper.
     warm_start: our addition to line 5: the last plan's noise is among the candidates.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
@@ -82,6 +87,7 @@ class CavinPlanner(SearchingPlanner):
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
         nearest_objects: int | None = 2,
+        effect_retries: int = 0,
         avoid_failures: bool = True,
         **options: Any,
     ) -> None:
@@ -98,6 +104,9 @@ class CavinPlanner(SearchingPlanner):
         if nearest_objects is not None:
             check_positive("nearest_objects", nearest_objects)
         self.nearest_objects = nearest_objects
+        if effect_retries < 0:
+            raise ValueError(f"effect_retries must be 0 or more, not {effect_retries}")
+        self.effect_retries = effect_retries
         self.avoid_failures = avoid_failures
 
     @chunked
@@ -115,17 +124,55 @@ class CavinPlanner(SearchingPlanner):
         `observed`: points of the objects that the camera sees, where no push may touch down. An environment's plan
         depends on its own arguments only. For errors see `planning.backends.chunking.chunked`.
         """
-        reward = self.reward
         # Line 1 (K = H / T) is in the constructor. Lines 2, 3 and 12, the loop over t, are the caller's.
         # Line 4: receive the new s_t from the environment.
-        s_t, T = state, self.segment_length
-        near = nearest_objects(s_t, self.nearest_objects, reward)
+        s_t = state
+        near = nearest_objects(s_t, self.nearest_objects, self.reward)
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
         effects = self.search_by_reward(EffectSpace(self.model), near.of(s_t), generators, previous)
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
+        plan = self._plan_motions(s_t, near, effects, i, generators, observed)
+        return self._try_other_effects(plan, s_t, near, effects, i, generators, observed)
+
+    def _try_other_effects(
+        self,
+        plan: Plan,
+        s_t: State,
+        near: NearestObjects,
+        effects: Candidates,
+        i: Tensor,
+        generators: Sequence[torch.Generator],
+        observed: ObservedPoints | None,
+    ) -> Plan:
+        """Lines 7 to 11 again, for effects unlike the effect plans `i: [B]`, where `plan` moves nothing."""
+        scores = effects.returns
+        for _ in range(self.effect_retries):
+            stuck = is_unmoved(s_t, plan.subgoals.centers[:, 0], plan.predicted_centers[:, self.segment_length - 1])
+            if not stuck.any():
+                break
+            scores = leave_out_similar(scores, first_moves(near.of(s_t), effects), i, stuck)
+            i = best_of(scores, "returns of effect plans")
+            before = [generator.get_state() for generator in generators]
+            plan = records.where(stuck, self._plan_motions(s_t, near, effects, i, generators, observed), plan)
+            for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
+                if not tried:  # an environment's plan depends on its own arguments only
+                    generator.set_state(own)
+        return plan
+
+    def _plan_motions(
+        self,
+        s_t: State,
+        near: NearestObjects,
+        effects: Candidates,
+        i: Tensor,
+        generators: Sequence[torch.Generator],
+        observed: ObservedPoints | None,
+    ) -> Plan:
+        """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
+        reward, T = self.reward, self.segment_length
         chosen = effects.take(i.unsqueeze(-1))
         c_star, subgoals = chosen.codes[:, 0], near.among(s_t, chosen.states.map(lambda field: field[:, 0]))
 

@@ -1,0 +1,97 @@
+"""Another effect where no motion moves anything."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import CavinPlanner
+from planning.extensions.effect_retries import is_unmoved, leave_out_similar
+
+GOAL = (0.5, 0.0)
+
+
+def walled(toy: SimpleNamespace) -> object:
+    """A point mass whose f knows of a wall: objects with x > 0 go no farther in x; h does not know it."""
+
+    class Walled(toy.PointMass):  # type: ignore[misc, name-defined]
+        def next_state(self, state: State, action: Tensor) -> State:
+            at_wall = (state.centers[..., :1, 0] > 0).unsqueeze(-1)
+            ahead = (action[..., 2] > 0).unsqueeze(-1).unsqueeze(-1)
+            after = super().next_state(state, action)
+            return after._replace(centers=torch.where(at_wall & ahead, state.centers, after.centers))
+
+    return Walled(noise=0.0)
+
+
+def planner(toy: SimpleNamespace, retries: int, **options: object) -> CavinPlanner:
+    reward = toy.GoalDisc(goal=GOAL, dense=True)
+    return toy.plain(walled(toy), reward, 64, 6, "first_segment", effect_retries=retries, **options)
+
+
+def moved(plan: object, state: State) -> Tensor:
+    away = plan.predicted_centers[:, 2] - state.centers  # type: ignore[attr-defined]
+    return away[..., :2].norm(dim=-1).amax(-1)
+
+
+def test_where_nothing_moves_another_effect_is_tried(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(0.01, 0.0)]])
+    stuck, tried = (planner(toy, retries).plan(state, toy.generators(3)) for retries in (0, 3))
+    assert moved(stuck, state) == 0.0
+    assert moved(tried, state) > 0.02
+    first, other = ((plan.subgoals.centers[:, 0] - state.centers)[0, 0, :2] for plan in (stuck, tried))
+    assert first[0] > 0.02  # through the wall
+    assert torch.cosine_similarity(first, other, dim=0) < 0.5
+
+
+def test_elsewhere_plans_are_as_without(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(-0.4, 0.0)]])
+    generators = [toy.generators(3) for _ in range(2)]
+    without, tried = (planner(toy, retries).plan(state, own) for retries, own in zip((0, 3), generators, strict=True))
+    assert torch.equal(without.actions, tried.actions)
+    assert torch.equal(generators[0][0].get_state(), generators[1][0].get_state())
+
+
+@pytest.mark.parametrize("warm_start", [False, True])
+def test_a_plan_does_not_depend_on_whether_its_neighbours_are_stuck(toy: SimpleNamespace, warm_start: bool) -> None:
+    places = [[(0.01, 0.0)], [(-0.4, 0.0)], [(0.01, 0.2)]]
+    one = planner(toy, 3, warm_start=warm_start)
+    together = toy.generators(3, 4, 5)
+    plans = one.plan(toy.scenes(places), together)
+    for number, place in enumerate(places):
+        alone = toy.generators(3 + number)
+        plan = one.plan(toy.scenes([place]), alone)
+        assert torch.equal(plan.actions[0], plans.actions[number])
+        assert torch.equal(plan.subgoals.centers[0], plans.subgoals.centers[number])
+        assert torch.equal(alone[0].get_state(), together[number].get_state())
+
+
+def test_only_an_effect_that_asks_for_a_motion_can_be_unmoved() -> None:
+    state = State(torch.zeros(4, 2, 3), torch.zeros(4, 2, 1), torch.tensor([[True, False]]).expand(4, 2))
+    subgoals, predicted = torch.zeros(4, 2, 3), torch.zeros(4, 2, 3)
+    subgoals[0, 0, 0] = 0.05  # asked for, and nothing moves
+    subgoals[1, 0, 0], predicted[1, 0, 1] = 0.05, 0.03  # something moves, if elsewhere
+    subgoals[2, 0, 0] = 0.01  # nothing is asked for
+    subgoals[3, 1, 0] = 0.05  # of padding
+    assert is_unmoved(state, subgoals, predicted).tolist() == [True, False, False, False]
+
+
+def test_effects_in_another_direction_stay_and_those_that_do_nothing_go() -> None:
+    moves = torch.tensor([[0.05, 0.0], [0.08, 0.01], [0.0, 0.05], [-0.05, 0.0], [0.001, 0.002], [0.03, 0.08]])
+    moves = moves.view(1, 6, 1, 2)
+    scores = torch.arange(6.0).unsqueeze(0)
+    left = leave_out_similar(scores, moves, torch.tensor([0]), torch.tensor([True]))
+    assert torch.isfinite(left).tolist() == [[False, False, True, True, False, True]]
+    assert torch.equal(left[torch.isfinite(left)], scores[torch.isfinite(left)])
+    assert torch.equal(leave_out_similar(scores, moves, torch.tensor([0]), torch.tensor([False])), scores)
+    same = moves[:, :2]
+    assert torch.equal(leave_out_similar(scores[:, :2], same, torch.tensor([0]), torch.tensor([True])), scores[:, :2])
+
+
+def test_a_negative_number_is_refused(toy: SimpleNamespace) -> None:
+    with pytest.raises(ValueError, match="effect_retries must be 0 or more, not -1"):
+        planner(toy, -1)
