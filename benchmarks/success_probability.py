@@ -1,7 +1,7 @@
 """The probability of success that plans are given: its episodes, its fit and its calibration.
 
     python benchmarks/success_probability.py collect DIR --seed 10000 [--share 0.5]
-    python benchmarks/success_probability.py fit FILE FOLDER ... [--half first]
+    python benchmarks/success_probability.py fit FILE FOLDER ... [--half first] [--keep FILE]
     python benchmarks/success_probability.py report FILE FOLDER ... [--half second] [--picture PNG]
 
 `collect` evaluates the shipped planners in every family of scenes, each in a folder of its own under DIR; a stopped run
@@ -118,19 +118,22 @@ def planner_of(folder: Path, one: Evaluated) -> str:
         return CELLS[folder.name].planner
     options = one.situation.planner
     name = "default" if options.get("planner.guidance", "none") == "none" else "guided"
+    name = f"{name}, other effects" if options.get("planner.effect_retries", 0) else name
     horizon = options.get("planner.horizon", HORIZON)
     return name if horizon == HORIZON else f"{name}, horizon {horizon}"
 
 
-def fit_all(path: Path, folders: Sequence[Path], ridge: float, half: str) -> None:
-    """Fit a regression for each planner, and write them."""
+def fit_all(path: Path, folders: Sequence[Path], ridge: float, half: str, keep: Path | None) -> None:
+    """Fit a regression for each planner, and write them, before those of the file `keep` with other checkpoints."""
     evaluations = [read(folder, half) for folder in folders]
     names = {id(one): planner_of(folder, one) for one, folder in zip(evaluations, folders, strict=True)}
     regressions = [fit(group, names[id(group[0])], ridge=ridge) for group in by_planner(evaluations)]
     seeds = sorted(row["seed"] for one in evaluations for row in one.rows)
     command = f"python benchmarks/success_probability.py {' '.join(sys.argv[1:])}"
     about = {"provenance": {**provenance(), "command": command}, "seeds": [seeds[0], seeds[-1]], "ridge": ridge}
-    write_regressions(path, regressions, about)
+    fitted = {one.checkpoint for one in regressions}
+    kept = [one for one in read_regressions(keep) if one.checkpoint not in fitted] if keep else []
+    write_regressions(path, [*regressions, *kept], about)
     for one in regressions:
         print(f"{one.name}: {one.successes} of {one.episodes} episodes succeeded, {one.plans} plans")
         for name, slope in one.slopes.items():
@@ -235,6 +238,7 @@ def main() -> None:
         one.add_argument("--half", choices=HALVES, default="all", help="of the episodes of each folder, by seed")
         if name == "fit":
             one.add_argument("--ridge", type=float, default=RIDGE, help="inverse variance of the slopes' prior")
+            one.add_argument("--keep", type=Path, help="a fit, whose regressions for other checkpoints stay")
         else:
             one.add_argument("--picture", type=Path, help="of the reliability diagram, .png")
     given = parser.parse_args()
@@ -242,7 +246,7 @@ def main() -> None:
         if given.command == "collect":
             collect(given.folder, given.seed, given.share)
         elif given.command == "fit":
-            fit_all(given.file, given.folders, given.ridge, given.half)
+            fit_all(given.file, given.folders, given.ridge, given.half, given.keep)
         else:
             report(given.file, given.folders, given.picture, given.half)
     except UserError as error:

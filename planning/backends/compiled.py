@@ -160,7 +160,7 @@ class _Native:
 
 
 def _announce(where: str) -> None:
-    _say(f"compiling for the first plan, which takes a minute or two; native code {where}")
+    _say(f"compiling for the first plan, which takes one to five minutes; native code {where}")
 
 
 @cache
