@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from models.state import State
-from planning import records
 from planning.backends.chunking import chunked
-from planning.extensions.effect_retries import first_moves, is_unmoved, leave_out_similar
+from planning.extensions.effect_retries import try_other_effects
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.guidance import guided_tracking
 from planning.extensions.idle_pushes import idle_last
@@ -134,42 +134,18 @@ class CavinPlanner(SearchingPlanner):
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
-        plan = self._plan_motions(s_t, near, effects, i, generators, observed)
-        return self._try_other_effects(plan, s_t, near, effects, i, generators, observed)
-
-    def _try_other_effects(
-        self,
-        plan: Plan,
-        s_t: State,
-        near: NearestObjects,
-        effects: Candidates,
-        i: Tensor,
-        generators: Sequence[torch.Generator],
-        observed: ObservedPoints | None,
-    ) -> Plan:
-        """Lines 7 to 11 again, for effects unlike the effect plans `i: [B]`, where `plan` moves nothing."""
-        scores = effects.returns
-        for _ in range(self.effect_retries):
-            stuck = is_unmoved(s_t, plan.subgoals.centers[:, 0], plan.predicted_centers[:, self.segment_length - 1])
-            if not stuck.any():
-                break
-            scores = leave_out_similar(scores, first_moves(near.of(s_t), effects), i, stuck)
-            i = best_of(scores, "returns of effect plans")
-            before = [generator.get_state() for generator in generators]
-            plan = records.where(stuck, self._plan_motions(s_t, near, effects, i, generators, observed), plan)
-            for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
-                if not tried:  # an environment's plan depends on its own arguments only
-                    generator.set_state(own)
-        return plan
+        # Our addition: lines 7 to 11 again where no motion moves anything.
+        motions_for = partial(self._plan_motions, s_t, near, effects, generators, observed)
+        return try_other_effects(self.effect_retries, motions_for, i, near.of(s_t), effects, s_t, generators)
 
     def _plan_motions(
         self,
         s_t: State,
         near: NearestObjects,
         effects: Candidates,
-        i: Tensor,
         generators: Sequence[torch.Generator],
         observed: ObservedPoints | None,
+        i: Tensor,
     ) -> Plan:
         """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
         reward, T = self.reward, self.segment_length

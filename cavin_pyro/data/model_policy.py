@@ -8,8 +8,6 @@ learning").
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.numerics import one_thread
 from cavin_pyro.config.parts import build_model
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
@@ -61,7 +60,7 @@ class ModelPushingPolicy:
     def act(self, observation: Observation) -> NDArray[np.floating]:
         """See `PushingPolicy`."""
         if not self._left:
-            with _one_thread():  # sums of several threads may differ in the last digit
+            with one_thread():  # sums of several threads may differ in the last digit
                 self._left = self._segment(observation)
         return self._left.pop(0)
 
@@ -102,13 +101,3 @@ def load_pusher(name: str) -> tuple[Model, Geometry]:
         raise UserError(f"policy=model needs a cascade, and checkpoint {path} has model {model.name}: choose cavin")
     checkpoint.load_into("model", model, path)
     return model.requires_grad_(False).eval(), geometry
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from models.model import Model
 from models.state import State, Window
+from planning.rollouts.dynamics import predict_states
 
 SCALE = 0.02  # metres, in x and in y: how near to its place in the subgoal an object must come
 LEAST = math.exp(-8.0)  # of the density, as of one object 8 cm away: a motion that goes elsewhere says nothing more
@@ -46,18 +47,12 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     with torch.no_grad():
         motion_code = prior.sample()
         pushes = model.actions(here, effect_code=effect_code.expand(-1, motions, -1), motion_code=motion_code)
-        density = _log_density(_end(model, here, pushes), subgoal)
+        ends, _ = predict_states(model, here, pushes)
+        density = _log_density(ends, subgoal)
     log_prior = prior.log_prob(motion_code)
     # The second factor is 1: it only has the gradient of the prior's density.
     each = (density + log_prior - log_prior.detach()).logsumexp(-1) - math.log(motions)
     return -each.sum() * (len(window.sequence_mask) / count)
-
-
-def _end(model: Model, here: State, pushes: Tensor) -> State:
-    """The state after T `pushes: [b, K, T, 4]` from `here: [b, 1]`: `[b, K]`."""
-    for push in pushes.unbind(-2):
-        here = model.next_state(here, push)
-    return here
 
 
 def _log_density(end: State, subgoal: State) -> Tensor:

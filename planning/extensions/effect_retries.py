@@ -7,15 +7,52 @@ same effect again.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor
 
 from models.state import State
+from planning import records
+from planning.plan import Plan
 from planning.rollouts.candidates import Candidates
+from planning.rollouts.ranking import best_of
 
 UNMOVED = 0.01  # metres; a motion that moves no object so far does nothing
 EFFECT = 0.02  # metres; an effect that moves an object so far asks for a motion
 SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objects together
+
+
+def try_other_effects(
+    retries: int,
+    motions_for: Callable[[Tensor], Plan],
+    chosen: Tensor,
+    near: State,
+    effects: Candidates,
+    state: State,
+    generators: Sequence[torch.Generator],
+) -> Plan:
+    """The plans for the effects `chosen: [B]` int64, or for other effects where these move nothing.
+
+    Args:
+        retries: how often another effect is tried. motions_for: lines 8 to 11 for effect plans by number, `[B]`; it
+            advances the `generators`, one per environment.
+        state: `[B]`. near: `[B]`, the same of the objects that `effects: [B, N]` are about.
+    """
+    plan, scores = motions_for(chosen), effects.returns
+    for _ in range(retries):
+        after = plan.predicted_centers[:, plan.actions.shape[1] - 1]
+        stuck = is_unmoved(state, plan.subgoals.centers[:, 0], after)
+        if not stuck.any():
+            break
+        scores = leave_out_similar(scores, first_moves(near, effects), chosen, stuck)
+        chosen = best_of(scores, "returns of effect plans")
+        before = [generator.get_state() for generator in generators]
+        plan = records.where(stuck, motions_for(chosen), plan)
+        for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
+            if not tried:  # an environment's plan depends on its own arguments only
+                generator.set_state(own)
+    return plan
 
 
 def is_unmoved(state: State, subgoals: Tensor, predicted: Tensor) -> Tensor:

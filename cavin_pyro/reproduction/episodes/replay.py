@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.numerics import one_thread
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.reproduction.cells import Cell
@@ -40,7 +39,7 @@ def replay(folders: Sequence[Path], row: Row, criterion: str) -> Replay:
     """
     config = stored_configuration(folders, row)
     config.criterion = criterion  # ends the episode where the table does
-    with _one_thread():
+    with one_thread():
         runner = make_runner(config, render=True)
         try:
             episode = runner.rollout(row["seed"], photograph=True)
@@ -88,14 +87,3 @@ def stored_configuration(folders: Sequence[Path], row: Row) -> DictConfig:
         f"no evaluate/{cell.name}-{row['training_seed']}/config.yaml in {', '.join(map(str, folders))}: pictures need "
         "the folders of the episodes"
     )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """As in an evaluation: which plan wins can change with the rounding of sums in several threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
