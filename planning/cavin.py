@@ -16,7 +16,7 @@ from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failu
 from planning.extensions.guidance import guided_tracking
 from planning.extensions.idle_pushes import idle_last
 from planning.extensions.nearest_objects import NearestObjects, nearest_objects
-from planning.extensions.perturbed_rollouts import most_robust
+from planning.extensions.perturbed_rollouts import PerturbedRollouts, most_robust
 from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
@@ -31,6 +31,7 @@ from planning.rollouts.segment import Objective, SegmentRollout, actions_of, sel
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
+FEW_CANDIDATES = PerturbedRollouts(candidates=64)  # a sixteenth of N: motions are sampled for one effect
 
 
 class CavinPlanner(SearchingPlanner):
@@ -44,7 +45,8 @@ class CavinPlanner(SearchingPlanner):
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
-    motion_samples: how many motions to sample at line 8; None takes N, and 1 leaves nothing to choose at line 10.
+    motion_samples: how many motions to sample at line 8; None takes N (paper), and 1 leaves nothing to choose at line
+        10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
@@ -83,15 +85,16 @@ class CavinPlanner(SearchingPlanner):
         horizon: int = 30,
         motion_horizon: str = "first_segment",
         *,
-        motion_samples: int | None = None,
+        motion_samples: int | None = 512,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
         nearest_objects: int | None = 2,
-        effect_retries: int = 0,
+        effect_retries: int = 3,
         avoid_failures: bool = True,
+        robustness: PerturbedRollouts | None = FEW_CANDIDATES,
         **options: Any,
     ) -> None:
-        super().__init__(model, reward, samples, horizon, **options)
+        super().__init__(model, reward, samples, horizon, robustness=robustness, **options)
         self.model: PlanningModel = model
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")

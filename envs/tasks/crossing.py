@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from envs.tasks.generated import GeneratedLayouts, paths, reachable_tiles
+from envs.tasks.generated import GeneratedLayouts, paths, reachable_tiles, starting_tiles
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart, check_inside
 from envs.tasks.tiles import TileSet
@@ -54,7 +54,9 @@ class Crossing(Task):
     @classmethod
     def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
         """A bridge without shortcuts, from its first tile to its last; obstacles start on reachable tiles."""
-        bridge = wanted.sample("bridge", paths(wanted.tiles), generator)
+        starts = starting_tiles()
+        bridges = {shape: [path for path in found if path[0] in starts] for shape, found in paths(wanted.tiles).items()}
+        bridge = wanted.sample("bridge", bridges, generator)
         anywhere = reachable_tiles()
         beside = [tile for tile in anywhere if tile not in bridge]
         return cls(

@@ -16,7 +16,10 @@ import numpy as np
 
 from envs.workspace import REACH_HIGH, REACH_LOW, TILE_COUNT, Tile, tile_center
 
-ROOM = 0.05  # metres that the tool's reach extends beyond the centre of a tile, so that it gets behind an object there
+ROOM = 0.05  # metres that the tool's reach extends beyond the centre of a tile that layouts use
+# Metres beyond the centre of a tile on which the target starts, so that the tool gets behind it on every side: it may
+# lie 0.05 off the centre (`envs.pushing.TARGET_JITTER`) and extend 0.05 from there, and the tool needs 0.02 more.
+ROOM_AT_START = 0.12
 SHAPES = ("straight", "l", "u", "s", "winding", "block")
 ANY_SHAPE = "any"
 OBSTACLES = ("anywhere", "beside")
@@ -75,12 +78,25 @@ class GeneratedLayouts:
 
 
 def reachable_tiles() -> tuple[Tile, ...]:
-    """The tiles on which the tool gets behind an object from every side."""
+    """The tiles that layouts use: the tool reaches beyond their centres on every side."""
+    return _tiles_with_room(ROOM)
+
+
+def starting_tiles() -> tuple[Tile, ...]:
+    """The tiles on which the target may start: the tool gets behind it on every side.
+
+    At the border of the tool's reach, pushes move objects outwards only, and no planner brings them back.
+    """
+    return _tiles_with_room(ROOM_AT_START)
+
+
+def _tiles_with_room(room: float) -> tuple[Tile, ...]:
+    """The tiles beyond whose centres the tool's reach extends by `room` metres on every side."""
     rows, columns = (
         [
             number
             for number in range(TILE_COUNT[axis])
-            if REACH_LOW[axis] + ROOM <= tile_center((number, number))[axis] <= REACH_HIGH[axis] - ROOM
+            if REACH_LOW[axis] + room <= tile_center((number, number))[axis] <= REACH_HIGH[axis] - room
         ]
         for axis in (0, 1)
     )

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.tasks.generated import ANY_SHAPE, GeneratedLayouts, neighbours, reachable_tiles
+from envs.tasks.generated import ANY_SHAPE, GeneratedLayouts, neighbours, reachable_tiles, starting_tiles
 from envs.tasks.step import Step
 from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart
 from envs.tasks.tiles import TileSet
@@ -71,7 +71,7 @@ class Insertion(Task):
         for slot in cls.random_layouts():
             assert isinstance(slot, Insertion)
             ways = _ways(slot)
-            if starts := [tile for tile in reachable_tiles() if ways.get(tile) == wanted.tiles]:
+            if starts := [tile for tile in starting_tiles() if ways.get(tile) == wanted.tiles]:
                 found.append((slot, starts))
         if not found or wanted.shape != ANY_SHAPE:
             raise ValueError(
