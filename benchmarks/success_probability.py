@@ -118,7 +118,6 @@ def planner_of(folder: Path, one: Evaluated) -> str:
         return CELLS[folder.name].planner
     options = one.situation.planner
     name = "default" if options.get("planner.guidance", "none") == "none" else "guided"
-    name = f"{name}, other effects" if options.get("planner.effect_retries", 0) else name
     horizon = options.get("planner.horizon", HORIZON)
     return name if horizon == HORIZON else f"{name}, horizon {horizon}"
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
-from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
+from cavin_pyro.config.parts import amortized_guides, build_guide
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.dataset import content_records, read_metadata, with_current_names
@@ -24,6 +24,7 @@ from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.data.world import collecting_world
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import check_fit, geometry_of
+from cavin_pyro.storage.models import model_of
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import with_current_keys
 from cavin_pyro.training.factory import data_folders
@@ -155,10 +156,7 @@ def load_programs(checkpoint: Checkpoint, where: str | Path) -> tuple[Model, Gui
     Raises:
         UserError: there is no model or no guide in it, or one of another architecture.
     """
-    if "model" not in checkpoint.config:
-        raise UserError(f"checkpoint {where} holds no model: give one that train has written")
-    model = build_model(checkpoint.config)
-    checkpoint.load_into("model", model, where)
+    model = model_of(checkpoint, where)
     guide = build_guide(checkpoint.config, model) if "guide" in checkpoint.config else None
     if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in checkpoint.tensors)):
         raise UserError(f"checkpoint {where} holds no guide: give one that train has written")
@@ -168,9 +166,7 @@ def load_programs(checkpoint: Checkpoint, where: str | Path) -> tuple[Model, Gui
             f"check infers others, so train with guide= one of {', '.join(amortized_guides(model.name))}"
         )
     checkpoint.load_into("guide", guide, where)
-    for program in (model, guide):
-        program.requires_grad_(False).eval()
-    return model, guide
+    return model, guide.requires_grad_(False).eval()
 
 
 def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowConfig, int, int]:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.numerics import one_thread
-from cavin_pyro.config.parts import build_model
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
+from cavin_pyro.storage.models import model_of
 from envs.observation import Observation
 from envs.policy import Intent
 from models.model import Model
@@ -94,10 +94,7 @@ def load_pusher(name: str) -> tuple[Model, Geometry]:
     path = find_checkpoint(name)
     checkpoint = load_checkpoint(path)
     geometry = geometry_of(checkpoint, path)
-    if "model" not in checkpoint.config:
-        raise UserError(f"checkpoint {path} holds no model: give one that train has written")
-    model = build_model(checkpoint.config)
+    model = model_of(checkpoint, path)
     if model.codes != ("effect_code", "motion_code"):
         raise UserError(f"policy=model needs a cascade, and checkpoint {path} has model {model.name}: choose cavin")
-    checkpoint.load_into("model", model, path)
-    return model.requires_grad_(False).eval(), geometry
+    return model, geometry

@@ -17,13 +17,14 @@ from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input, whole_number
 from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
-from cavin_pyro.config.parts import build_model, class_of, construct
+from cavin_pyro.config.parts import class_of, construct
 from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.evaluation.success.probability import NO_PROBABILITY, Probability, probability_for
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
+from cavin_pyro.storage.models import model_of
 from envs.layouts import GENERATED, RANDOM
 from envs.objects.sampling import NoRoomError
 from envs.pushing import PushingEnv
@@ -189,12 +190,8 @@ def make_planner(
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
         return construct(options), geometry
-    if "model" not in checkpoint.config:
-        raise UserError(f"checkpoint {path} holds no model: give one that train has written")
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
-    model = build_model(checkpoint.config)
-    checkpoint.load_into("model", model, path)
-    model.requires_grad_(False).eval().to(device)
+    model = model_of(checkpoint, path).to(device)
     _check_planner(options, model, path)
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)

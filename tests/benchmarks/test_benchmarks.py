@@ -196,6 +196,15 @@ def test_the_simulator_takes_the_place_of_f() -> None:
     assert all(re.search(r"[01]/1 ", line) for line in lines[2:])
 
 
+def test_pushes_at_the_start_of_a_scene_are_counted() -> None:
+    lines = run("starts", "--episodes", "2", "--pushes", "12", "objects=1").splitlines()
+    counts = [list(map(int, line.split()[3:])) for line in lines[1:3]]
+    for tried, moved, broke, nearer in counts:
+        assert tried == 12 and moved > 0 and moved >= nearer and broke + nearer <= tried
+    assert sum(nearer for *_, nearer in counts) > 0  # a target that starts where the tool gets behind it
+    assert sum(int(line.split()[0]) for line in lines[3:]) == 2
+
+
 def test_the_oracle_foretells_pushes_without_touching_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")  # as for a script; it takes it off
     specification = importlib.util.spec_from_file_location("oracle", ROOT / "benchmarks" / "oracle.py")
