@@ -31,7 +31,7 @@ from planning.rollouts.segment import Objective, SegmentRollout, actions_of, sel
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
-FEW_CANDIDATES = PerturbedRollouts(candidates=64)  # a sixteenth of N: motions are sampled for one effect
+FEW_CANDIDATES = PerturbedRollouts(candidates=64)  # motions are sampled for one effect, and most bring it about
 
 
 class CavinPlanner(SearchingPlanner):
@@ -45,8 +45,8 @@ class CavinPlanner(SearchingPlanner):
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
-    motion_samples: how many motions to sample at line 8; None takes N (paper), and 1 leaves nothing to choose at line
-        10.
+    motion_samples: how many motions to sample at line 8: N in the paper; None takes half of N, and 1 leaves nothing to
+        choose at line 10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
@@ -60,6 +60,8 @@ class CavinPlanner(SearchingPlanner):
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
         paper.
+    effect_risk: another effect is tried, too, where more than this share of the chosen motion's perturbed rollouts
+        fails; 1 tries none for that.
     warm_start: our addition to line 5: the last plan's noise is among the candidates.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
@@ -85,11 +87,12 @@ class CavinPlanner(SearchingPlanner):
         horizon: int = 30,
         motion_horizon: str = "first_segment",
         *,
-        motion_samples: int | None = 512,
+        motion_samples: int | None = None,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
         nearest_objects: int | None = 2,
         effect_retries: int = 3,
+        effect_risk: float = 1.0,
         avoid_failures: bool = True,
         robustness: PerturbedRollouts | None = FEW_CANDIDATES,
         **options: Any,
@@ -99,7 +102,7 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        self.motion_samples = samples if motion_samples is None else motion_samples
+        self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
         self.motion_optimizer = make_optimizer(motion_optimizer or self.optimizer, samples=self.motion_samples)
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
@@ -109,7 +112,9 @@ class CavinPlanner(SearchingPlanner):
         self.nearest_objects = nearest_objects
         if effect_retries < 0:
             raise ValueError(f"effect_retries must be 0 or more, not {effect_retries}")
-        self.effect_retries = effect_retries
+        if not 0.0 <= effect_risk <= 1.0:
+            raise ValueError(f"effect_risk must be a share from 0 to 1, not {effect_risk}")
+        self.effect_retries, self.effect_risk = effect_retries, effect_risk
         self.avoid_failures = avoid_failures
 
     @chunked
@@ -137,9 +142,10 @@ class CavinPlanner(SearchingPlanner):
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
-        # Our addition: lines 7 to 11 again where no motion moves anything.
+        # Our addition: lines 7 to 11 again where no motion moves anything, or all may fail.
         motions_for = partial(self._plan_motions, s_t, near, effects, generators, observed)
-        return try_other_effects(self.effect_retries, motions_for, i, near.of(s_t), effects, s_t, generators)
+        retries = self.effect_retries, self.effect_risk
+        return try_other_effects(*retries, motions_for, i, near.of(s_t), effects, s_t, generators)
 
     def _plan_motions(
         self,

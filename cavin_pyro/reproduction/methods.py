@@ -51,7 +51,7 @@ METHODS: dict[str, Method] = {
             ("model=single_latent", "guide=single_latent", "model.action_weight=0.1"),
             {
                 "paper": ("planner=sectar", *WITHOUT_ADDITIONS),
-                # More samples than the others' 1,024, so that it spends as many model evaluations as CAVIN.
+                # More samples than the others' 1,024, so that it spends at least as many model evaluations as CAVIN.
                 "ours": ("planner=sectar", "planner.samples=1408"),
                 "perturbed_rollouts": (
                     "planner=sectar",

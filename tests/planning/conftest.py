@@ -222,8 +222,8 @@ def plain(
     **options: object,
 ) -> CavinPlanner:
     """Algorithm 1 that avoids failures, with those of our additions that the options name."""
-    without: dict[str, Any] = {"robustness": None, "idle_distance": 0.0, "warm_start": False, "motion_samples": None}
-    without["effect_retries"] = 0
+    without: dict[str, Any] = {"robustness": None, "idle_distance": 0.0, "warm_start": False, "effect_retries": 0}
+    without["motion_samples"] = samples
     return CavinPlanner(model, reward, samples, horizon, motion_horizon, **{**without, **options})
 
 
