@@ -60,8 +60,6 @@ class CavinPlanner(SearchingPlanner):
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
         paper.
-    effect_risk: another effect is tried, too, where more than this share of the chosen motion's perturbed rollouts
-        fails; 1 tries none for that.
     warm_start: our addition to line 5: the last plan's noise is among the candidates.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
@@ -92,7 +90,6 @@ class CavinPlanner(SearchingPlanner):
         feature_weight: float = 0.0,
         nearest_objects: int | None = 2,
         effect_retries: int = 3,
-        effect_risk: float = 1.0,
         avoid_failures: bool = True,
         robustness: PerturbedRollouts | None = FEW_CANDIDATES,
         **options: Any,
@@ -112,9 +109,7 @@ class CavinPlanner(SearchingPlanner):
         self.nearest_objects = nearest_objects
         if effect_retries < 0:
             raise ValueError(f"effect_retries must be 0 or more, not {effect_retries}")
-        if not 0.0 <= effect_risk <= 1.0:
-            raise ValueError(f"effect_risk must be a share from 0 to 1, not {effect_risk}")
-        self.effect_retries, self.effect_risk = effect_retries, effect_risk
+        self.effect_retries = effect_retries
         self.avoid_failures = avoid_failures
 
     @chunked
@@ -142,10 +137,9 @@ class CavinPlanner(SearchingPlanner):
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
-        # Our addition: lines 7 to 11 again where no motion moves anything, or all may fail.
+        # Our addition: lines 7 to 11 again where no motion moves anything.
         motions_for = partial(self._plan_motions, s_t, near, effects, generators, observed)
-        retries = self.effect_retries, self.effect_risk
-        return try_other_effects(*retries, motions_for, i, near.of(s_t), effects, s_t, generators)
+        return try_other_effects(self.effect_retries, motions_for, i, near.of(s_t), effects, s_t, generators)
 
     def _plan_motions(
         self,

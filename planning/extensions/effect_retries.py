@@ -1,9 +1,8 @@
-"""Another effect where no motion moves anything, or all may fail (our addition to Algorithm 1, between lines 10 and 7).
+"""Another effect where no motion moves anything (our addition to Algorithm 1, between lines 10 and 7).
 
 Line 7 chooses an effect without knowing whether a motion brings it about. Where an obstacle takes the place from which
 the target would have to be pushed, f lets every motion without a failure move nothing, and the next plan chooses the
-same effect again. Beside a forbidden place, the best motion for an effect may fail in many of its perturbed rollouts,
-where a detour would not.
+same effect again.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objec
 
 def try_other_effects(
     retries: int,
-    risk: float,
     motions_for: Callable[[Tensor], Plan],
     chosen: Tensor,
     near: State,
@@ -34,43 +32,27 @@ def try_other_effects(
     state: State,
     generators: Sequence[torch.Generator],
 ) -> Plan:
-    """The plans for the effects `chosen: [B]` int64, or for other effects where these move nothing or are too risky.
-
-    Where they move nothing, the next effect's plan takes their place. Where more than `risk` of their rollouts fail, it
-    does if it moves something and fails less often.
+    """The plans for the effects `chosen: [B]` int64, or for other effects where these move nothing.
 
     Args:
-        retries: how often another effect is tried. risk: share of a motion's perturbed rollouts, 0 to 1.
-        motions_for: lines 8 to 11 for effect plans by number, `[B]`; it advances the `generators`, one per environment.
+        retries: how often another effect is tried. motions_for: lines 8 to 11 for effect plans by number, `[B]`; it
+            advances the `generators`, one per environment.
         state: `[B]`. near: `[B]`, the same of the objects that `effects: [B, N]` are about.
     """
     plan, scores = motions_for(chosen), effects.returns
     for _ in range(retries):
-        unmoved = _does_nothing(plan, state)
-        trying = unmoved | (_failures(plan) > risk)
-        if not trying.any():
+        after = plan.predicted_centers[:, plan.actions.shape[1] - 1]
+        stuck = is_unmoved(state, plan.subgoals.centers[:, 0], after)
+        if not stuck.any():
             break
-        scores = leave_out_similar(scores, first_moves(near, effects), chosen, trying)
+        scores = leave_out_similar(scores, first_moves(near, effects), chosen, stuck)
         chosen = best_of(scores, "returns of effect plans")
         before = [generator.get_state() for generator in generators]
-        other = motions_for(chosen)
-        better = unmoved | ((_failures(other) < _failures(plan)) & ~_does_nothing(other, state))
-        plan = records.where(trying & better, other, plan)
-        for generator, own, tried in zip(generators, before, trying.tolist(), strict=True):
+        plan = records.where(stuck, motions_for(chosen), plan)
+        for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
             if not tried:  # an environment's plan depends on its own arguments only
                 generator.set_state(own)
     return plan
-
-
-def _does_nothing(plan: Plan, state: State) -> Tensor:
-    """Where the chosen motion moves nothing, and the chosen effect should: `[B]` bool."""
-    return is_unmoved(state, plan.subgoals.centers[:, 0], plan.predicted_centers[:, plan.actions.shape[1] - 1])
-
-
-def _failures(plan: Plan) -> Tensor:
-    """Share of the chosen motion's perturbed rollouts that fail: `[B]`, 0 without such rollouts."""
-    assert plan.prospects is not None
-    return plan.prospects.failures.nan_to_num(0.0)
 
 
 def is_unmoved(state: State, subgoals: Tensor, predicted: Tensor) -> Tensor:

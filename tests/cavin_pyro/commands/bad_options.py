@@ -187,7 +187,6 @@ BAD_OPTIONS = [
     ("plan", "planner.optimizer=cem planner.samples=3", "4 iterations need at least as many samples, not 3"),
     ("plan", "planner.feature_weight=-1", "feature_weight must be zero or a positive number, not -1"),
     ("plan", "planner.motion_samples=0", "motion_samples must be at least 1, not 0"),
-    ("plan", "planner.effect_risk=2", "effect_risk must be a share from 0 to 1, not 2"),
     ("plan", "planner.idle_distance=-1", "idle_distance must be zero or a positive number, not -1"),
     ("plan", "planner.warm_start=3", "planner.warm_start must be true or false, not 3"),
     ("plan", "planner.compile=3", "planner.compile must be true or false, not 3"),
