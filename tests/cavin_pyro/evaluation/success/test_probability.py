@@ -109,10 +109,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
 SHIPPED = {
     "default": ("objects=3",),
     "guided": ("planner.guidance=layout", "layout=generated", "generated.tiles=12", "maximum_steps=120"),
-    "guided, other effects": (
-        *("planner.guidance=layout", "planner.effect_retries=3"),
-        *("layout=generated", "generated.tiles=9", "maximum_steps=120"),
-    ),
+    "default, horizon 3": ("task=rearrange", "planner.horizon=3"),
 }
 
 
