@@ -1,17 +1,21 @@
 """The tiles of a layout and objects' places in colour pictures for people; never in the depth image or in the mask.
 
-`paint_tiles` and `paint_places` colour the pixels of a rendered picture that show the table's top. What they paint is
-no body of the simulator: nothing can touch it, it is not in the depth image, and objects occlude it.
+A `Paint` colours the pixels of a rendered picture that show the table's top. What it paints is no body of the
+simulator: nothing can touch it, it is not in the depth image, and objects occlude it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.sensors.camera import Camera
+from envs.sensors.sensor import Rendering
 from envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE, Tile
 
 LEVEL = 0.002  # metres; points at most this far from z = 0 belong to the table's top
@@ -33,58 +37,83 @@ class TileGroup(NamedTuple):
     tiles: tuple[Tile, ...]
 
 
-def paint_tiles(
-    picture: NDArray[np.uint8],
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    places: NDArray[np.floating],
-    groups: Sequence[TileGroup],
-) -> NDArray[np.uint8]:
-    """A copy of a picture with tiles on some of its pixels.
+@dataclass(frozen=True)
+class Paint:
+    """What a camera sees of markings on the table's top, where nothing lies on it.
+
+    Attributes:
+        rows, columns: [P] pixels with a marking, among those that look at the table's top.
+        camera_height: metres. falls: [P] metres that a pixel's ray falls per metre of depth.
+        kept: [P, 1] share of the picture's colour that stays. added: [P, 3] what is added to it, 0 to 255.
+    """
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    camera_height: float
+    falls: NDArray[np.float64]
+    kept: NDArray[np.float64]
+    added: NDArray[np.float64]
+
+    def on(self, rendering: Rendering, objects: Sequence[int]) -> NDArray[np.uint8]:
+        """A copy of the rendered picture [height, width, 3] with the markings that no body of `objects` hides."""
+        where = self.rows, self.columns
+        height = self.camera_height - rendering.depth[where] * self.falls
+        seen = np.flatnonzero((np.abs(height) < LEVEL) & ~np.isin(rendering.bodies[where], objects))
+        where = self.rows[seen], self.columns[seen]
+        painted = rendering.color.copy()
+        painted[where] = np.rint(self.kept[seen] * painted[where] + self.added[seen]).astype(np.uint8)
+        return painted
+
+
+@lru_cache(maxsize=8)  # a film has a hundred pictures by one camera
+def paint_of(
+    camera: Camera,
+    groups: tuple[TileGroup, ...],
+    places: tuple[Place, ...] = (),
+    colors: tuple[tuple[float, float, float], ...] = (),
+) -> Paint:
+    """Groups of tiles, and over them a disc at each object's place.
 
     Args:
-        picture: [height, width, 3]. rows, columns: [P] pixels that show the table's top.
-        places: [P, 2] where on the table they lie, metres.
+        places: centres of the discs. colors: of each disc, red, green and blue from 0 to 1.
     """
-    exact = (places - np.array(TILE_ORIGIN)) / TILE_SIDE
+    rows, columns = (numbers.ravel() for numbers in np.indices((camera.height, camera.width)))
+    ahead = camera.points(np.ones((camera.height, camera.width)), rows, columns) - np.array(camera.position)
+    down = np.flatnonzero(ahead[:, 2] < 0.0)
+    rows, columns, ahead = rows[down], columns[down], ahead[down]
+    camera_height, falls = camera.position[2], -ahead[:, 2]
+    points = np.array(camera.position[:2]) + ahead[:, :2] * (camera_height / falls)[:, None]
+    kept: NDArray[np.float64] = np.ones((len(points), 1))
+    added: NDArray[np.float64] = np.zeros((len(points), 3))
+    discs = (_of_place(points, place, color) for place, color in zip(places, colors, strict=False))
+    for opacity, color in (*(_of_tiles(points, group) for group in groups), *discs):
+        kept = kept * (1.0 - opacity)
+        added = added * (1.0 - opacity) + opacity * color
+    marked = np.flatnonzero(kept < 1.0)
+    return Paint(rows[marked], columns[marked], camera_height, falls[marked], kept[marked], added[marked])
+
+
+Opacity = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Of points on the table [P, 1], 0 where nothing is painted, and the colour [3], 0 to 255."""
+
+
+def _of_tiles(points: NDArray[np.float64], group: TileGroup) -> Opacity:
+    """A fill, and an opaque line along the edge of every tile."""
+    exact = (points - np.array(TILE_ORIGIN)) / TILE_SIDE
     tile = np.floor(exact + 0.5).astype(np.intp)
     on_grid = ((tile >= 0) & (tile < TILE_COUNT)).all(axis=-1)
     tile = np.where(on_grid[:, None], tile, 0)
+    chosen = np.zeros(TILE_COUNT, dtype=np.bool_)
+    chosen[tuple(np.array(group.tiles).T)] = True
     to_edge = TILE_SIDE * (0.5 - np.abs(exact - tile).max(axis=-1))  # metres
-    painted = picture.copy()
-    for group in groups:
-        chosen = np.zeros(TILE_COUNT, dtype=np.bool_)
-        chosen[tuple(np.array(group.tiles).T)] = True
-        inside = np.flatnonzero(on_grid & chosen[tile[:, 0], tile[:, 1]])
-        border = np.clip(1.5 - to_edge[inside] / BORDER, 0.0, 1.0)  # fades over one width: smooth edges
-        opacity = (group.opacity + (1.0 - group.opacity) * border)[:, None]
-        where = rows[inside], columns[inside]
-        color = np.array([int(group.color[start : start + 2], 16) for start in (1, 3, 5)])
-        painted[where] = np.rint((1.0 - opacity) * painted[where] + opacity * color).astype(np.uint8)
-    return painted
+    border = np.clip(1.5 - to_edge / BORDER, 0.0, 1.0)  # fades over one width: smooth edges
+    opacity = np.where(on_grid & chosen[tile[:, 0], tile[:, 1]], group.opacity + (1.0 - group.opacity) * border, 0.0)
+    return opacity[:, None], np.array([int(group.color[start : start + 2], 16) for start in (1, 3, 5)], dtype=float)
 
 
-def paint_places(
-    picture: NDArray[np.uint8],
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    points: NDArray[np.floating],
-    places: Sequence[Place],
-    colors: Sequence[tuple[float, float, float]],
-) -> NDArray[np.uint8]:
-    """A copy of a picture with a disc at each object's place.
-
-    Args:
-        picture, rows, columns, points: as of `paint_tiles`.
-        places: centres of the discs. colors: of each disc, red, green and blue from 0 to 1.
-    """
-    painted = picture.copy()
-    for place, color in zip(places, colors, strict=False):
-        to_edge = PLACE_RADIUS - np.linalg.norm(points - np.array(place), axis=-1)  # metres
-        inside = np.flatnonzero(to_edge >= 0.0)
-        border = np.clip(2.5 - to_edge[inside] / BORDER, 0.0, 1.0)
-        opacity = (PLACE_OPACITY + (1.0 - PLACE_OPACITY) * border)[:, None]
-        where = rows[inside], columns[inside]
-        mixed = (1.0 - opacity) * painted[where] + opacity * 255.0 * np.array(color)
-        painted[where] = np.rint(mixed).astype(np.uint8)
-    return painted
+def _of_place(points: NDArray[np.float64], place: Place, color: tuple[float, float, float]) -> Opacity:
+    """A disc with an opaque line around it."""
+    to_edge = PLACE_RADIUS - np.linalg.norm(points - np.array(place), axis=-1)  # metres
+    border = np.clip(2.5 - to_edge / BORDER, 0.0, 1.0)
+    opacity = np.where(to_edge >= 0.0, PLACE_OPACITY + (1.0 - PLACE_OPACITY) * border, 0.0)
+    return opacity[:, None], 255.0 * np.array(color)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from envs.filming import FrameHook, film
-from envs.markings import LEVEL, Place, TileGroup, paint_places, paint_tiles
+from envs.markings import Place, TileGroup, paint_of
 from envs.objects.object_sets import BuiltinObjects, ObjectSet
 from envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
 from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
@@ -248,11 +248,8 @@ class Scene:
         rendering = self.world.render(camera)
         if not self.markings and not self.places:
             return rendering.color
-        rows, columns = np.nonzero(~np.isin(rendering.bodies, self.bodies))
-        points = camera.points(rendering.depth, rows, columns)
-        top = np.abs(points[:, 2]) < LEVEL
-        pixels = rows[top], columns[top], points[top, :2]
-        return paint_places(paint_tiles(rendering.color, *pixels, self.markings), *pixels, self.places, COLORS)
+        places = tuple((float(x), float(y)) for x, y in self.places)
+        return paint_of(camera, tuple(self.markings), places, COLORS).on(rendering, self.bodies)
 
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""

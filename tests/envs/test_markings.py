@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from envs.layouts import load_task
-from envs.markings import paint_tiles
+from envs.markings import paint_of
 from envs.pushing import VIDEO_SIZE, PushingEnv
 from envs.scene import Scene
 from envs.sensors.camera import Camera
+from envs.sensors.sensor import Rendering
 from envs.tasks import GOAL_MARKING, TASKS, TileSet
 from envs.workspace import TILE_COUNT, tile_center
 
@@ -92,12 +93,33 @@ def test_colours_differ_without_red_or_without_green() -> None:
                     assert np.abs(linear[one] - linear[other]).max() > 0.1
 
 
-def test_a_picture_is_copied_and_pixels_off_the_grid_are_left_alone() -> None:
-    picture = np.full((2, 2, 3), 100, dtype=np.uint8)
-    rows, columns = np.array([0, 0, 1]), np.array([0, 1, 0])
-    places = np.array([tile_center((1, 2)), (9.0, 9.0), tile_center((0, 0))])
-    groups = [group for group in load_task("crossing", 0).tile_groups() if group.name == "goal"]
-    painted = paint_tiles(picture, rows, columns, places, groups)
-    assert (picture == 100).all()
-    changed = (painted != 100).any(axis=-1)
-    np.testing.assert_array_equal(changed, [[True, False], [False, False]])
+def test_a_picture_is_copied_and_what_lies_on_the_table_hides_its_markings() -> None:
+    goal = tuple(group for group in load_task("crossing", 0).tile_groups() if group.name == "goal")
+    one, other = pixel(*tile_center((1, 2))), pixel(*tile_center((0, 0)))
+    shape = PICTURE.height, PICTURE.width
+    flat = Rendering(
+        np.full(shape, PICTURE.position[2]), np.zeros(shape, dtype=np.int64), np.full((*shape, 3), 100, dtype=np.uint8)
+    )
+    painted = paint_of(PICTURE, goal).on(flat, [7])
+    assert (flat.color == 100).all()
+    assert (painted[one] != 100).any() and (painted[other] == 100).all()
+    flat.bodies[one] = 7
+    assert (paint_of(PICTURE, goal).on(flat, [7])[one] == 100).all()
+    flat.bodies[one] = 0
+    flat.depth[one] -= 0.01  # something that is no object
+    assert (paint_of(PICTURE, goal).on(flat, [7])[one] == 100).all()
+
+
+def test_a_place_lies_over_the_tiles() -> None:
+    groups = tuple(load_task("crossing", 0).tile_groups())
+    (i, j), red = groups[0].tiles[0], (1.0, 0.0, 0.0)
+    x, y = tile_center((i, j))
+    with_place = paint_of(PICTURE, groups, ((x, y),), (red,))
+    shape = PICTURE.height, PICTURE.width
+    flat = Rendering(
+        np.full(shape, PICTURE.position[2]), np.zeros(shape, dtype=np.int64), np.full((*shape, 3), 100, dtype=np.uint8)
+    )
+    tiles, both = paint_of(PICTURE, groups).on(flat, []), with_place.on(flat, [])
+    np.testing.assert_allclose(both[pixel(x, y)], 0.55 * tiles[pixel(x, y)] + [0.45 * 255, 0, 0], atol=1.0)
+    changed = (tiles != both).any(axis=-1)
+    assert 0 < changed.mean() < 0.02 and not changed[pixel(x, y + 0.04)]
