@@ -45,6 +45,7 @@ from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.progress import progress_bar
 from envs.observation import Observation
+from envs.physics import Poses
 from envs.randomness import collection_streams
 from envs.robots import STICK_RADIUS
 from envs.scene import FALLEN, Scene
@@ -54,7 +55,6 @@ from models.state import State, Window, stack_steps
 T = 3  # pushes of a segment
 MOVED, STILL, PHANTOM = 0.01, 0.002, 0.02  # metres
 Table = dict[str, "Errors"]
-Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass
@@ -77,37 +77,24 @@ class Episode:
     pushes: list[Push]
 
 
-def poses(scene: Scene) -> Poses:
-    truth = scene.ground_truth()
-    return truth.positions.copy(), truth.orientations.copy()
-
-
-def put(scene: Scene, there: Poses) -> None:
-    """Put the bodies at rest at these poses."""
-    client = scene.world.client
-    for body, position, orientation in zip(scene.bodies, *there, strict=True):
-        client.resetBasePositionAndOrientation(body, position, orientation)
-        client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    scene.world.rest(scene.bodies)
-
-
 def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redraws: int) -> Episode:
     """An episode as `collect` has it, until something falls, and its replays."""
     generator, policy_generator = collection_streams(config.seed, number)
     count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
     seen = [scene.sample([clutter_area(generator)] * count, config.ranges, generator)]
     policy = pushing_policy(config, policy_generator)
-    there, actions = [poses(scene)], []
+    there, actions = [scene.ground_truth()], []
     for _ in range(config.steps):
         action = policy.act(seen[-1]).astype(np.float32)
         if scene.push(action).fallen:
             break
         actions.append(action)
-        there.append(poses(scene))
+        there.append(scene.ground_truth())
         seen.append(scene.observe())
     again = replays(scene, twin, config, there, actions, redraws, np.random.default_rng([config.seed, number]))
     pushes = [
-        Push(seen[t], seen[t + 1], action, there[t][0], there[t + 1][0], again[t]) for t, action in enumerate(actions)
+        Push(seen[t], seen[t + 1], action, there[t].positions, there[t + 1].positions, again[t])
+        for t, action in enumerate(actions)
     ]
     return Episode([each.name for each in scene.objects], pushes)
 
@@ -130,11 +117,11 @@ def replays(
             objects.append(replace(each, mass=mass, friction=generator.uniform(*config.ranges.friction)))
         twin.reset(objects, generator)
         for t in range(len(actions)):
-            put(twin, there[t])
+            twin.world.restore(twin.bodies, there[t])
             for ahead, action in enumerate(actions[t : t + T], start=1):
                 twin.push(action)
                 if ahead in (1, T):
-                    ends[t][ahead].append(poses(twin)[0])
+                    ends[t][ahead].append(twin.ground_truth().positions)
     return [{ahead: np.array(drawn) for ahead, drawn in each.items()} for each in ends]
 
 

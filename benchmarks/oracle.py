@@ -51,13 +51,7 @@ class Oracle:
 
     def outcome(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Observed centres [M, 3] in metres after the pushes [T, 4], from where the real objects are now."""
-        poses, client = self.env.scene.ground_truth(), self.twin.scene.world.client
-        for body, position, orientation in zip(
-            self.twin.scene.bodies, poses.positions, poses.orientations, strict=True
-        ):
-            client.resetBasePositionAndOrientation(body, position, orientation)
-            client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        self.twin.scene.world.rest(self.twin.scene.bodies)
+        self.twin.scene.world.restore(self.twin.scene.bodies, self.env.scene.ground_truth())
         for action in actions:
             self.twin.scene.push(np.clip(action, -1.0, 1.0))
         return self.twin.scene.observe().centers

@@ -75,14 +75,6 @@ def scenes(count: int, heavy: bool, seed: int) -> list[tuple[list[ObjectParamete
     return sampled
 
 
-def put(scene: Scene, poses: Poses) -> None:
-    """Every object to a pose, asleep: each push starts from the same place under every robot."""
-    for body, position, orientation in zip(scene.bodies, poses.positions, poses.orientations, strict=True):
-        scene.world.client.resetBasePositionAndOrientation(body, position, orientation)
-        scene.world.client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
-    scene.world.rest(scene.bodies)
-
-
 def pushes(
     robot: str, assets: Path | None, count: int, heavy: bool, script: list[Any] | None, aside: float = 0.0
 ) -> dict[str, Any]:
@@ -99,7 +91,7 @@ def pushes(
                 found["script"].append((before, action))
             else:
                 before, action = script[number * PUSHES_PER_SCENE + turn]
-            put(scene, before)
+            scene.world.restore(scene.bodies, before)  # every robot pushes from the same place
             watched.tips = []
             report = scene.push(beside(action, aside) if aside else action)
             found["after"].append(scene.ground_truth())

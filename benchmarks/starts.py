@@ -2,8 +2,9 @@
 
 In the first state of each scene of a generated layout, pushes at the target are tried in the simulator, each from the
 same state: from 4 to 14 cm away, in a random direction, as far as the tool reaches. Of each scene it says how many of
-them leave the target's way to the goal shorter by 1 cm and break no rule. Where hardly any does, no planner succeeds,
-whatever its model. `--seeds` names single scenes. The last lines count the scenes by their share of such pushes.
+them leave the target's way to the goal shorter by 1 cm and break no rule. Where hardly any does, little is left to a
+planner, whatever its model. `--seeds` names single scenes. The last lines count the scenes by their share of such
+pushes.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Start(NamedTuple):
 def try_pushes(env: PushingEnv, seed: int, pushes: int) -> Start:
     """Push the target of a scene in many directions, each time from the scene's first state."""
     env.reset(seed=seed)
-    scene, client = env.scene, env.scene.world.client
+    scene = env.scene
     before, poses = scene.observe(), scene.ground_truth()
     centers, mask = torch.from_numpy(before.centers), torch.from_numpy(before.mask)
     way = env.reward.way
@@ -60,10 +61,7 @@ def try_pushes(env: PushingEnv, seed: int, pushes: int) -> Start:
         if (start < REACH_LOW).any() or (start > REACH_HIGH).any():
             continue
         counts["tried"] += 1
-        for body, position, orientation in zip(scene.bodies, poses.positions, poses.orientations, strict=True):
-            client.resetBasePositionAndOrientation(body, position, orientation)
-            client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        scene.world.rest(scene.bodies)
+        scene.world.restore(scene.bodies, poses)
         push = normalised_push(start, MAXIMUM_MOTION * direction / np.abs(direction).max())
         report = scene.push(np.clip(push, -1.0, 1.0))
         if report.unsafe:

@@ -180,6 +180,13 @@ class PhysicsWorld:
         found = [self._bullet.getBasePositionAndOrientation(body) for body in bodies]
         return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
 
+    def restore(self, bodies: Sequence[int], poses: Poses) -> None:
+        """Put bodies at rest at poses, for example where they were before; for benchmarks that try several pushes."""
+        for body, position, orientation in zip(bodies, poses.positions, poses.orientations, strict=True):
+            self._bullet.resetBasePositionAndOrientation(body, position, orientation)
+            self._bullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self.rest(bodies)
+
     def visuals(self) -> list[Visual]:
         """The visual shapes of every body in the world."""
         return visuals(self._bullet)

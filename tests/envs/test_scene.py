@@ -18,7 +18,7 @@ from envs.robots import OFF_STAGE, SETTLED_SPEED, STICK_RADIUS
 from envs.scene import COLORS, MOVED, TURNED, PushReport, Scene
 from envs.sensors import IdealSensor
 from envs.sensors.camera import Camera
-from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
+from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, normalised_push, push_endpoints
 
 ROOT = Path(__file__).parents[2]
 REACHABLE: Area = (((0.40, -0.35), (0.70, 0.35)),)
@@ -386,3 +386,16 @@ def test_a_world_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     world = PhysicsWorld()
     world.close()
     assert capfd.readouterr() == ("", "")
+
+
+def test_restored_bodies_are_where_they_were_and_the_same_push_ends_alike(scene: Scene, put: Callable) -> None:
+    scene.reset([put("rubiks_cube", 0.5, 0.0), put("rubiks_cube", 0.6, 0.0)], np.random.default_rng(0))
+    before, push, ends = scene.ground_truth(), normalised_push(np.array([0.42, 0.0]), np.array([0.1, 0.0])), []
+    for _ in range(2):
+        scene.push(push)
+        ends.append(scene.ground_truth().positions)
+        assert np.abs(ends[-1] - before.positions).max() > 0.01
+        scene.world.restore(scene.bodies, before)
+        np.testing.assert_allclose(scene.ground_truth().positions, before.positions, atol=1e-9)
+        np.testing.assert_allclose(scene.ground_truth().orientations, before.orientations, atol=1e-9)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-3)  # metres; contacts are not what they were
