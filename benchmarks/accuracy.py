@@ -10,10 +10,11 @@ hit     the tool's path passes within half of the object's half-width (across th
 graze   within all of it and the tool's radius
 miss    farther off, or the push ends before the object
 
-The floor has two parts. Hidden: the distance between what happened and the mean of --redraws replays of the same push
-in a second world, from the same poses, with mass and friction drawn anew within their ranges (those that leave the
-object on the table). Camera: the distance
-between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
+The floor has three parts. Hidden: the distance between an object's motion and its mean in --redraws replays of the
+same push in a second world, from the same poses, with mass and friction drawn anew within their ranges (those that
+leave the object on the table). Place: the same for somebody who also sees where each object lies only to within
+--place-error (standard deviation in x and in y), so that the replays begin around the place that he sees. Camera: the
+distance between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
 `--policy model` has pushes that `--pusher CHECKPOINT` chooses, as in `collect policy=model`.
 `--objects 8 10` is for other numbers of objects than 1 to 5, and `--neighbours 4 9` predicts once with the nearest 4
 other objects in each relation, and once with the nearest 9.
@@ -55,6 +56,7 @@ from models.state import State, Window, stack_steps
 T = 3  # pushes of a segment
 MOVED, STILL, PHANTOM = 0.01, 0.002, 0.02  # metres
 Table = dict[str, "Errors"]
+Replays = dict[int, NDArray[np.float64]]  # [redraws, objects, 3] motions in metres after 1 and T pushes; NaN if fallen
 
 
 @dataclass
@@ -66,7 +68,8 @@ class Push:
     action: NDArray[np.float32]
     start: NDArray[np.float64]  # [objects, 3] metres, bodies before and after
     end: NDArray[np.float64]
-    replayed: dict[int, NDArray[np.float64]]  # [redraws, objects, 3] metres, after 1 and T pushes from here
+    replayed: Replays  # from where the bodies were
+    displaced: Replays  # from around where somebody saw them
 
 
 @dataclass
@@ -77,7 +80,9 @@ class Episode:
     pushes: list[Push]
 
 
-def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redraws: int) -> Episode:
+def play(
+    scene: Scene, twin: Scene, config: CollectionConfig, number: int, redraws: int, place_error: float
+) -> Episode:
     """An episode as `collect` has it, until something falls, and its replays."""
     generator, policy_generator = collection_streams(config.seed, number)
     count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
@@ -91,9 +96,12 @@ def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redra
         actions.append(action)
         there.append(scene.ground_truth())
         seen.append(scene.observe())
-    again = replays(scene, twin, config, there, actions, redraws, np.random.default_rng([config.seed, number]))
+    again, displaced = (
+        replays(scene, twin, config, there, actions, redraws, number, error)
+        for error in (0.0, place_error)
+    )
     pushes = [
-        Push(seen[t], seen[t + 1], action, there[t].positions, there[t + 1].positions, again[t])
+        Push(seen[t], seen[t + 1], action, there[t].positions, there[t + 1].positions, again[t], displaced[t])
         for t, action in enumerate(actions)
     ]
     return Episode([each.name for each in scene.objects], pushes)
@@ -106,10 +114,16 @@ def replays(
     there: list[Poses],
     actions: list[NDArray[np.float32]],
     redraws: int,
-    generator: np.random.Generator,
-) -> list[dict[int, NDArray[np.float64]]]:
-    """For every push: positions [redraws, objects, 3] after 1 and, where there are as many, after T pushes."""
-    ends: list[dict[int, list[NDArray[np.float64]]]] = [defaultdict(list) for _ in actions]
+    number: int,
+    place_error: float,
+) -> list[Replays]:
+    """For every push: motions after 1 and, where there are as many, after T pushes.
+
+    place_error: metres, of the place that is seen from the true one, and of the true one from that; 0 for the true one.
+    """
+    generator, places = (np.random.default_rng([config.seed, number, *of]) for of in ((), (1,)))
+    motions: list[dict[int, list[NDArray[np.float64]]]] = [defaultdict(list) for _ in actions]
+    seen = [place_error * places.standard_normal((len(scene.objects), 2)) for _ in actions]
     for _ in range(redraws):
         objects = []
         for each in scene.objects:
@@ -117,12 +131,15 @@ def replays(
             objects.append(replace(each, mass=mass, friction=generator.uniform(*config.ranges.friction)))
         twin.reset(objects, generator)
         for t in range(len(actions)):
-            twin.world.restore(twin.bodies, there[t])
+            start = there[t].positions.copy()
+            start[:, :2] += seen[t] + place_error * places.standard_normal(seen[t].shape)
+            twin.world.restore(twin.bodies, Poses(start, there[t].orientations))
             for ahead, action in enumerate(actions[t : t + T], start=1):
                 twin.push(action)
                 if ahead in (1, T):
-                    ends[t][ahead].append(twin.ground_truth().positions)
-    return [{ahead: np.array(drawn) for ahead, drawn in each.items()} for each in ends]
+                    end = twin.ground_truth().positions
+                    motions[t][ahead].append(np.where(end[:, 2:] > FALLEN, end - start, np.nan))
+    return [{ahead: np.array(drawn) for ahead, drawn in each.items()} for each in motions]
 
 
 def kind(before: Observation, action: NDArray[np.float32], slot: int) -> str:
@@ -178,9 +195,10 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
             best = min(kinds, key=("hit", "graze", "miss").index)
             groups = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
             before, seen = first.before.centers[slot], last.after.centers[slot]
-            stayed = first.replayed[ahead][first.replayed[ahead][:, slot, 2] > FALLEN, slot]
-            if len(stayed):
-                table["hidden"].add(groups, moved, float(np.linalg.norm(stayed.mean(0) - last.end[slot])))
+            for floor, again in (("hidden", first.replayed), ("place", first.displaced)):
+                stayed = again[ahead][np.isfinite(again[ahead][:, slot, 2]), slot]
+                if len(stayed):
+                    table[floor].add(groups, moved, float(np.linalg.norm(stayed.mean(0) - body)))
             table["camera"].add(groups, moved, float(np.linalg.norm(seen - before - body)))
             for who, all_of in predicted.items():
                 claimed = float(np.linalg.norm(all_of[number][slot] - before))
@@ -255,7 +273,7 @@ def draw(tables: dict[int, Table], path: Path) -> None:
         for number, who in enumerate(table):
             means = [100 * float(np.mean(table[who].moved.get(group, [np.nan]))) for group in groups]
             width, (model, _, part) = 0.8 / len(table), who.partition(": ")
-            color = f"C{models.index(model)}" if part else {"hidden": "0.45", "camera": "0.75"}[who]
+            color = f"C{models.index(model)}" if part else {"hidden": "0.3", "place": "0.55", "camera": "0.8"}[who]
             place = places + (number - (len(table) - 1) / 2) * width
             ax.bar(place, means, width, label=who, color=color, alpha=0.45 if part == "h" else 1.0)
         ax.set_xticks(places, [group.replace("_", " ") for group in groups], rotation=30, ha="right")
@@ -277,6 +295,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=20000)
     parser.add_argument("--redraws", type=int, default=8)
+    parser.add_argument("--place-error", type=float, default=0.0018, help="metres (%(default)s)")
     parser.add_argument("--objects", type=int, nargs=2, default=(1, OBJECT_SLOTS), help="at least, and at most")
     parser.add_argument("--neighbours", type=int, nargs="+", default=(None,))
     parser.add_argument("--policy", choices=POLICIES, default="heuristic", help="what chooses the pushes")
@@ -294,7 +313,7 @@ def main() -> None:
         progress_bar("pushing", total=arguments.episodes, unit="episode") as bar,
     ):
         for number in range(arguments.episodes):
-            episodes.append(play(scene, twin, config, number, arguments.redraws))
+            episodes.append(play(scene, twin, config, number, arguments.redraws, arguments.place_error))
             bar.update()
     paths = arguments.checkpoints or ["cavin"]
     found = [predictions(path, episodes, near) for path in paths for near in arguments.neighbours]

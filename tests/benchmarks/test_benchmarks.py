@@ -271,10 +271,15 @@ def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -
     for part in (one_push, three_pushes):
         (row,) = re.findall(r"^all +\d+ +(.*)$", part, re.M)
         means[part] = [float(cell.split(" / ")[0]) for cell in re.split(r" {2,}", row.strip())]
-    hidden, camera, f = means[one_push]
+    hidden, place, camera, f = means[one_push]
     assert 0.0 < max(hidden, camera) < f < 3.0  # centimetres
-    assert means[three_pushes][2] > hidden
+    assert place > hidden
+    assert means[three_pushes][3] > hidden
     assert (tmp_path / "a.png").stat().st_size > 10_000
+    blind = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", "--place-error", "0", *options[:3])
+    assert "place" in blind
+    hidden_again, place_again = re.search(r"^all +\d+ +(\S+) / \S+ +(\S+) /", blind, re.M).groups()  # type: ignore[union-attr]
+    assert hidden_again == place_again  # who sees the places exactly knows as much
 
 
 def test_pushes_of_a_model_are_others_than_the_heuristics() -> None:
