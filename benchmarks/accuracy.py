@@ -80,9 +80,7 @@ class Episode:
     pushes: list[Push]
 
 
-def play(
-    scene: Scene, twin: Scene, config: CollectionConfig, number: int, redraws: int, place_error: float
-) -> Episode:
+def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redraws: int, place_error: float) -> Episode:
     """An episode as `collect` has it, until something falls, and its replays."""
     generator, policy_generator = collection_streams(config.seed, number)
     count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
@@ -97,8 +95,7 @@ def play(
         there.append(scene.ground_truth())
         seen.append(scene.observe())
     again, displaced = (
-        replays(scene, twin, config, there, actions, redraws, number, error)
-        for error in (0.0, place_error)
+        replays(scene, twin, config, there, actions, redraws, number, error) for error in (0.0, place_error)
     )
     pushes = [
         Push(seen[t], seen[t + 1], action, there[t].positions, there[t + 1].positions, again[t], displaced[t])

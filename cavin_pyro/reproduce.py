@@ -15,6 +15,7 @@ def main(config: DictConfig) -> None:
     """
     from pathlib import Path
 
+    from cavin_pyro.config.device import choose_device
     from cavin_pyro.reproduction.episodes.picture import draw_chosen_episodes
     from cavin_pyro.reproduction.merging import IGNORED, merge_tables
     from cavin_pyro.reproduction.pipeline import as_typed, run_pipeline
@@ -24,6 +25,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.provenance import PROVENANCE, append_provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
+    device = choose_device(config.device).type  # `auto` chooses once, for all stages
     with output_folder(config.output) as home:
         check_same_run(home, config, ignore=IGNORED)
         rows = read_table(Path(config.table)) if config.table else []
@@ -32,7 +34,7 @@ def main(config: DictConfig) -> None:
         if config.merge:
             rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
         elif not config.table:
-            rows = run_pipeline(config, home)
+            rows = run_pipeline(config, home, device)
         for path in write_results(home, rows, as_typed(config)):
             print(path)
         if config.pictures is not None:

@@ -30,13 +30,14 @@ ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
 
 
-def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
+def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> list[Row]:
     """Collect, pretrain, train and evaluate, as far as that has not been done, and write the table of episodes.
 
     Args:
         config: of the command `reproduce`. `shard=i/n`: the i-th of every n trainings and their episodes only.
             With more `episodes` or other `planners` than an earlier run, only what is missing is run; `extends` names
             the table of a run whose folder is elsewhere, and whose episodes are kept, wanted or not.
+        device: cpu or cuda, on which networks are trained and plan; collection runs on the CPU.
 
     Returns:
         The table's rows.
@@ -45,8 +46,8 @@ def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
         UserError: an option that cannot be used, or a stage that failed.
     """
     scale = chosen_scale(config)
-    first = preparation(scale, home, workers=config.workers)
-    learning = of_shard(trainings(scale, home, config.methods), config.shard)
+    first = preparation(scale, home, workers=config.workers, device=device)
+    learning = of_shard(trainings(scale, home, config.methods, device=device), config.shard)
     folders = {stage.folder for stage in learning}
     own = [
         one
@@ -61,7 +62,7 @@ def run_pipeline(config: DictConfig, home: Path) -> list[Row]:
     with _whole_progress(flat, scale, own, home, config.workers, known) as bar:
         for stages in groups:
             run_stages(stages, config.workers, bar.update_stages)
-        rows = _evaluate(scale, own, home, models, config.workers, bar, known)
+        rows = _evaluate(scale, own, home, models, device, config.workers, bar, known)
     own_keys = {row_key(row) for row in rows}
     rows = in_order([*rows, *(row for key, row in known.items() if key not in own_keys)], SCALES[config.scale])
     write_table(home / TABLE, rows)
@@ -151,6 +152,7 @@ def _evaluate(
     own: Sequence[Evaluation],
     home: Path,
     models: Mapping[Evaluation, Path],
+    device: str,
     workers: int,
     bar: _Bar,
     known: Mapping[tuple[Any, ...], Row],
@@ -163,7 +165,7 @@ def _evaluate(
     rows = {one: begin(_made(evaluation_folder(home, one))) for one in own}
     missing = [
         ((seed - one.seed) // ROUND, place, one, config, seed)
-        for place, (one, config) in enumerate(_configurations(scale, own, home, models))
+        for place, (one, config) in enumerate(_configurations(scale, own, home, models, device))
         for seed in missing_seeds(config, rows[one])
         if episode_key(one, seed) not in known
     ]
@@ -179,7 +181,7 @@ def _evaluate(
 
 
 def _configurations(
-    scale: Scale, own: Sequence[Evaluation], home: Path, models: Mapping[Evaluation, Path]
+    scale: Scale, own: Sequence[Evaluation], home: Path, models: Mapping[Evaluation, Path], device: str
 ) -> Iterator[tuple[Evaluation, DictConfig]]:
     """The options of every evaluation, composed once for each method, planner and task, because that takes time."""
     composed: dict[tuple[str, str, str], DictConfig] = {}
@@ -188,7 +190,9 @@ def _configurations(
         key = cell.method, cell.planner, cell.task
         if key not in composed:
             planner = METHODS[cell.method].planners[cell.planner]
-            composed[key] = compose("evaluate", f"task={cell.task}", *SHARED, *planner, *scale.planning, "output=-")
+            composed[key] = compose(
+                "evaluate", f"task={cell.task}", *SHARED, *planner, *scale.planning, f"device={device}", "output=-"
+            )
         config = composed[key].copy()
         config.reward, config.objects = cell.reward, cell.objects
         config.seed, config.episodes = one.seed, one.episodes

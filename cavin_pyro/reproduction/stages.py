@@ -78,8 +78,8 @@ class Stage:
             raise UserError(f"{self.line} failed: {' '.join(last).removeprefix('error: ')} ({self.folder}/log.txt)")
 
 
-def preparation(scale: Scale, home: Path, *, workers: int) -> list[Stage]:
-    """Data, then the PointNet that all methods share."""
+def preparation(scale: Scale, home: Path, *, workers: int, device: str = "cpu") -> list[Stage]:
+    """Data, then the PointNet that all methods share; `device`: of the latter's training."""
 
     def collected(folder: Path) -> float:
         return _number(folder / "metadata.json", "transitions") / scale.transitions
@@ -94,7 +94,7 @@ def preparation(scale: Scale, home: Path, *, workers: int) -> list[Stage]:
     )
     pretrain = Stage(
         "pretrain",
-        (f"data={collect.folder}", *scale.pretraining),
+        (f"data={collect.folder}", *scale.pretraining, f"device={device}"),
         home / "pretrain",
         "reconstructions.png",
         PRETRAINING_SECONDS,
@@ -102,7 +102,7 @@ def preparation(scale: Scale, home: Path, *, workers: int) -> list[Stage]:
     return [collect, pretrain]
 
 
-def trainings(scale: Scale, home: Path, methods: Sequence[str]) -> list[Stage]:
+def trainings(scale: Scale, home: Path, methods: Sequence[str], *, device: str = "cpu") -> list[Stage]:
     """Every method with every training seed, on the same data and features."""
     steps = next((int(one.partition("=")[2]) for one in scale.training if one.startswith("trainer.steps=")), None)
 
@@ -118,6 +118,7 @@ def trainings(scale: Scale, home: Path, methods: Sequence[str]) -> list[Stage]:
                 *scale.training,
                 *METHODS[name].training,
                 f"seed={seed}",
+                f"device={device}",
             ),
             training_folder(home, name, seed),
             "training.png",

@@ -68,6 +68,8 @@ def stored_options(path: Path) -> dict[str, Any]:
             options.setdefault(f"generated.{name}", default)
     if "planner.horizon" in options:
         options.setdefault("planner.guidance", "none")
+    if "scale" in options:
+        options.setdefault("device", "cpu")
     if "trainer.schedule" in options:
         options.setdefault("trainer.reflect", False)
         options.setdefault("trained", [])

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from cavin_pyro.config.commands.device import DeviceOptions
 from cavin_pyro.config.options import option
 
 
 @dataclass
-class ReproduceConfig:
+class ReproduceConfig(DeviceOptions):
     """Options of `python -m cavin_pyro.reproduce`."""
 
     defaults: list[Any] = field(default_factory=lambda: ["_self_", "base"])

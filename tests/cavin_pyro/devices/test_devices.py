@@ -42,13 +42,17 @@ def test_everything_works_on_a_device_that_is_not_the_cpu(chosen: str, least: in
 
 
 @without_gpu
-def test_cuda_without_a_gpu_is_one_line_that_names_the_choices(shell: SimpleNamespace, tmp_path: Path) -> None:
-    ended = shell.run_command("plan", "device=cuda", folder=tmp_path)
+@pytest.mark.parametrize("command", ["plan", "reproduce"])
+def test_cuda_without_a_gpu_is_one_line_that_names_the_choices(
+    command: str, shell: SimpleNamespace, tmp_path: Path
+) -> None:
+    ended = shell.run_command(command, "device=cuda", folder=tmp_path)
     assert ended.status == 2 and ended.output == ""
     assert re.fullmatch(
         r"error: device=cuda, but torch .*: choose device=cpu, or device=auto, which takes a GPU where there is one\n",
         ended.errors,
     )
+    assert not list(tmp_path.iterdir())
 
 
 @without_gpu

@@ -13,7 +13,7 @@ from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations,
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale
 from cavin_pyro.reproduction.scales import SCALES
-from cavin_pyro.reproduction.stages import trainings
+from cavin_pyro.reproduction.stages import preparation, trainings
 from tests.cavin_pyro.conftest import ROOT
 
 
@@ -62,6 +62,12 @@ def test_every_command_line_of_a_stage_is_accepted(method: str, scale: str) -> N
     for planner in METHODS[method].planners.values():
         composed = compose("evaluate", *SHARED, *planner, *SCALES[scale].planning, "output=-")
         assert composed.env.segmentation == "clusters" and composed.criterion == "published"
+
+
+def test_networks_of_all_stages_are_trained_on_the_chosen_device() -> None:
+    scale = SCALES["smoke"]
+    stages = [*preparation(scale, ROOT, workers=1, device="cuda"), *trainings(scale, ROOT, ["cavin"], device="cuda")]
+    assert {stage.command for stage in stages if "device=cuda" in stage.options} == {"pretrain", "train"}
 
 
 def test_variants_have_a_planner_each_and_differ_from_the_papers() -> None:
