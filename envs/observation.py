@@ -21,7 +21,8 @@ class Observation:
     """An observation of the table, padded to M objects.
 
     Attributes:
-        clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of each cloud.
+        clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of all points that the
+            camera sees of each object, of which a cloud has a sample.
         mask: [M] bool, True for objects observed at least once.
         visible: [M] bool, True for objects in this image; a hidden object keeps its latest cloud.
     """
@@ -42,6 +43,7 @@ class LatestClouds:
     def __init__(self, generator: np.random.Generator, slots: int = OBJECT_SLOTS) -> None:
         self._generator = generator
         self._clouds = np.zeros((slots, POINTS_PER_OBJECT, 3), dtype=np.float32)
+        self._centers = np.zeros((slots, 3), dtype=np.float32)
         self._mask = np.zeros(slots, dtype=np.bool_)
 
     def update(self, image: DepthImage, found: Sequence[Pixels]) -> Observation:
@@ -51,7 +53,8 @@ class LatestClouds:
             if len(rows) >= MINIMUM_PIXELS:
                 points = image.camera.points(image.depth, rows, columns)
                 self._clouds[slot] = sample_cloud(points, POINTS_PER_OBJECT, self._generator)
+                # Of all points: the mean of the sample would be off by 2 mm, more than a push's outcome forgives.
+                self._centers[slot] = points.mean(0)
                 visible[slot] = True
         self._mask |= visible
-        centers = self._clouds.mean(axis=1, dtype=np.float64).astype(np.float32)
-        return Observation(self._clouds.copy(), centers, self._mask.copy(), visible)
+        return Observation(self._clouds.copy(), self._centers.copy(), self._mask.copy(), visible)

@@ -101,11 +101,13 @@ class Camera:
 
 
 def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Sample `count` of the points [P, 3], without replacement if there are enough.
+    """Sample `count` of the points [P, 3], each as often as any other or once more.
 
     Raises:
         ValueError: there is no point to sample from.
     """
     if len(points) == 0:
         raise ValueError("no point to sample a cloud from: the object is not visible")
-    return points[generator.choice(len(points), size=count, replace=len(points) < count)]
+    whole, rest = divmod(count, len(points))
+    once_more = generator.choice(len(points), size=rest, replace=False)
+    return points[np.concatenate([np.tile(np.arange(len(points)), whole), once_more])]
