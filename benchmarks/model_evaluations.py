@@ -14,7 +14,7 @@ sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.model_evaluations import count_evaluations
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
 
 PARTS = ("h", "g", "f")
 
@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument(
         "--models", type=Path, help="folder of METHOD-0.safetensors; by default the shipped checkpoints"
     )
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--methods", nargs="+", default=PAPER_METHODS, choices=METHODS)
     arguments = parser.parse_args()
     print(f"| method | planner | {' | '.join(PARTS)} | all |\n| --- | --- |" + " --- |" * (len(PARTS) + 1))
     for name in arguments.methods:

@@ -37,7 +37,7 @@ from cavin_pyro.data.observed import observed_state
 from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.statistics import wilson
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
 from cavin_pyro.reproduction.pipeline import SHARED
 from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="scenes, the same for every setting")
     parser.add_argument("--timed", type=int, default=8, help="scenes whose first plans are timed")
     parser.add_argument("--samples", type=int, nargs="+", default=SAMPLES)
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--methods", nargs="+", default=PAPER_METHODS, choices=METHODS)
     parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=PLANNERS)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--output", type=Path, default=Path("runs/samples"))

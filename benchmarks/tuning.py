@@ -20,7 +20,7 @@ sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs
 from cavin_pyro.evaluation.statistics import wilson
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
 from cavin_pyro.reproduction.pipeline import SHARED
 from cavin_pyro.reproduction.scales import QUICK_TRAINING, TASKS
 from cavin_pyro.reproduction.stages import Stage, run_stages
@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument("home", type=Path)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--episodes", type=int, default=15, help="of every variant in each task")
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--methods", nargs="+", default=PAPER_METHODS, choices=METHODS)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--training", nargs="*", default=[], help="further options of train")
     parser.add_argument("--planning", nargs="*", default=[], help="further options of evaluate")

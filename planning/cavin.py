@@ -14,7 +14,6 @@ from planning.backends.chunking import chunked
 from planning.extensions.effect_retries import try_other_effects
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.guidance import guided_tracking
-from planning.extensions.idle_pushes import idle_last
 from planning.extensions.nearest_objects import NearestObjects, nearest_objects
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, most_robust
 from planning.extensions.touchdown import ObservedPoints
@@ -41,7 +40,7 @@ class CavinPlanner(SearchingPlanner):
 
     model: h, g, f and their priors.
     reward: the task.
-    samples: N, at both levels.
+    samples: N, at line 5, and in the paper also at line 8.
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
@@ -60,7 +59,8 @@ class CavinPlanner(SearchingPlanner):
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
         paper.
-    warm_start: our addition to line 5: the last plan's noise is among the candidates.
+    warm_start: our addition to line 5: the last plan's noise is among the candidates of `shooting`, `evolution` and
+        `smc`; the other optimizers do not read it.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
     idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
@@ -138,16 +138,16 @@ class CavinPlanner(SearchingPlanner):
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
         # Our addition: lines 7 to 11 again where no motion moves anything.
-        motions_for = partial(self._plan_motions, s_t, near, effects, generators, observed)
+        motions_for = partial(self._plan_motions, s_t, near, generators, observed)
         return try_other_effects(self.effect_retries, motions_for, i, near.of(s_t), effects, s_t, generators)
 
     def _plan_motions(
         self,
         s_t: State,
         near: NearestObjects,
-        effects: Candidates,
         generators: Sequence[torch.Generator],
         observed: ObservedPoints | None,
+        effects: Candidates,
         i: Tensor,
     ) -> Plan:
         """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
@@ -185,7 +185,7 @@ class CavinPlanner(SearchingPlanner):
             j, failures = most_robust(self.robustness, motions, scores, later_cost, *task)
         chosen = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = chosen.codes[:, 0], chosen.actions[:, 0], chosen.path[:, 0]
-        a_star, path = idle_last(a_star, path, s_t, T, self.idle_distance)
+        a_star, path = self.idle_last(a_star, path, s_t, observed)
 
         # Line 11: the caller executes the first T actions, or the first of them.
         return Plan(

@@ -12,6 +12,7 @@ from models.state import State
 from planning.backends.compiled import Compiled
 from planning.backends.eager import Backend, eager
 from planning.extensions.guidance import check_guidance, guided_return, way_of
+from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.touchdown import ObservedPoints, prefer_free
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
@@ -145,6 +146,14 @@ class SearchingPlanner:
         pushes: `[B, N, T, 4]`, their first segments.
         """
         return prefer_free(scores, pushes[..., 0, :], observed, self.touchdown_distance)
+
+    def idle_last(
+        self, actions: Tensor, path: Tensor, state: State, observed: ObservedPoints | None
+    ) -> tuple[Tensor, Tensor]:
+        """The chosen actions `[B, H, 4]` with idle pushes last, and the states after each: `[B, H, M, 3]` metres."""
+        return idle_last(
+            actions, path, state, self.segment_length, self.idle_distance, observed, self.touchdown_distance
+        )
 
 
 def summary(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
@@ -50,16 +50,6 @@ def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:
     """
     if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
         raise UserError(f"{name} must be a whole number from {minimum} to {maximum}, not {value}")
-
-
-def one_of(name: str, value: object, choices: Collection[str]) -> None:
-    """Check a name from the command line.
-
-    Raises:
-        UserError: the name is none of the choices, which are named.
-    """
-    if value not in choices:
-        raise UserError(f"unknown {name} {value!r}: choose from {', '.join(choices)}")
 
 
 class Parser(argparse.ArgumentParser):

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +24,10 @@ ABANDONED_SECONDS = 3600.0  # a file that another training writes there is young
 
 
 def geometry_fingerprint(geometry: Geometry) -> str:
-    """Twelve hexadecimal digits that change when any weight does."""
-    digest = hashlib.sha256()
+    """Twelve hexadecimal digits that change when any weight does, or the file of its class, with its constants."""
+    digest = hashlib.sha256(f"{type(geometry).__module__}.{type(geometry).__qualname__}".encode())
+    with suppress(OSError, TypeError):  # a class without a file, such as a notebook's
+        digest.update(inspect.getsource(sys.modules[type(geometry).__module__]).encode())
     for name, value in sorted(geometry.state_dict().items()):
         digest.update(name.encode())
         digest.update(value.contiguous().numpy().tobytes())

@@ -39,7 +39,8 @@ class EpisodeReward:
     def __init__(self, env: TaskSource, *, reward: str, margin: float, device: str | torch.device = "cpu") -> None:
         self._env, self._kind, self._device = env, reward, device
         self.dense, self.margin = reward == "dense", margin
-        self._rewards = {id(task): self._reward_of(task) for task in env.tasks}
+        # With each reward its task, which must live as long: another one could get its number.
+        self._rewards = {id(task): (task, self._reward_of(task)) for task in env.tasks}
 
     @property
     def task(self) -> Task:
@@ -50,8 +51,8 @@ class EpisodeReward:
     def current(self) -> TaskReward:
         """The reward of the current episode: a pure function of tensors."""
         if id(self.task) not in self._rewards:  # a layout or a goal that only this episode has
-            self._rewards = {id(self.task): self._reward_of(self.task)}
-        return self._rewards[id(self.task)]
+            self._rewards = {id(self.task): (self.task, self._reward_of(self.task))}
+        return self._rewards[id(self.task)][1]
 
     def _reward_of(self, task: Task) -> TaskReward:
         return TaskReward(task, reward=self._kind, margin=self.margin, device=self._device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     last line is dropped and its episode run again.
     """
     rows, seeds = begin(folder), seeds_of(config)
-    missing = [seed for seed in seeds if seed not in rows]
+    missing = missing_seeds(seeds, rows)
     launcher = Launcher(config.launcher, config.workers, config.address)
     if missing:
         announce_waiting(config)
@@ -81,8 +81,7 @@ def merge(config: DictConfig, folder: Path) -> list[Row]:
         check_same_run(shard, config, ignore=NOT_COMPARED)
         rows |= finished_episodes(shard / EPISODES_FILE)
     seeds = range(config.seed, config.seed + config.episodes)
-    missing = [seed for seed in seeds if seed not in rows]
-    if missing:
+    if missing := missing_seeds(seeds, rows):
         raise UserError(
             f"the folders of merge lack {len(missing)} of {len(seeds)} episodes, the first with seed {missing[0]}: "
             "give the folder of every shard, each finished"
@@ -111,9 +110,9 @@ def append(folder: Path, row: Row) -> None:
         file.write(json.dumps(row) + "\n")
 
 
-def missing_seeds(config: DictConfig, rows: Mapping[int, Row]) -> list[int]:
-    """Seeds of the episodes that are still to be run."""
-    return [seed for seed in range(config.seed, config.seed + config.episodes) if seed not in rows]
+def missing_seeds(seeds: Iterable[int], rows: Mapping[int, Row]) -> list[int]:
+    """Of the episodes with these seeds, those that are still to be run."""
+    return [seed for seed in seeds if seed not in rows]
 
 
 def episode_row(episode: Episode) -> Row:

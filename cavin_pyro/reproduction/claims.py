@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
 from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
 
 LEADS = {  # points between CAVIN and the second best, 3 objects
@@ -87,7 +87,7 @@ def _leads(cells: Mapping[tuple[Any, ...], Rate], p_values: Mapping[tuple[Any, .
     for reward, paper in LEADS.items():
         for task, points in paper.items():
             own = cells.get((OURS, task, reward, TOP_ROW_OBJECTS))
-            others = {name: (name, task, reward, TOP_ROW_OBJECTS) for name in METHODS if name != OURS}
+            others = {name: (name, task, reward, TOP_ROW_OBJECTS) for name in PAPER_METHODS if name != OURS}
             present = [name for name, place in others.items() if place in cells]
             if own is None or not present:
                 continue
@@ -111,7 +111,7 @@ def _to_sparse(cells: Mapping[tuple[Any, ...], Rate]) -> Iterator[Claim]:
 
 
 def _to_five(cells: Mapping[tuple[Any, ...], Rate]) -> Iterator[Claim]:
-    for name in METHODS:
+    for name in PAPER_METHODS:
         one, five = (cells.get((name, "clearing", "sparse", objects)) for objects in (1, 5))
         if one is None or five is None:
             continue

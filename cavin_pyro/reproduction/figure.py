@@ -14,7 +14,7 @@ from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
 from cavin_pyro.storage.files import atomic_write
 
 DOTS_PER_INCH = 120
-BAR_WIDTH = 0.2
+GROUP_WIDTH = 0.8  # of the bars of all methods side by side
 DODGE = 0.06  # of lines whose whiskers would lie on one another, in objects
 TITLES = {"paper": "planners as in the paper", "ours": "planners with our additions"}
 Rates = Sequence[Mapping[str, Any]]
@@ -50,13 +50,14 @@ def _draw_rewards(axes: Axes, rates: Rates) -> None:
     """Dense and sparse rewards, three objects."""
     kinds = ("dense", "sparse")
     shown = _shown(rates)
+    width = GROUP_WIDTH / max(1, len(shown))
     for number, (name, method) in enumerate(shown.items()):
         chosen = [rate for rate in rates if rate["method"] == name and rate["objects"] == TOP_ROW_OBJECTS]
         for place, kind in enumerate(kinds):
             for rate in chosen:
                 if rate["reward"] == kind:
-                    x = place + (number - (len(shown) - 1) / 2) * BAR_WIDTH
-                    axes.bar(x, 100 * rate["rate"], BAR_WIDTH * 0.9, color=method.color)
+                    x = place + (number - (len(shown) - 1) / 2) * width
+                    axes.bar(x, 100 * rate["rate"], 0.9 * width, color=method.color)
                     axes.errorbar(x, 100 * rate["rate"], _whiskers([rate]), color="black", capsize=2, linewidth=0.8)
     axes.set_xticks(range(len(kinds)), [f"{kind} reward" for kind in kinds])
     axes.set_xlabel(_episodes([rate for rate in rates if rate["objects"] == TOP_ROW_OBJECTS]), fontsize=8)

@@ -1,4 +1,4 @@
-"""The four methods of the paper's figure, each with its training and two planners."""
+"""The four methods of the paper's figure, and CAVIN with our networks, each with its training and two planners."""
 
 from __future__ import annotations
 
@@ -18,13 +18,17 @@ WITHOUT_ADDITIONS = (
 
 @dataclass(frozen=True)
 class Method:
-    """A method. label: in figures. training: overrides of `train`. planners: overrides of `evaluate`, by planner."""
+    """A method. label: in figures. training: overrides of `train`. planners: overrides of `evaluate`, by planner.
+
+    in_paper: whether the paper has it. The paper's claims, and the correction of its comparisons, are about those.
+    """
 
     name: str
     label: str
     color: str
     training: tuple[str, ...]
     planners: dict[str, tuple[str, ...]]
+    in_paper: bool = True
 
 
 METHODS: dict[str, Method] = {
@@ -74,5 +78,18 @@ METHODS: dict[str, Method] = {
             ("model=dynamics", "guide=none", "prior=standard"),
             {"paper": ("planner=mpc", *WITHOUT_ADDITIONS), "ours": ("planner=mpc",)},
         ),
+        Method(
+            "contact",
+            "CAVIN, contact",
+            "#CC79A7",
+            (
+                *("model=cascaded", "guide=cascaded", "prior=mixture"),
+                *("geometry=outline", "dynamics=contact", "scales=predicted", "objective=rollout"),
+                *("trainer.reflect=true", "trainer.learning_rate=2e-3", "trainer.clip_norm=10000"),
+            ),
+            {"paper": ("planner=paper",), "ours": ("planner=cavin",)},
+            in_paper=False,
+        ),
     )
 }
+PAPER_METHODS = [one.name for one in METHODS.values() if one.in_paper]

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from cavin_pyro.config.commands.reproduction import ReproduceConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs
+from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of
 from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations, in_order
 from cavin_pyro.reproduction.methods import METHODS
@@ -166,7 +166,7 @@ def _evaluate(
     missing = [
         ((seed - one.seed) // ROUND, place, one, config, seed)
         for place, (one, config) in enumerate(_configurations(scale, own, home, models, device))
-        for seed in missing_seeds(config, rows[one])
+        for seed in missing_seeds(seeds_of(config), rows[one])
         if episode_key(one, seed) not in known
     ]
     missing.sort(key=lambda job: (job[0], job[1], job[-1]))

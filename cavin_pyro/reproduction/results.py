@@ -108,18 +108,19 @@ def _of_criterion(p_values: Mapping[tuple[Any, ...], float], criterion: str) -> 
 def _section(planner: str, criterion: str, measured: Sequence[Mapping[str, Any]], compared: Sequence[Any]) -> str:
     own = [one for one in measured if one["planner"] == planner and one["criterion"] == criterion]
     p_values = {_key(one): one["p_holm"] for one in compared if one["criterion"] == criterion}
+    methods = [name for name in METHODS if any(one["method"] == name for one in own)]
     lines = [
         f"## {TITLES.get(planner, planner).capitalize()}, criterion {criterion}",
         "",
         f"![](figure-{planner}-{criterion}.png)",
         "",
-        "| task | reward | objects | " + " | ".join(METHODS[name].label for name in METHODS) + " |",
-        "| --- " * (3 + len(METHODS)) + "|",
+        "| task | reward | objects | " + " | ".join(METHODS[name].label for name in methods) + " |",
+        "| --- " * (3 + len(methods)) + "|",
     ]
     cells = dict.fromkeys((one["task"], one["reward"], one["objects"]) for one in own)
     for task, reward, objects in sorted(cells, key=lambda cell: (cell[2] != TOP_ROW_OBJECTS, cell)):
         entries = []
-        for name in METHODS:
+        for name in methods:
             found = [
                 one
                 for one in own

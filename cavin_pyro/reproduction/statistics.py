@@ -10,6 +10,7 @@ from scipy.stats import binomtest, trim_mean
 
 from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.cells import FIGURES
+from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.table import CRITERIA, Row
 
 RESAMPLES = 10_000
@@ -75,17 +76,19 @@ def paired_tests(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Exact McNemar tests, episode by episode, with Holm's p values.
 
     CAVIN against every other method, both with the same kind of planner; and every variant against `paper` of the same
-    method. A family is all comparisons of one kind of planner (all variants together) and one criterion.
+    method. A family is all comparisons of one kind of planner (all variants together) and one criterion, with methods
+    of the paper or with others, so that what the paper has is corrected as if no others were there.
     """
     cells, found = by_cell(rows), []
     for criterion in CRITERIA:
-        families: dict[str, list[dict[str, Any]]] = {}
+        families: dict[tuple[str, bool], list[dict[str, Any]]] = {}
         for cell, others in cells.items():
             method, planner, *rest = cell
             reference = (OURS, planner) if planner in FIGURES else (method, "paper")
             against = cells.get((*reference, *rest))
             if reference != (method, planner) and against is not None:
-                family = families.setdefault(planner if planner in FIGURES else "variants", [])
+                kind = planner if planner in FIGURES else "variants"
+                family = families.setdefault((kind, METHODS[method].in_paper), [])
                 compared = {
                     **dict(zip(CELL, cell, strict=True)),
                     "criterion": criterion,

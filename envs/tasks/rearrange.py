@@ -31,7 +31,7 @@ class Rearrange(Task):
     count. Which place is whose is decided once, when the episode starts: places that a file shows go to the objects
     that look most alike, and among objects that look the same to the nearest ones (`envs.goals.assign`). Deciding again
     after every push, by the best assignment of the moment, would let two objects that look alike trade places, but
-    noise in their outlines could then also swap objects that differ. A random goal draws a place for each object.
+    noise in their outlines could then also swap objects that differ. A random goal samples a place for each object.
 
     A margin makes the tolerance smaller for planners.
 

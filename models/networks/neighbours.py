@@ -20,10 +20,6 @@ class Neighbour(ABC):
     def of(self, values: Tensor) -> Tensor:
         """The row of its object: `values: [..., M, D]`, with any leading dimensions of the scenes -> the same shape."""
 
-    def scalar_of(self, values: Tensor) -> Tensor:
-        """The same for `values: [..., M]`."""
-        return self.of(values.unsqueeze(-1)).squeeze(-1)
-
 
 class Shifted(Neighbour):
     """Object (i - shift) mod M; the shifts from 1 to M - 1 visit all pairs of different objects."""
@@ -40,10 +36,6 @@ class Shifted(Neighbour):
     def of(self, values: Tensor) -> Tensor:
         """See `Neighbour`."""
         return values.roll(self._shift, -2)
-
-    def scalar_of(self, values: Tensor) -> Tensor:
-        """See `Neighbour`."""
-        return values.roll(self._shift, -1)
 
 
 class Indexed(Neighbour):

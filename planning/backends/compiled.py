@@ -44,12 +44,12 @@ COUNTS = {"num_logical_cores", "num_physical_cores", "num_sockets"}
 class Compiled:
     """Native code, which torch's AOTInductor writes when a function is first called with its constants and shapes.
 
-    This takes 5 to 20 seconds for each of a planner's four or five functions. The code is kept in a folder of the
+    This takes one or two minutes for the four or five functions of a planner. The code is kept in a folder of the
     user's (`planning.backends.cache`), where later processes find it by a key of everything that decides it. Weights
     become part of the code: they must not change afterwards.
 
-    Matrix products of factors rounded to bfloat16 (torch's float32 precision "medium") are computed on tensors of
-    bfloat16, so their results are rounded as well; with "highest" everything is float32.
+    Matrix products of factors rounded to bfloat16 (torch's float32 precision "medium" or "high") are computed on
+    tensors of bfloat16, so their results are rounded as well; with "highest" everything is float32.
 
     Without such a folder, or for constants that cannot be digested, code is made for this process only.
     """
@@ -160,7 +160,7 @@ class _Native:
 
 
 def _announce(where: str) -> None:
-    _say(f"compiling for the first plan, which takes one to five minutes; native code {where}")
+    _say(f"compiling for the first plan, which takes one or two minutes; native code {where}")
 
 
 @cache

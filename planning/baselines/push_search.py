@@ -9,7 +9,6 @@ import torch
 
 from models.state import State
 from planning.backends.chunking import chunked
-from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
 from planning.extensions.touchdown import ObservedPoints
 from planning.plan import Plan
@@ -67,7 +66,7 @@ class PushSearch(SearchingPlanner):
             best, failures = robust
         chosen = candidates.take(best.unsqueeze(-1))
         actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
-        actions, path = idle_last(actions, path, state, self.segment_length, self.idle_distance)
+        actions, path = self.idle_last(actions, path, state, observed)
         no_codes = codes.new_empty(len(codes), 0, 0)
         return Plan(
             actions=actions[:, : self.segment_length],

@@ -11,7 +11,6 @@ from torch import Tensor
 from models.state import State
 from planning.backends.chunking import chunked
 from planning.cavin import EffectSpace
-from planning.extensions.idle_pushes import idle_last
 from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, MostRobust, sequential_halving
 from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import NoFiniteCandidateError
@@ -82,7 +81,7 @@ class SectarPlanner(SearchingPlanner):
             raise NoFiniteCandidateError(
                 broken[0], "the pushes of the chosen effect are not finite; check the model's weights"
             )
-        first, centers = idle_last(actions[:, 0], path[:, 0], state, self.segment_length, self.idle_distance)
+        first, centers = self.idle_last(actions[:, 0], path[:, 0], state, observed)
         return Plan(
             actions=first,
             planned_actions=first,

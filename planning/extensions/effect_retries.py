@@ -25,7 +25,7 @@ SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objec
 
 def try_other_effects(
     retries: int,
-    motions_for: Callable[[Tensor], Plan],
+    motions_for: Callable[[Candidates, Tensor], Plan],
     chosen: Tensor,
     near: State,
     effects: Candidates,
@@ -37,18 +37,22 @@ def try_other_effects(
     Args:
         retries: how often another effect is tried. motions_for: lines 8 to 11 for effect plans by number, `[B]`; it
             advances the `generators`, one per environment.
-        state: `[B]`. near: `[B]`, the same of the objects that `effects: [B, N]` are about.
+        state: `[B]`. near: `[B]`, the same of the objects that `effects: [B, N]` are about. The search for the best of
+            these may have stopped early; the others are then rolled out to their ends.
     """
-    plan, scores = motions_for(chosen), effects.returns
-    for _ in range(retries):
+    plan, scores = motions_for(effects, chosen), effects.returns
+    for number in range(retries):
         after = plan.predicted_centers[:, plan.actions.shape[1] - 1]
         stuck = is_unmoved(state, plan.subgoals.centers[:, 0], after)
         if not stuck.any():
             break
+        if number == 0:
+            effects = effects.in_full()
+            scores = effects.returns
         scores = leave_out_similar(scores, first_moves(near, effects), chosen, stuck)
         chosen = best_of(scores, "returns of effect plans")
         before = [generator.get_state() for generator in generators]
-        plan = records.where(stuck, motions_for(chosen), plan)
+        plan = records.where(stuck, motions_for(effects, chosen), plan)
         for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
             if not tried:  # an environment's plan depends on its own arguments only
                 generator.set_state(own)

@@ -6,26 +6,47 @@ import torch
 from torch import Tensor
 
 from models.state import State
+from planning.extensions.touchdown import ObservedPoints
 from planning.rollouts import returns
 
 
 def idle_last(
-    actions: Tensor, path: Tensor, state: State, segment_length: int, distance: float
+    actions: Tensor,
+    path: Tensor,
+    state: State,
+    segment_length: int,
+    distance: float,
+    observed: ObservedPoints | None = None,
+    touchdown_distance: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
-    """The same actions and states, but in the first segment idle pushes come last.
+    """The same actions, but in the first segment idle pushes come last, and the states after each of them.
 
     A push is idle if f predicts that it moves no object by `distance` metres. Both groups keep their order. An idle
     push moves no object by more than `distance`, so the predictions for the other pushes stay valid up to that
     distance. A planner that plans again after every push would otherwise execute an idle push and gain nothing.
 
+    The order stays where the push that would come first touches down on an object, and the one that comes first now
+    does not (`planning.extensions.touchdown`).
+
     actions: `[B, H, 4]`. path: `[B, H, M, 3]` metres. state: `[B]`, before the first push. segment_length: T.
+    observed: points of the objects that the camera sees. touchdown_distance: metres between a push's start and these.
     """
     pushes, centers = actions[:, :segment_length], path[:, :segment_length]
     moved = (centers - returns.before_each(state.centers, centers)).norm(dim=-1)
     strides = torch.where(state.mask.unsqueeze(1), moved, 0.0).amax(-1)  # [B, T]
-    order = (strides < distance).int().argsort(dim=-1, stable=True)
+    idle = strides < distance
+    order = idle.int().argsort(dim=-1, stable=True)
     environments = torch.arange(len(pushes), device=pushes.device).unsqueeze(-1)
+    if observed is not None and touchdown_distance and observed.points.shape[1]:
+        now, first = (
+            observed.blocked(pushes[environments, one[:, :1]], touchdown_distance) for one in (0 * order, order)
+        )
+        order = torch.where(first & ~now, torch.arange(segment_length, device=order.device), order)
+    ordered = order != torch.arange(segment_length, device=order.device)
+    # Where the order changed, all that moves something has been pushed before the idle pushes.
+    done = ordered.any(-1, keepdim=True) & idle.gather(-1, order)
+    after = torch.where(done[..., None, None], centers[:, -1:], centers[environments, order])
     return (
         torch.cat([pushes[environments, order], actions[:, segment_length:]], 1),
-        torch.cat([centers[environments, order], path[:, segment_length:]], 1),
+        torch.cat([after, path[:, segment_length:]], 1),
     )

@@ -25,14 +25,17 @@ class ObservedPoints(NamedTuple):
         """`[B, N]` bool: `pushes: [B, N, 4]` that start nearer than `distance` metres to a point."""
         low, high = self.low.unsqueeze(1), self.high.unsqueeze(1)
         starts = low + (pushes[..., :2].clamp(-1.0, 1.0) + 1.0) / 2.0 * (high - low)
-        return torch.cdist(starts, self.points).amin(-1) < distance
+        # Not by matrix products, in which an infinite point makes all distances NaN.
+        apart = torch.cdist(starts, self.points, compute_mode="donot_use_mm_for_euclid_dist")
+        return apart.amin(-1) < distance
 
 
 def prefer_free(scores: Tensor, pushes: Tensor, observed: ObservedPoints | None, distance: float) -> Tensor:
     """Scores `[B, N]` that leave out candidates whose first push would touch down on an object.
 
     pushes: `[B, N, 4]`, the first of each candidate. observed: None where nothing is known. distance: metres between
-    the push's start and a point; 0 leaves out none. Where nothing would be left, the scores stay as they are.
+    the push's start and a point; 0 leaves out none. Where nothing would be left, the scores stay as they are. The
+    baselines' searches may have stopped before the others' ends, so their scores are those up to there.
     """
     if observed is None or not distance or observed.points.shape[1] == 0:
         return scores

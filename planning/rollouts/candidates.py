@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -230,6 +230,17 @@ class Candidates:
         )
         segments = (*self.segments, SegmentRecord(noise, rollout, self.score_state))
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
+
+    def in_full(self) -> Candidates:
+        """The same candidates with the same numbers, each to its own end: for whoever reads more than the best one.
+
+        Those that were not reparameterised are returned as they are.
+        """
+        if any(segment.noise is None for segment in self.segments):
+            return self
+        # Not compiled: it happens seldom, and would be another function to compile.
+        problem = replace(self.problem, best_only=False, backend=eager)
+        return problem.evaluate(self.noise)
 
     def take(self, numbers: Tensor) -> Candidates:
         """Candidates by number, `[B, m]` int64; a repeated number gives copies."""

@@ -22,7 +22,7 @@ def sample_each(
     conditions: Sequence[State | Tensor],
     generators: Sequence[torch.Generator],
 ) -> Tensor:
-    """One sample per candidate from `prior(*conditions)`, each environment with its own generator: `[B, N, 16]`.
+    """One sample per candidate from `prior(*conditions)`, each environment with its own generator: `[B, N, D]`.
 
     `conditions`: the arguments of the prior, states and codes with leading dimensions `[B, N]`. The prior is
     called once per environment, so its samples do not depend on the rest of the batch.

@@ -13,8 +13,8 @@ class DeviceOptions:
 
     device: str = option(
         "cpu",
-        "where the networks run: the CPU, or a GPU by CUDA; auto takes the GPU where there is one. Results hang on the "
-        "seed and on this: a GPU rounds otherwise",
+        "where the networks run: the CPU, or a GPU by CUDA; auto takes the GPU where there is one. Results depend on "
+        "the seed and on this: a GPU rounds otherwise",
         choices="cavin_pyro.config.device.DEVICES",
         group="run",
     )

@@ -24,7 +24,7 @@ class ReproduceConfig(DeviceOptions):
     )
     methods: list[str] = option(
         ["cavin", "sectar", "cvae_mpc", "mpc"],
-        "methods to train and evaluate",
+        "methods to train and evaluate: the paper's four by default; contact is CAVIN with networks that see contact",
         choices="cavin_pyro.reproduction.methods.METHODS",
         group="run",
     )

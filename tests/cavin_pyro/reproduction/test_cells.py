@@ -10,7 +10,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations, in_order
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
 from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale
 from cavin_pyro.reproduction.scales import SCALES
 from cavin_pyro.reproduction.stages import preparation, trainings
@@ -18,7 +18,7 @@ from tests.cavin_pyro.conftest import ROOT
 
 
 def test_the_paper_figure_has_seventy_two_cells_for_each_kind_of_planner() -> None:
-    found = list(cells(SCALES["paper"], list(METHODS), FIGURES))
+    found = list(cells(SCALES["paper"], PAPER_METHODS, FIGURES))
     assert len(found) == len(set(found)) == 2 * 72
     top = [one for one in found if one.planner == "paper" and one.objects == 3]
     assert len(top) == 4 * 3 * 2

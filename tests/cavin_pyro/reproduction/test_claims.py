@@ -33,6 +33,11 @@ def test_a_lead_holds_only_beyond_the_interval_and_by_the_test() -> None:
     assert found([cell("cavin", 9, 10), cell("mpc", 9, 10)])[lead][1] == "no, within chance"
 
 
+def test_our_networks_are_no_second_best_of_the_paper() -> None:
+    cells = [cell("cavin", 95, 100), cell("mpc", 20, 100), cell("contact", 99, 100)]
+    assert list(found(cells)) == ["clearing, sparse: CAVIN leads MPC"]
+
+
 def test_the_papers_margin_stands_beside_the_second_best_alone() -> None:
     cells = [cell("cavin", 95, 100), cell("mpc", 20, 100), cell("sectar", 70, 100), cell("cvae_mpc", 50, 100)]
     papers = {text.split()[-1]: paper for text, (paper, _) in found(cells).items()}

@@ -34,6 +34,15 @@ def episodes(method: str, outcomes: dict[int, list[str]], **more: Any) -> list[d
 WON, LOST = "success", "timeout"
 
 
+def test_a_method_that_the_paper_lacks_does_not_change_what_its_comparisons_are_corrected_for() -> None:
+    ours, other = episodes("cavin", {0: [WON] * 12}), episodes("mpc", {0: [LOST] * 6 + [WON] * 6})
+    more = episodes("contact", {0: [LOST] * 8 + [WON] * 4})
+    without, alongside = paired_tests([*ours, *other]), paired_tests([*ours, *other, *more])
+    assert [one for one in alongside if one["method"] == "mpc"] == without
+    found = [one for one in alongside if one["method"] == "contact"]
+    assert len(found) == 2 and all(one["p_holm"] == one["p"] for one in found)
+
+
 def test_rates_pool_training_seeds_and_count_every_outcome() -> None:
     rows = episodes("cavin", {0: [WON, WON, LOST], 1: [WON, "violation", "fall"]})
     strict, published = rates(rows)

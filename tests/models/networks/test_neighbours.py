@@ -15,7 +15,7 @@ from models.state import State
 def numbers(centers: Tensor, mask: Tensor, most: int | None) -> list[list[set[int]]]:
     """Which real objects are neighbours of each object of each scene [B, M]."""
     own = torch.arange(mask.shape[-1]).float().expand(mask.shape)
-    found = [(other.scalar_of(own).int(), other.real) for other in neighbours(centers, mask, most)]
+    found = [(other.of(own.unsqueeze(-1)).squeeze(-1).int(), other.real) for other in neighbours(centers, mask, most)]
     return [
         [{int(who[scene, i]) for who, real in found if real[scene, i]} for i in range(mask.shape[1])]
         for scene in range(len(mask))
@@ -50,7 +50,6 @@ def test_rows_are_those_of_the_neighbour_for_any_leading_dimensions(random_state
     (nearest,) = neighbours(state.centers, state.mask, 1)
     index = squared_distances(state.centers, state.mask).argmin(-1).expand(3, 2, 4, 8)
     assert torch.equal(nearest.of(values), values.take_along_dim(index.unsqueeze(-1), -2))
-    assert torch.equal(nearest.scalar_of(values[..., 0]), values[..., 0].take_along_dim(index, -1))
 
 
 def test_an_object_is_infinitely_far_from_itself_and_from_padding(random_state: Callable[..., State]) -> None:

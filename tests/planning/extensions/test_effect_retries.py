@@ -28,9 +28,11 @@ def walled(toy: SimpleNamespace) -> object:
     return Walled(noise=0.0)
 
 
-def planner(toy: SimpleNamespace, retries: int, **options: object) -> CavinPlanner:
-    reward = toy.GoalDisc(goal=GOAL, dense=True)
-    return toy.plain(walled(toy), reward, 64, 6, "first_segment", effect_retries=retries, **options)
+def planner(
+    toy: SimpleNamespace, retries: int, *, reward: object = None, samples: int = 64, horizon: int = 6, **options: object
+) -> CavinPlanner:
+    reward = reward or toy.GoalDisc(goal=GOAL, dense=True)
+    return toy.plain(walled(toy), reward, samples, horizon, "first_segment", effect_retries=retries, **options)
 
 
 def moved(plan: object, state: State) -> Tensor:
@@ -46,6 +48,17 @@ def test_where_nothing_moves_another_effect_is_tried(toy: SimpleNamespace) -> No
     first, other = ((plan.subgoals.centers[:, 0] - state.centers)[0, 0, :2] for plan in (stuck, tried))
     assert first[0] > 0.02  # through the wall
     assert torch.cosine_similarity(first, other, dim=0) < 0.5
+
+
+def test_the_other_effect_reaches_the_goal_though_the_search_has_stopped_at_the_first(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(0.01, 0.0)]])
+    # One segment through the wall reaches the goal, and ends the search under a sparse reward; a way round takes more.
+    reward = toy.GoalDisc(goal=(0.12, 0.0))
+    for seed in range(5):
+        own = planner(toy, 3, reward=reward, samples=256, horizon=12, warm_start=True)
+        tried = own.plan(state, toy.generators(seed))
+        assert moved(tried, state) > 0.02
+        assert tried.expected_success.item() and tried.segments.item() > 1
 
 
 def test_elsewhere_plans_are_as_without(toy: SimpleNamespace) -> None:

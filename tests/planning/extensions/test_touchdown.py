@@ -36,6 +36,12 @@ def test_a_start_is_blocked_within_the_distance_in_metres() -> None:
     assert found.tolist() == [[True, True, False, True, False]]
 
 
+def test_infinite_points_stand_for_none_among_many() -> None:
+    starts, many = pushes((0.0, 0.5), (0.5, 0.5)), seen((0.5, 0.5), *(30 * [(0.1, -0.9)]))
+    padded = ObservedPoints(torch.cat([many.points, torch.full((1, 40, 2), torch.inf)], 1), LOW, HIGH)
+    assert many.blocked(starts, 0.01).tolist() == padded.blocked(starts, 0.01).tolist() == [[True, False]]
+
+
 @given(st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=2))
 def test_starts_are_where_the_environment_puts_them(start: list[float]) -> None:
     place, _ = push_endpoints(np.array([*start, 0.0, 0.0]))
