@@ -36,15 +36,14 @@ def idle_last(
     strides = torch.where(state.mask.unsqueeze(1), moved, 0.0).amax(-1)  # [B, T]
     idle = strides < distance
     order = idle.int().argsort(dim=-1, stable=True)
+    as_given = torch.arange(segment_length, device=pushes.device)
     environments = torch.arange(len(pushes), device=pushes.device).unsqueeze(-1)
     if observed is not None and touchdown_distance and observed.points.shape[1]:
-        now, first = (
-            observed.blocked(pushes[environments, one[:, :1]], touchdown_distance) for one in (0 * order, order)
-        )
-        order = torch.where(first & ~now, torch.arange(segment_length, device=order.device), order)
-    ordered = order != torch.arange(segment_length, device=order.device)
+        blocked_now = observed.blocked(pushes[:, :1], touchdown_distance)
+        blocked_then = observed.blocked(pushes[environments, order[:, :1]], touchdown_distance)
+        order = torch.where(blocked_then & ~blocked_now, as_given, order)
     # Where the order changed, all that moves something has been pushed before the idle pushes.
-    done = ordered.any(-1, keepdim=True) & idle.gather(-1, order)
+    done = (order != as_given).any(-1, keepdim=True) & idle.gather(-1, order)
     after = torch.where(done[..., None, None], centers[:, -1:], centers[environments, order])
     return (
         torch.cat([pushes[environments, order], actions[:, segment_length:]], 1),
