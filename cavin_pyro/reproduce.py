@@ -17,8 +17,8 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.reproduction.episodes.picture import draw_chosen_episodes
-    from cavin_pyro.reproduction.merging import IGNORED, merge_tables
-    from cavin_pyro.reproduction.pipeline import as_typed, run_pipeline
+    from cavin_pyro.reproduction.merging import IGNORED, check_shards, merge_tables
+    from cavin_pyro.reproduction.pipeline import as_typed, check_inputs, chosen_rows, run_pipeline
     from cavin_pyro.reproduction.results import write_results
     from cavin_pyro.reproduction.table import read_table
     from cavin_pyro.storage.files import output_folder
@@ -28,7 +28,11 @@ def main(config: DictConfig) -> None:
     device = choose_device(config.device).type  # `auto` chooses once, for all stages
     with output_folder(config.output) as home:
         check_same_run(home, config, ignore=IGNORED)
-        rows = read_table(Path(config.table)) if config.table else []
+        rows = chosen_rows(read_table(Path(config.table)), config) if config.table else []
+        if config.merge:
+            check_shards([Path(folder) for folder in config.merge])
+        elif not config.table:
+            check_inputs(config)
         write_config(home, config)
         append_provenance(home / PROVENANCE, Path(config.extends).with_name(PROVENANCE) if config.extends else None)
         if config.merge:

@@ -77,6 +77,10 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
         raise UserError(
             f"compare={folder} is no finished evaluation: {Path(error.filename).name} is missing"
         ) from error
+    except OSError as error:
+        raise UserError(
+            f"compare={folder} cannot be read ({error.strerror}): give the folder of an evaluation"
+        ) from error
     except (ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
     if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):

@@ -19,16 +19,25 @@ EXTENDED = ("planners", "tasks", "objects", "episodes", "bottom_episodes", "exte
 IGNORED = ("output", "workers", "shard", "merge", "pictures", *EXTENDED)
 
 
+def check_shards(folders: Sequence[Path]) -> None:
+    """Check that there is a table in each folder.
+
+    Raises:
+        UserError: a folder holds no finished shard.
+    """
+    for folder in folders:
+        if not (folder / TABLE).is_file():
+            raise UserError(f"merge={folder} holds no {TABLE}: let its shard end first")
+
+
 def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> list[dict[str, Any]]:
     """Join the episodes of shards, in the order that a run of all of them has, and write the table.
 
     Raises:
-        UserError: a folder holds no finished shard or one of other options, or episodes are missing.
+        UserError: a folder holds a shard of other options, or episodes are missing.
     """
     rows: dict[tuple[Any, ...], dict[str, Any]] = {}
     for folder in folders:
-        if not (folder / TABLE).exists():
-            raise UserError(f"merge={folder} holds no {TABLE}: let its shard end first")
         check_same_run(folder, config, ignore=IGNORED)
         for row in read_table(folder / TABLE):
             rows[row_key(row)] = row

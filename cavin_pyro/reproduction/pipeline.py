@@ -18,7 +18,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of
 from cavin_pyro.launching.launcher import of_shard
-from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Evaluation, evaluations, in_order
+from cavin_pyro.reproduction.cells import FIGURES, SCENES_PER_TRAINING, Evaluation, evaluations, in_order
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import OBJECT_COUNTS, SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
@@ -91,11 +91,47 @@ def chosen_scale(config: DictConfig) -> Scale:
     return replace(scale, **given, tasks=tasks, object_counts=counts)
 
 
+def check_inputs(config: DictConfig) -> None:
+    """Check what a run reads and chooses, before it writes anything.
+
+    Raises:
+        UserError: an option that cannot be used, a model or a table that is missing.
+    """
+    scale = chosen_scale(config)
+    for name in ("methods", "planners"):
+        if not config[name]:
+            raise UserError(f"{name}=[] leaves nothing to run: choose some, or leave the option out")
+    of_shard(trainings(scale, Path(), config.methods), config.shard)
+    _models(config, Path(), list(evaluations(scale, config.methods, config.planners)))
+    _known(config, scale)
+
+
+def chosen_rows(rows: Sequence[Row], config: DictConfig) -> list[Row]:
+    """The rows of a table that the options `methods`, `planners`, `tasks` and `objects` choose.
+
+    Raises:
+        UserError: there is none.
+    """
+    kinds = {planner: "variants" if planner not in FIGURES else planner for planner in {row["planner"] for row in rows}}
+    chosen = [
+        row
+        for row in rows
+        if row["method"] in config.methods
+        and kinds[row["planner"]] in config.planners
+        and row["task"] in config.tasks
+        and row["objects"] in config.objects
+    ]
+    if not chosen:
+        raise UserError(
+            f"table={config.table} has no episode of the chosen methods, planners, tasks and objects: choose others"
+        )
+    return chosen
+
+
 def as_typed(config: DictConfig) -> str:
     """The command that makes the same table, for the page of results."""
-    if config.table:
-        return shlex.join(["python", "-m", "cavin_pyro.reproduce", f"table={config.table}"])
-    default, words = ReproduceConfig(), [f"scale={config.scale}"]
+    default = ReproduceConfig()
+    words = [f"table={config.table}" if config.table else f"scale={config.scale}"]
     for name in ("methods", "planners", "tasks", "objects", "episodes", "bottom_episodes", "models", "extends"):
         if config[name] != getattr(default, name):
             value = config[name]

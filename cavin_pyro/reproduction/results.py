@@ -32,8 +32,12 @@ def write_results(home: Path, rows: Sequence[Row], command: str) -> list[Path]:
     write_json(home / STATISTICS, statistics)
     planners = [name for name in FIGURES if any(row["planner"] == name for row in rows)]
     figures = [(planner, criterion) for planner in planners for criterion in CRITERIA]
+    failed = [
+        (planner, criterion) for planner, criterion in figures if any(one["planner"] == planner for one in counted)
+    ]
     for planner, criterion in figures:
         draw_figure(home / f"figure-{planner}-{criterion}.png", measured, planner=planner, criterion=criterion)
+    for planner, criterion in failed:
         draw_failures(home / f"failures-{planner}-{criterion}.png", counted, planner=planner, criterion=criterion)
     sections = [_section(planner, criterion, measured, compared) for planner, criterion in figures]
     checked = [
@@ -49,11 +53,15 @@ def write_results(home: Path, rows: Sequence[Row], command: str) -> list[Path]:
         *checked,
         *sections,
         *_variants(measured, compared),
-        *failures_section(counted, figures),
+        *failures_section(counted, failed),
     ]
     with atomic_write(home / PAGE) as temporary:
         temporary.write_text("\n".join(lines), encoding="utf-8")
-    pictures = [home / f"{kind}-{one}-{other}.png" for kind in ("figure", "failures") for one, other in figures]
+    pictures = [
+        home / f"{kind}-{planner}-{criterion}.png"
+        for kind, drawn in (("figure", figures), ("failures", failed))
+        for planner, criterion in drawn
+    ]
     return [home / PAGE, home / STATISTICS, *pictures]
 
 

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 from envs.physics import ArmDescription
 
 URDF = Path("sawyer", "sawyer_stick.urdf")  # inside the folder of assets
-HOW_TO_GET = "get it with `python -m cavin_pyro.assets sawyer --to DIR`, then give assets=DIR"
+HOW_TO_GET = "get it with `python -m cavin_pyro.assets sawyer --to DIR`, then give env.assets=DIR"
 POSTURE = (0.0, -0.6, 0.0, 1.2, 0.0, 1.0, 1.5)  # radians; the elbow up, the hand above the table's middle
 HOME = (
     0.46,

@@ -20,7 +20,7 @@ class TrainerConfig:
     """How to train (section `trainer`)."""
 
     steps: int = option(1_000_000, "gradient steps, at most", minimum=1, group="trainer", limit=10**9)
-    batch_size: int = option(64, "windows per step", minimum=1, group="trainer", limit=10**6)
+    batch_size: int = option(64, "windows per step", minimum=1, group="trainer", limit=65_536)
     learning_rate: float = option(1e-4, "Adam's", above=0, group="trainer")
     schedule: str = option(
         "constant", "of the learning rate; cosine ends at a hundredth of it", choices=SCHEDULES, group="trainer"
@@ -163,6 +163,6 @@ class PretrainConfig(DeviceOptions):
         [], "names of objects, [mug,banana]; training omits their clouds", group="data"
     )
     steps: int = option(6000, "gradient steps", minimum=1, group="training", limit=10**9)
-    batch_size: int = option(128, "clouds per step", minimum=1, group="training", limit=10**6)
+    batch_size: int = option(128, "clouds per step", minimum=1, group="training", limit=65_536)
     learning_rate: float = option(1e-3, "Adam's", above=0, group="training")
     autoencoder: Any = None

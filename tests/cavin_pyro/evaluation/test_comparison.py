@@ -60,6 +60,7 @@ def test_an_evaluation_is_compared_on_the_command_line(shell: SimpleNamespace, t
             "compare=one has task._target_=envs.tasks.crossing.Crossing, not envs.tasks.clearing",
         ),
         (["compare=nowhere"], "compare=nowhere is no finished evaluation"),
+        (["compare=one/results.txt"], "compare=one/results.txt cannot be read (Not a directory)"),
     ):
         answer = evaluation("episodes=2", "output=three", *more)
         assert answer.status == 2

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,8 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.reproduction.cells import evaluations
-from cavin_pyro.reproduction.merging import merge_tables
+from cavin_pyro.reproduction.merging import check_shards, merge_tables
+from cavin_pyro.reproduction.pipeline import check_inputs, chosen_rows
 from cavin_pyro.reproduction.results import write_results
 from cavin_pyro.reproduction.scales import SCALES
 from cavin_pyro.reproduction.table import TABLE, episode_row, read_table, write_table
@@ -72,7 +74,7 @@ def test_shards_that_lack_episodes_or_have_other_options_are_refused(tmp_path: P
     with pytest.raises(UserError, match="holds a run with scale=minimal, not smoke"):
         merge_tables(compose("reproduce", "scale=smoke", f"methods=[{','.join(METHODS)}]"), tmp_path, [half])
     with pytest.raises(UserError, match=f"holds no {TABLE}: let its shard end first"):
-        merge_tables(config(), tmp_path, [tmp_path / "none"])
+        check_shards([half, tmp_path / "none"])
     assert not (tmp_path / TABLE).exists()
 
 
@@ -91,6 +93,44 @@ def test_figures_and_page_follow_from_the_table_and_have_the_same_bytes(tmp_path
     assert "| clearing | MPC | 1 | 0.0 % | 0.0 % | 0.0 % | 0.0 % | 100.0 % | 50.0 % | 0.0 % |" in page
     statistics = json.loads((tmp_path / "one" / "statistics.json").read_text())
     assert set(statistics) == {"rates", "tests", "interquartile_means", "failures"}
+
+
+def test_without_scenes_of_three_objects_there_is_no_picture_of_failures(tmp_path: Path) -> None:
+    rows = chosen_rows(played(), config(objects="[1]"))
+    assert {row["objects"] for row in rows} == {1}
+    names = {path.name for path in write_results(tmp_path, rows, "the command")}
+    assert names == {"results.md", "statistics.json", *(f"figure-paper-{one}.png" for one in ("strict", "published"))}
+
+
+def test_a_table_is_drawn_as_far_as_the_options_choose() -> None:
+    rows = played()
+    assert chosen_rows(rows, config()) == rows
+    assert {row["method"] for row in chosen_rows(rows, config(methods="[mpc]"))} == {"mpc"}
+    with pytest.raises(UserError, match="has no episode of the chosen methods, planners, tasks and objects"):
+        chosen_rows(rows, config(table="some.parquet", tasks="[crossing]"))
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("planners=[]", "planners=[] leaves nothing to run"),
+        ("methods=[]", "methods=[] leaves nothing to run"),
+        ("tasks=[]", "tasks has none of scale=minimal"),
+        ("models=nowhere", "models=nowhere holds no cavin-0.safetensors"),
+        ("extends=nowhere", "nowhere is no table of episodes"),
+        ("shard=3/2", "shard must be i/n"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_anything_is_written(option: str, said: str) -> None:
+    with pytest.raises(UserError, match=re.escape(said)):
+        check_inputs(compose("reproduce", "scale=minimal", option))
+
+
+def test_a_refused_command_leaves_its_folder_to_the_corrected_one(shell: SimpleNamespace, tmp_path: Path) -> None:
+    for option in ("models=nowhere", "merge=[nowhere]", "planners=[]"):
+        refused = shell.run_command("reproduce", "scale=minimal", option, "output=run", folder=tmp_path)
+        assert refused.status == 2 and len(refused.complaints) == 1
+        assert not (tmp_path / "run").exists()
 
 
 def test_figures_and_page_come_from_a_table_alone(shell: SimpleNamespace, tmp_path: Path) -> None:
