@@ -34,7 +34,7 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_state
-from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs
+from cavin_pyro.evaluation.evaluation import Row, append, begin, missing_seeds, run_jobs, seeds_of
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
@@ -84,7 +84,7 @@ def _run(
         check_same_run(folders[setting], config, ignore=("output", "episodes", "workers", "compare"))
         write_config(folders[setting], config)
         rows[setting] = begin(folders[setting])
-        for seed in missing_seeds(config, rows[setting]):
+        for seed in missing_seeds(seeds_of(config), rows[setting]):
             jobs.append((config, seed))
             owners.append(setting)
     with (

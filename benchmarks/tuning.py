@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs
+from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of
 from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
 from cavin_pyro.reproduction.pipeline import SHARED
@@ -95,7 +95,7 @@ def evaluate(
                 f"output={folder}",
             )
             rows[variant, task] = begin(folder)
-            for seed in missing_seeds(config, rows[variant, task]):
+            for seed in missing_seeds(seeds_of(config), rows[variant, task]):
                 jobs.append((config, seed))
                 owners.append((variant, task, folder))
     with (

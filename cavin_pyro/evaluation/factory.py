@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +97,12 @@ def check_options(config: DictConfig, device: torch.device) -> None:
         raise UserError(
             f"launcher=ray runs episodes on processors, and device={config.device} plans on {device.type}: "
             "choose launcher=local or device=cpu"
+        )
+    unread = [name for name, usual in asdict(GeneratedLayouts()).items() if config.generated[name] != usual]
+    if unread and config.layout != GENERATED:
+        raise UserError(
+            f"generated.{unread[0]}={config.generated[unread[0]]} is an option of layout=generated, and "
+            f"layout={config.layout}: give layout=generated, or leave it out"
         )
     changing = config.layout == RANDOM or (config.layout == GENERATED and config.generated.seed is None)
     if changing and config.planner.get("compile"):

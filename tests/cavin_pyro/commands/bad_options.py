@@ -31,6 +31,7 @@ BAD_OPTIONS = [
         "layout=generated generated.shape=round",
         "unknown generated.shape 'round': choose from straight, l, u, s",
     ),
+    ("plan", "generated.tiles=5", "generated.tiles=5 is an option of layout=generated, and layout=0: give"),
     ("plan", "layout=generated generated.tiles=3", "generated.tiles must be a whole number from 4 to 14, not 3"),
     ("plan", "layout=generated task=gathering", "task gathering has no generated layouts: give another layout"),
     (
@@ -51,7 +52,7 @@ BAD_OPTIONS = [
     (
         "check",
         "device=cuda",
-        "unknown override 'device': it is an option of pretrain, train, plan, evaluate, demo; valid",
+        "unknown override 'device': it is an option of pretrain, train, plan, evaluate, demo, reproduce; valid",
     ),
     ("plan", "env.objects=toys", "unknown env.objects 'toys': choose from builtin, ycb, mixed, random"),
     ("plan", "env.objects=ycb", "give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to DIR"),

@@ -95,7 +95,7 @@ def test_the_wanted_number_of_real_clouds_is_sampled_for_pretraining(count: int,
     sampled = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
     assert sampled.shape == (count, 256, 3)
     assert sampled.dtype == np.float32
-    np.testing.assert_allclose(sampled.mean(axis=1), 0.0, atol=1e-3)  # metres from their centres
+    np.testing.assert_allclose(sampled.mean(axis=1), 0.0, atol=3e-3)  # metres from their centres
     assert (np.ptp(sampled, axis=1).max(axis=-1) > 0.01).all()  # padding would be a single point
     again = sample_clouds([pushes], count=count, generator=np.random.default_rng(0))
     np.testing.assert_array_equal(sampled, again)
