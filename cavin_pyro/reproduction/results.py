@@ -116,7 +116,8 @@ def _of_criterion(p_values: Mapping[tuple[Any, ...], float], criterion: str) -> 
 def _section(planner: str, criterion: str, measured: Sequence[Mapping[str, Any]], compared: Sequence[Any]) -> str:
     own = [one for one in measured if one["planner"] == planner and one["criterion"] == criterion]
     p_values = {_key(one): one["p_holm"] for one in compared if one["criterion"] == criterion}
-    methods = [name for name in METHODS if any(one["method"] == name for one in own)]
+    present = {one["method"] for one in own}
+    methods = [name for name, method in METHODS.items() if method.in_paper or name in present]
     lines = [
         f"## {TITLES.get(planner, planner).capitalize()}, criterion {criterion}",
         "",

@@ -154,7 +154,7 @@ def test_the_configuration_of_a_cell_is_complete_or_absent(tmp_path: Path, monke
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            list(pipeline._configurations(SCALES["minimal"], own, tmp_path, models))
+            list(pipeline._configurations(SCALES["minimal"], own, tmp_path, models, "cpu"))
     assert not list(folder.iterdir())
-    list(pipeline._configurations(SCALES["minimal"], own, tmp_path, models))
+    list(pipeline._configurations(SCALES["minimal"], own, tmp_path, models, "cpu"))
     assert [path.name for path in folder.iterdir()] == ["config.yaml"]
