@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,7 @@ def probability_for(config: DictConfig) -> Probability:
         return NO_PROBABILITY
     path = SHIPPED if config.success_probability is None else Path(config.success_probability)
     now, nearest = situation(config), ""
-    fewest = math.inf
+    fewest = (True, math.inf)  # a fit for such scenes is nearer than any for others
     for one in read_regressions(path):
         differing = planner_mismatch(one.planner, now.planner)
         if one.checkpoint != now.checkpoint:
@@ -85,12 +85,17 @@ def probability_for(config: DictConfig) -> Probability:
         outside = [scenes.mismatch(now.scenes) for scenes in one.scenes]
         if not differing and None in outside:
             return one
-        said = [f"{name}={now.planner.get(name, config.get(name))}" for name in differing]
+        said = [f"{name}={_value(name, now.planner, config)}" for name in differing]
         if all(outside):
             said.append(min(filter(None, outside), key=_far))
-        if len(said) < fewest:
-            fewest, nearest = len(said), " and ".join(said[:2])
+        if (far := (all(outside), len(said))) < fewest:
+            fewest, nearest = far, " and ".join(said[:2])
     return Unfitted(f"not fitted for {nearest}" if nearest else f"{path} holds no fit")
+
+
+def _value(name: str, options: Mapping[str, Any], config: DictConfig) -> Any:
+    """An option as the user gave it; of one with options of its own, such as an optimizer, its class."""
+    return options.get(name, options.get(f"{name}._target_", config.get(name)))
 
 
 def read_regressions(path: Path) -> list[Regression]:

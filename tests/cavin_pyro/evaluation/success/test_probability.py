@@ -54,12 +54,29 @@ def test_the_planner_and_the_scenes_of_a_fit_get_its_probability(options: tuple[
         (("maximum_steps=90",), "maximum_steps=90"),
         (("task=clearing",), "task._target_=envs.tasks.clearing.Clearing"),
         (("planner=mpc",), "planner"),
+        (
+            ("planner.motion_optimizer={_target_: planning.optimizers.CrossEntropy}",),
+            "planner.motion_optimizer=planning.optimizers.CrossEntropy",
+        ),
     ],
 )
 def test_any_other_is_uncalibrated_and_told_why(options: tuple[str, ...], said: str, file: Path) -> None:
     found = probability_for(compose("evaluate", f"success_probability={file}", *options))
     assert isinstance(found, Unfitted) and found.why.startswith(f"not fitted for {said}")
     assert found([]) is None
+
+
+def test_the_nearest_fit_is_one_for_such_scenes(file: Path) -> None:
+    content = json.loads(file.read_text())
+    (mine,) = content["regressions"]
+    elsewhere = json.loads(json.dumps(mine).replace("crossing.Crossing", "clearing.Clearing"))
+    elsewhere["planner"] |= {"planner.samples": 32, "planner.horizon": 60}
+    both = file.with_name("both.json")
+    both.write_text(json.dumps({**content, "regressions": [elsewhere, mine]}))
+    found = probability_for(
+        compose("evaluate", f"success_probability={both}", "planner.samples=32", "planner.horizon=60")
+    )
+    assert isinstance(found, Unfitted) and found.why == "not fitted for planner.samples=32 and planner.horizon=60"
 
 
 def test_a_planner_that_predicts_nothing_gets_none_without_a_word(file: Path) -> None:
