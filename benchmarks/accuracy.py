@@ -4,7 +4,8 @@ New episodes are collected by the heuristic (--episodes, --seed: of the collecti
 object it prints the distance between the predicted and the observed centre, after one push, after three (f reads its
 own predictions), and for h with the code that the guide infers from the three pushes' outcome. Objects that moved more
 than a centimetre by the simulator stand apart from those that moved less than 2 mm, and among the latter those of which
-f says that they move more than 2 cm. By number of objects, by object, and by the kind of push:
+f says that they move more than 2 cm; these once more by pushes that the robot began alone: a push that would touch down
+on an object is not begun, and nothing moves. By number of objects, by object, and by the kind of push:
 
 hit     the tool's path passes within half of the object's half-width (across the path) from its middle
 graze   within all of it and the tool's radius
@@ -66,6 +67,7 @@ class Push:
     before: Observation
     after: Observation
     action: NDArray[np.float32]
+    begun: bool  # not where it would have touched down on an object
     start: NDArray[np.float64]  # [objects, 3] metres, bodies before and after
     end: NDArray[np.float64]
     replayed: Replays  # from where the bodies were
@@ -86,11 +88,13 @@ def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redra
     count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
     seen = [scene.sample([clutter_area(generator)] * count, config.ranges, generator)]
     policy = pushing_policy(config, policy_generator)
-    there, actions = [scene.ground_truth()], []
+    there, actions, begun = [scene.ground_truth()], [], []
     for _ in range(config.steps):
         action = policy.act(seen[-1]).astype(np.float32)
-        if scene.push(action).fallen:
+        report = scene.push(action)
+        if report.fallen:
             break
+        begun.append(not report.unsafe)
         actions.append(action)
         there.append(scene.ground_truth())
         seen.append(scene.observe())
@@ -98,7 +102,7 @@ def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redra
         replays(scene, twin, config, there, actions, redraws, number, error) for error in (0.0, place_error)
     )
     pushes = [
-        Push(seen[t], seen[t + 1], action, there[t].positions, there[t + 1].positions, again[t], displaced[t])
+        Push(seen[t], seen[t + 1], action, begun[t], there[t].positions, there[t + 1].positions, again[t], displaced[t])
         for t, action in enumerate(actions)
     ]
     return Episode([each.name for each in scene.objects], pushes)
@@ -161,14 +165,16 @@ class Errors:
         self.moved: dict[str, list[float]] = defaultdict(list)
         self.still: list[float] = []
         self.phantoms: list[bool] = []
+        self.begun: list[bool] = []  # all pushes, for each object that lay still
 
-    def add(self, groups: Sequence[str], moved: float, error: float, claimed: float = 0.0) -> None:
+    def add(self, groups: Sequence[str], moved: float, error: float, begun: bool, claimed: float = 0.0) -> None:
         if moved > MOVED:
             for group in ("all", *groups):
                 self.moved[group].append(error)
         elif moved < STILL:
             self.still.append(error)
             self.phantoms.append(claimed > PHANTOM)
+            self.begun.append(begun)
 
 
 def segments(episodes: Sequence[Episode], ahead: int) -> Iterator[tuple[Episode, int, list[Push]]]:
@@ -192,14 +198,16 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
             best = min(kinds, key=("hit", "graze", "miss").index)
             groups = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
             before, seen = first.before.centers[slot], last.after.centers[slot]
+            begun = all(push.begun for push in pushes)
             for floor, again in (("hidden", first.replayed), ("place", first.displaced)):
                 stayed = again[ahead][np.isfinite(again[ahead][:, slot, 2]), slot]
                 if len(stayed):
-                    table[floor].add(groups, moved, float(np.linalg.norm(stayed.mean(0) - body)))
-            table["camera"].add(groups, moved, float(np.linalg.norm(seen - before - body)))
+                    table[floor].add(groups, moved, float(np.linalg.norm(stayed.mean(0) - body)), begun)
+            table["camera"].add(groups, moved, float(np.linalg.norm(seen - before - body)), begun)
             for who, all_of in predicted.items():
                 claimed = float(np.linalg.norm(all_of[number][slot] - before))
-                table[who].add(groups, moved, float(np.linalg.norm(all_of[number][slot] - seen)), claimed)
+                error = float(np.linalg.norm(all_of[number][slot] - seen))
+                table[who].add(groups, moved, error, begun, claimed)
     return table
 
 
@@ -255,8 +263,9 @@ def show(table: Table, ahead: int) -> None:
         print(f"{group:20s} {len(cells[0]):6d} " + "".join(f"{_centimetres(cell):>26s}" for cell in cells))
     stills = [errors.still for errors in table.values()]
     print(f"{'still':20s} {len(stills[0]):6d} " + "".join(f"{_centimetres(cell):>26s}" for cell in stills))
-    shares = [f"{np.mean(errors.phantoms):.2%}" for errors in table.values()]
-    print(f"{'still, said to move':28s}" + "".join(f"{share:>26s}" for share in shares))
+    for title, only_begun in (("still, said to move", False), ("the same, by pushes begun", True)):
+        shares = [_share_of_phantoms(errors, only_begun) for errors in table.values()]
+        print(f"{title:28s}" + "".join(f"{share:>26s}" for share in shares))
 
 
 def draw(tables: dict[int, Table], path: Path) -> None:
@@ -280,6 +289,12 @@ def draw(tables: dict[int, Table], path: Path) -> None:
         ax.set_ylim(top=1.2 * ax.get_ylim()[1])
         ax.legend(frameon=False, ncols=len(table), loc="upper center")
     figure.savefig(path, dpi=120)
+
+
+def _share_of_phantoms(errors: Errors, only_begun: bool) -> str:
+    """Of objects that lay still, those of which the predictor says that they move."""
+    counted = [phantom for phantom, begun in zip(errors.phantoms, errors.begun, strict=True) if begun or not only_begun]
+    return f"{np.mean(counted):.2%} ({sum(counted)} of {len(counted)})" if counted else "-"
 
 
 def _centimetres(values: Sequence[float]) -> str:

@@ -275,6 +275,10 @@ def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -
     assert 0.0 < max(hidden, camera) < f < 3.0  # centimetres
     assert place > hidden
     assert means[three_pushes][3] > hidden
+    counts = re.findall(r"% \((\d+) of (\d+)\)", one_push)  # of hidden, place, camera and f; then by pushes begun alone
+    (said, still), (said_begun, still_begun) = ([int(one) for one in counts[number]] for number in (3, 7))
+    assert 0 < still_begun < still  # some of the heuristic's pushes touch down on an object
+    assert said_begun <= said
     assert (tmp_path / "a.png").stat().st_size > 10_000
     blind = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", "--place-error", "0", *options[:3])
     assert "place" in blind
@@ -318,3 +322,13 @@ def test_training_and_planning_are_timed_on_every_device_of_the_machine() -> Non
     rows = [line for line in lines if line.startswith(("| cpu (", "| cuda ("))]
     assert len(titles) == 2 and len(rows) == (5 if torch.cuda.is_available() else 2)
     assert all(float(row.split("|")[2]) > 0.0 for row in rows)
+
+
+def test_plans_are_timed_beside_a_reference() -> None:
+    small, large = "planner.samples=8 planner.robustness=null", "planner.samples=2048"
+    options = ("--tasks", "insertion", "--scenes", "3", "--repetitions", "1")
+    row = run("paired_times", small, large, large, *options).splitlines()[-1]
+    ratios = [float(cell.split()[0]) for cell in row.split("|")[3::2][:3]]
+    assert ratios[0] < 0.6
+    assert 0.6 < ratios[1] < 1.7  # the same planner twice
+    assert ratios[2] == 1.0
