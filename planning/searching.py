@@ -12,9 +12,9 @@ from models.state import State
 from planning.backends.compiled import Compiled
 from planning.backends.eager import Backend, eager
 from planning.extensions.guidance import check_guidance, guided_return, way_of
-from planning.extensions.idle_pushes import idle_last
+from planning.extensions.idle_pushes import IDLE_DISTANCE, idle_last
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
-from planning.extensions.touchdown import ObservedPoints, prefer_free
+from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
@@ -55,8 +55,8 @@ class SearchingPlanner:
         stride_limits: Sequence[float] | None = None,
         warm_start: bool = True,
         robustness: PerturbedRollouts | None = ROBUSTNESS,
-        idle_distance: float = 0.01,
-        touchdown_distance: float = 0.015,
+        idle_distance: float = IDLE_DISTANCE,
+        touchdown_distance: float = TOUCHDOWN_DISTANCE,
         guidance: str = "none",
         compile: bool = False,
     ) -> None:

@@ -24,12 +24,10 @@ from envs.observation import Observation
 from envs.policy import Intent
 from models.model import Model
 from models.networks.geometry import Geometry
-from planning.extensions.touchdown import prefer_free
+from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, prefer_free
 from planning.rollouts.dynamics import predict_states
 from planning.rollouts.ranking import best_of, squared_distance
 from planning.rollouts.sampling import sample_each
-
-TOUCHDOWN_DISTANCE = 0.015  # metres, the default of planner.touchdown_distance
 
 
 class PushingPolicy(Protocol):

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from models.state import State
 from planning import records
+from planning.extensions.idle_pushes import IDLE_DISTANCE
 from planning.plan import Plan
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.ranking import best_of
 
-UNMOVED = 0.01  # metres; a motion that moves no object so far does nothing
 EFFECT = 0.02  # metres; an effect that moves an object so far asks for a motion
 SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objects together
 
@@ -65,7 +65,7 @@ def is_unmoved(state: State, subgoals: Tensor, predicted: Tensor) -> Tensor:
     Args:
         state: `[B]`. subgoals: `[B, M, 3]` metres, the first ones. predicted: `[B, M, 3]` metres, by f after T pushes.
     """
-    return (_farthest(state, predicted) < UNMOVED) & (_farthest(state, subgoals) >= EFFECT)
+    return (_farthest(state, predicted) < IDLE_DISTANCE) & (_farthest(state, subgoals) >= EFFECT)
 
 
 def first_moves(state: State, effects: Candidates) -> Tensor:

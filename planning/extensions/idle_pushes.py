@@ -9,6 +9,8 @@ from models.state import State
 from planning.extensions.touchdown import ObservedPoints
 from planning.rollouts import returns
 
+IDLE_DISTANCE = 0.01  # metres; what moves no object by as much does nothing
+
 
 def idle_last(
     actions: Tensor,

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from planning.rollouts.ranking import prefer
 
+TOUCHDOWN_DISTANCE = 0.015  # metres between a push's start and a point on which it would touch down
+
 
 class ObservedPoints(NamedTuple):
     """Points of the objects that the camera sees, and the box that normalised starts of pushes span."""
