@@ -72,7 +72,7 @@ class SearchingPlanner:
         self.backend: Backend = Compiled() if compile else eager
         self.reparameterized = warm_start or compile
         if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
-            raise ValueError("outcomes=sampled needs a model that samples f: it has no sampled_next_state")
+            raise ValueError("robustness.outcomes=sampled needs a model that samples f: it has no sampled_next_state")
         _ = self.cumulative_reward(), self.way  # refuse bad options now, not in the first plan
         self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
         self.touchdown_distance = touchdown_distance

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import resources
 from typing import Any
 
@@ -10,7 +12,7 @@ import hydra
 import yaml
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from pyro.infer.autoguide import AutoGuide, AutoMessenger
 
 from cavin_pyro.config.constructors import OWN_PACKAGES
@@ -40,11 +42,29 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
         raise UserError(" ".join(str(error).split())) from error
     except (InstantiationException, TypeError) as error:
         cause = error.__cause__ or error
+        inner = re.search(r"full_key: ([\w.]+)$", str(error))  # Hydra's name of the part within this one
+        if isinstance(cause, ValueError) and inner:
+            with naming(inner[1], OmegaConf.select(OmegaConf.create(dict(config)), inner[1])):
+                raise UserError(" ".join(str(cause).split())) from error
         raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
     except (MemoryError, OverflowError, RuntimeError) as error:  # of torch: a layer larger than the memory
         if str(config["_target_"]).partition(".")[0] not in OWN_PACKAGES:
             raise
         raise UserError(f"{config['_target_']} cannot be built: {' '.join(str(error).split())}") from error
+
+
+@contextmanager
+def naming(section: str, config: Config) -> Iterator[None]:
+    """Let a `UserError` from building a part name its options as users type them: `planner.samples`, not `samples`."""
+    names = "|".join(re.escape(str(name)) for name in config if not str(name).startswith("_"))
+    mention = rf"^(unknown )?({names})(?=[ =.])|(?<![\w.])({names})(?==)"
+    try:
+        yield
+    except UserError as error:
+        if not names:
+            raise
+        said = re.sub(mention, lambda one: f"{one[1] or ''}{section}.{one[2] or one[3]}", str(error))
+        raise UserError(said) from error
 
 
 def check_sizes(section: str, config: Config) -> None:
@@ -56,8 +76,20 @@ def check_sizes(section: str, config: Config) -> None:
     for name, value in config.items():
         if type(value) is int and not str(name).endswith("_weight"):
             at_least(f"{section}.{name!s}", value, 1)
-            if value > LARGEST_SIZE:
-                raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
+    check_largest(section, config)
+
+
+def check_largest(section: str, config: Config) -> None:
+    """Check that no whole number of a section or of the sections in it is a slip, apart from weights.
+
+    Raises:
+        UserError: one is larger than `LARGEST_SIZE`.
+    """
+    for name, value in config.items():
+        if isinstance(value, Mapping | DictConfig):
+            check_largest(f"{section}.{name!s}", value)
+        elif type(value) is int and value > LARGEST_SIZE and not str(name).endswith("_weight"):
+            raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
 
 
 def build_model(config: Config) -> Model:
@@ -91,7 +123,8 @@ def build_model(config: Config) -> Model:
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
     scales = construct(config.get("scales") or FIXED_SCALES)
-    model = construct(sizes, **parts, scales=scales, dynamics=dynamics)
+    with naming("model", sizes):
+        model = construct(sizes, **parts, scales=scales, dynamics=dynamics)
     if not isinstance(model, Model):
         raise UserError(f"model {sizes['_target_']} is no model program: derive it from models.model.Model")
     chosen = own_prior.get("_target_") or config["prior"]["_target_"]

@@ -18,6 +18,13 @@ from envs.tasks import Task
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
 
+LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
+    "scale": (0.1, 10.0),
+    "mass": (0.001, 1000.0),
+    "friction": (0.001, 10.0),
+    "kilograms": (0.001, 1000.0),
+}
+
 
 def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
     """The class that the option `task` names, and replacements of fields of its layout: `task.*` and `tiles.*`.
@@ -54,7 +61,8 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     """Object parameters' ranges.
 
     Raises:
-        UserError: assets that are not there, an unknown object, or a range that is not two increasing positive numbers.
+        UserError: assets that are not there, an unknown object, or a range that is not two increasing numbers within
+            `LIMITS`.
     """
     ranges: Any = OmegaConf.to_container(env.ranges)
     with user_input():
@@ -68,7 +76,7 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
             chosen(ranges[name], objects)
         except ValueError as error:
             raise UserError(str(error).replace(":", f" in env.ranges.{name}:", 1)) from error
-    for name in ("scale", "mass", "friction", "kilograms"):
+    for name in LIMITS:
         ranges[name] = _pair(f"env.ranges.{name}", ranges[name]) if ranges[name] or name != "kilograms" else None
     for name in ("clearance", "drop_height"):
         if not isinstance(ranges[name], int | float) or not ranges[name] >= 0:
@@ -80,6 +88,9 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
     numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
     if not numbers or not 0 < value[0] <= value[1]:
         raise UserError(f"{name} must be two positive numbers, low then high, not {value}")
+    least, most = LIMITS[name.rpartition(".")[2]]
+    if value[0] < least or value[1] > most:
+        raise UserError(f"{name} must be between {least:g} and {most:g}, not {value}")
     return value[0], value[1]
 
 

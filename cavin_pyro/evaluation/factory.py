@@ -17,7 +17,7 @@ from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input, whole_number
 from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
-from cavin_pyro.config.parts import class_of, construct
+from cavin_pyro.config.parts import check_largest, class_of, construct, naming
 from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
@@ -87,6 +87,7 @@ def check_options(config: DictConfig, device: torch.device) -> None:
         UserError: a number or name out of its range, or options that exclude each other.
     """
     check_world(config.env)
+    check_largest("planner", config.planner)
     if device.type != "cpu" and config.planner.get("compile"):
         raise UserError(
             f"planner.compile=true makes native code for the CPU, and device={config.device} plans on {device.type}: "
@@ -194,13 +195,15 @@ def make_planner(
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
-        return construct(options), geometry
+        with naming("planner", options):
+            return construct(options), geometry
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = model_of(checkpoint, path).to(device)
     _check_planner(options, model, path)
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
-    return construct(options, model=wrap(model) if wrap else model, reward=reward, **optimizers), geometry
+    with naming("planner", config.planner):
+        return construct(options, model=wrap(model) if wrap else model, reward=reward, **optimizers), geometry
 
 
 def make_runner(
@@ -251,7 +254,8 @@ def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
             own = class_of(section)
             taken = inspect.signature(own).parameters if callable(own) else usual
             given = {str(key): value for key, value in section.items() if key in taken or key not in usual}
-            built[name] = construct(given)
+            with naming(f"planner.{name}", given):
+                built[name] = construct(given)
             del options[name]
     return built
 

@@ -10,7 +10,7 @@ from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
 from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
 from envs.tasks.generated import ANY_SHAPE, FEWEST, MOST, OBSTACLES, SHAPES, GeneratedLayouts
-from envs.workspace import MAXIMUM_OBJECTS
+from envs.workspace import MAXIMUM_OBJECTS, TILE_SIDE
 
 CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
     "cavin": ("cascaded", "cascaded"),
@@ -99,11 +99,11 @@ class EpisodeConfig(DeviceOptions):
     )
     margin: float = option(
         0.02,
-        "safety margin of the planner's reward; predictions err by about this much",
+        "safety margin of the planner's reward, at most half a tile; predictions err by about this much",
         unit="metres",
         minimum=0,
+        maximum=TILE_SIDE / 2,
         group="planning",
-        limit=10,
     )
     matmul_precision: str = option(
         "bfloat16",
