@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,7 +40,7 @@ class Rearrange(Task):
         region: the tiles on which random places lie.
         goal: a file, see `envs.goals.read_goal`; None samples places in every episode, with the start's clearance.
         clearance: metres between random places, at least.
-        places: (x, y) metres of each object, in order; empty takes those of `goal`. Episodes have it.
+        places: (x, y) metres of each object, in order, instead of `goal`. Episodes have it.
     """
 
     markings = (Marking("region", "region of places", "#F2C200", 0.12),)
@@ -56,6 +57,8 @@ class Rearrange(Task):
         """The places are on the table, or the file shows some."""
         places = _places(self.places)
         object.__setattr__(self, "places", places)
+        if places and self.goal is not None:
+            raise ValueError(f"goal {self.goal} and places both say where the objects go: give one of them")
         if not isinstance(self.goal, str | None):
             raise ValueError(f"goal must be the path of a file, not {self.goal!r}")
         if not (isinstance(self.clearance, int | float) and self.clearance >= 0.0):
@@ -87,8 +90,15 @@ class Rearrange(Task):
             return self
         if self._shown is not None:
             _check_count(f"goal {self.goal}", len(self._shown.centers), objects)
-            return replace(self, places=assign(observation, self._shown))
+            return self._with_places(assign(observation, self._shown))
         return replace(self, places=sample_places(self.region, objects, self.clearance, generator))
+
+    def _with_places(self, places: Sequence[Place]) -> Rearrange:
+        """This task in an episode, with the places of its file, which nobody else may give beside it."""
+        episode = copy.copy(self)
+        object.__setattr__(episode, "places", _places(places))
+        vars(episode).pop("_padded", None)  # those of no places
+        return episode
 
     def to(self, device: torch.device) -> Rearrange:
         """As of `Task`, the places included."""

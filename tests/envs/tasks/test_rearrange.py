@@ -191,6 +191,7 @@ def test_pictures_show_a_disc_in_the_colour_of_each_object(env: PushingEnv) -> N
         ({"places": [[0.1, 0.1]]}, r"places: \[0\.1, 0\.1\] is off the table, from \[0\.22, -0\.61\] to"),
         ({"places": [[0.5, 0.1]] * 11}, r"places must be at most 10 points, not 11$"),
         ({"goal": [[1, 2]]}, r"goal must be the path of a file, not \[\[1, 2\]\]$"),
+        ({"goal": "a.png", "places": [(0.5, 0.1)]}, r"goal a\.png and places both say .*: give one of them$"),
         ({"goal": "nowhere.png"}, r"goal nowhere\.png cannot be read: No such file or directory$"),
         ({"clearance": -1}, r"clearance must be at least 0 metres, not -1$"),
         ({"clearance": "wide"}, r"clearance must be at least 0 metres, not 'wide'$"),
