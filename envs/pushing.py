@@ -102,7 +102,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         elif layout == GENERATED:
             wanted = generated or GeneratedLayouts()
             self.tasks = (generate_task(task, wanted, None, tiles),)
-            self._generate = partial(generate_task, task, wanted)
+            self._generate = partial(generate_task, task, wanted, tiles=tiles)
         else:
             self.tasks = possible_tasks(task, layout, tiles)
         if type(self.tasks[0]) not in TASKS.values():

@@ -14,14 +14,16 @@ Source of the layouts of the paper's three tasks: appendix "Task Details"; the p
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import yaml
 
 from envs.tasks import TASKS, GeneratedLayouts, Task
 from envs.tasks.contract import check_fields
+from envs.tasks.tiles import TileSet
 
 RANDOM, GENERATED = "random", "generated"
 LARGEST = 100_000  # characters of a layout; ours have 200
@@ -60,16 +62,16 @@ def possible_tasks(
 
     Args:
         task, layout, tiles: as of `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
-            in this folder.
+            in this folder. All get the fields of `tiles` that are no lists of tiles, such as `clearance`.
 
     Raises:
         ValueError: as `load_task`, or tiles for `layout=random`.
     """
     if layout != RANDOM:
         return (load_task(task, layout, tiles),)
-    _refuse_tiles(task, RANDOM, tiles)
-    kind = task_class(task)
-    sampled = kind.random_layouts() or tuple(load_task(kind, number) for number in layout_numbers(kind))
+    options, kind = _options(task, RANDOM, tiles), task_class(task)
+    sampled = tuple(replace(one, **options) for one in kind.random_layouts())
+    sampled = sampled or tuple(load_task(kind, number, options) for number in layout_numbers(kind))
     if not sampled:
         raise ValueError(f"task {kind.name} has no layouts to sample from: give layout=FILE.yaml, not random")
     return sampled
@@ -84,21 +86,27 @@ def generate_task(
     """A task in a generated layout: that of `wanted.seed`, or without one a new one.
 
     Args:
-        generator: for a new one; None generates that of seed 0. tiles: none may be given, as of `possible_tasks`.
+        generator: for a new one; None generates that of seed 0. tiles: fields that are no lists of tiles, as of
+            `possible_tasks`.
 
     Raises:
         ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
     """
-    _refuse_tiles(task, GENERATED, tiles)
+    options = _options(task, GENERATED, tiles)
     if wanted.seed is not None or generator is None:
         generator = np.random.default_rng(wanted.seed or 0)
-    return task_class(task).generate(wanted, generator)
+    generated = task_class(task).generate(wanted, generator)
+    return replace(generated, **options) if options else generated
 
 
-def _refuse_tiles(task: str | type[Task], layout: str, tiles: Mapping[str, Any] | None) -> None:
-    if any(one is not None for one in (tiles or {}).values()):
+def _options(task: str | type[Task], layout: str, tiles: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The fields given for a task in layouts that are sampled or generated, of which none may be a list of tiles."""
+    given = {name: value for name, value in (tiles or {}).items() if value is not None}
+    kinds = get_type_hints(task_class(task))
+    if any(kinds.get(name, TileSet) is TileSet for name in given):
         numbers = ", ".join(map(str, layout_numbers(task)))
         raise ValueError(f"tiles replace fields of one layout: give layout={numbers} or a YAML file, not {layout}")
+    return given
 
 
 def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None) -> Task:

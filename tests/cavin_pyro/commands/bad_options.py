@@ -209,6 +209,12 @@ BAD_OPTIONS = [
         "layout=random samples another in every episode: choose planner.compile",
     ),
     ("plan", "planner.compile=true task=rearrange", "this task has another in every episode: choose planner.compile"),
+    (
+        "plan",
+        "task=rearrange task.places=[[0.5,0.1]] task.goal=a.png",
+        "goal a.png and places both say where the objects",
+    ),
+    ("plan", "task=rearrange layout=generated", "task rearrange has no generated layouts: give another layout"),
     ("plan", "task=rearrange tiles.goal=[[1,2]]", "goal must be the path of a file, not [[1, 2]]"),
     ("plan", "task=rearrange task.places=[[0.5,0.1]]", "number of places is 1, of objects 3: use objects=1"),
     (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -189,6 +190,19 @@ def test_what_cannot_be_generated_is_refused_in_one_line(task: str, wanted: dict
 def test_tiles_that_replace_those_of_a_generated_layout_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^tiles replace fields of one layout: .*, not generated$"):
         PushingEnv(task="crossing", layout="generated", tiles={"goal": [[1, 2]]})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Careful(Crossing):
+    """Crossing with an option."""
+
+    distance: float = 0.1
+
+
+def test_other_fields_are_those_of_every_generated_layout() -> None:
+    generator = np.random.default_rng(3)
+    found = generate_task(Careful, GeneratedLayouts(), generator, {"distance": 0.3})
+    assert isinstance(found, Careful) and found.distance == 0.3
 
 
 def test_every_shape_that_is_named_exists() -> None:

@@ -77,6 +77,11 @@ def test_tiles_that_replace_those_of_a_random_layout_are_refused() -> None:
     possible_tasks("insertion", "random", {"goal": None})
 
 
+def test_other_fields_are_those_of_every_random_layout() -> None:
+    options = {"clearance": 0.2, "places": []}
+    assert possible_tasks("rearrange", "random", options) == (load_task("rearrange", 0, options),)
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_every_layout_that_may_be_sampled_has_room_for_five_objects(task: str, envs: dict[str, PushingEnv]) -> None:
     env = envs[task]
