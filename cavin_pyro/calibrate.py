@@ -19,8 +19,8 @@ def main(config: DictConfig) -> None:
 
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     with output_folder(config.output) as folder:
-        loaded, context = load_calibration(config)
         check_same_run(folder, config, ignore=("output",))
+        loaded, context = load_calibration(config)
         write_config(folder, config)
         sizes = {name: config[name] for name in ("windows", "samples", "repeats")}
         before = measure_guide(context, **sizes)

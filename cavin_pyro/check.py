@@ -10,6 +10,8 @@ from cavin_pyro.config.application import command
 @command("check")
 def main(config: DictConfig) -> None:
     """Check a trained model and its guide on held-out windows, and write a report; resumes an interrupted run."""
+    from functools import partial
+
     import pyro
 
     from cavin_pyro.config.parts import check_sizes
@@ -27,14 +29,14 @@ def main(config: DictConfig) -> None:
     names = choose_sections(config.sections, config.sizes)
     pair, export = check_pair(config), check_export(config.export)
     check_sizes("sizes.export", config.sizes.export)
+    objects = config.sizes.consistency.objects
+    accept = partial(check_objects, objects=objects) if "consistency" in names else None
     with output_folder(config.output) as folder:
         if pair:
-            parts = write_pair(config, names, folder)
+            parts = write_pair(config, names, folder, accept)
         else:
-            context, about = load_context(config)
-            if "consistency" in names:  # before anything is written
-                check_objects(context, config.sizes.consistency.objects)
             check_same_run(folder, config, ignore=("output", "sections", "export"))
+            context, about = load_context(config, accept)
             write_config(folder, config)
             if export:
                 sizes = config.sizes.export

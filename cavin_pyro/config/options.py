@@ -145,7 +145,7 @@ def shown(value: Any) -> Any:
     """A value in the user's notation."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
-    return f"{value:g}" if isinstance(value, float) else value
+    return f"{value:g}" if isinstance(value, float) else value if value != "" else "''"
 
 
 def _range(about: About, whole: bool) -> str:

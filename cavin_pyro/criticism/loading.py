@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,6 +36,8 @@ from models.state import Window
 # Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
 ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum_move", "negative_fraction")
 
+Accept = Callable[[Model], None]
+
 
 class Loaded(NamedTuple):
     """A checkpoint with its data. path: of the file. windows: all of the data, as its own training split them."""
@@ -49,11 +51,14 @@ class Loaded(NamedTuple):
     folders: list[Path]
 
 
-def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
+def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
     Windows are chosen and held out with the checkpoint's own configuration and seed, so that the held-out episodes are
     those that its training held out.
+
+    Args:
+        accept: see `load_trained`.
 
     Returns:
         The context, and `about` for the report (see `cavin_pyro.criticism.report`).
@@ -62,18 +67,18 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
     world = collecting_world(config.env)
-    loaded = load_trained(config, config.checkpoint)
+    loaded = load_trained(config, config.checkpoint, accept)
     return context_of(config, loaded, world, loaded.table.validation)
 
 
-def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any]]]:
+def load_pair(config: DictConfig, accept: Accept | None = None) -> dict[str, tuple[CheckContext, dict[str, Any]]]:
     """The same for the options `a` and `b`, with the same held-out windows: those that neither was trained on.
 
     Raises:
         UserError: their windows are not of the same data, or none is held out by both.
     """
     world = collecting_world(config.env)
-    both = {name: load_trained(config, config[name]) for name in ("a", "b")}
+    both = {name: load_trained(config, config[name], accept) for name in ("a", "b")}
     tables = {name: loaded.table for name, loaded in both.items()}
     lengths = {name: loaded.model.segment_length for name, loaded in both.items()}
     held_out_objects = [list(trained_windows(one.checkpoint, one.path)[0].held_out_objects) for one in both.values()]
@@ -94,8 +99,11 @@ def load_pair(config: DictConfig) -> dict[str, tuple[CheckContext, dict[str, Any
     return contexts
 
 
-def load_trained(config: DictConfig, name: str) -> Loaded:
+def load_trained(config: DictConfig, name: str, accept: Accept | None = None) -> Loaded:
     """A checkpoint by its name or path, with its programs, and the windows of the option `data` as its training split.
+
+    Args:
+        accept: raises a UserError for a model that cannot be used, before the data are read.
 
     Raises:
         UserError: as `load_context`.
@@ -103,6 +111,8 @@ def load_trained(config: DictConfig, name: str) -> Loaded:
     path = find_checkpoint(name)
     checkpoint = load_checkpoint(path, trust=list(config.trust))
     model, guide = load_programs(checkpoint, path)
+    if accept is not None:
+        accept(model)
     geometry = geometry_of(checkpoint, path)
     check_fit(model, geometry)
     windows, segment_length, split = trained_windows(checkpoint, path)

@@ -104,6 +104,8 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         UserError: there is no dataset, or it has another format or version, or it holds no episode.
     """
     path = folder / "metadata.json"
+    if folder.is_file():
+        raise UserError(f"no dataset in {folder}, which is a file: give the folder that collect has written")
     if not path.exists():
         raise UserError(
             f"no dataset in {folder}: make one with python -m cavin_pyro.collect transitions=100000 output={folder}"

@@ -57,6 +57,12 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     objective = build_objective(config, model)
     geometry, origin = chosen_geometry(config)
     data = data_folders(config.data)
+    with user_input():
+        objective.check(model, guide)
+    started = start_from(config.initial, model, guide, geometry, config.trained) if config.initial else {}
+    train_only(config.trained, model, guide)
+    signs = _mirror_signs(config.trainer.reflect, geometry, guide)
+    check_same_run(folder, config, ignore=("data", "output", "device"))
     check_fit(model, geometry, max(slots_of(read_metadata(folder)) for folder in data))
     windows = load_windows(
         data,
@@ -67,11 +73,6 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         skip_corrupt=config.skip_corrupt,
         storage=folder,
     )
-    with user_input():
-        objective.check(model, guide)
-    started = start_from(config.initial, model, guide, geometry, config.trained) if config.initial else {}
-    train_only(config.trained, model, guide)
-    signs = _mirror_signs(config.trainer.reflect, geometry, guide)
     model.to(device), guide.to(device)  # made on the CPU: one seed makes the same weights for every device
     where = _place(windows, device)
     if guide.amortized:
@@ -86,7 +87,6 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
             f"guides that infer any window: {others}"
         )
 
-    check_same_run(folder, config, ignore=("data", "output", "device"))
     record = {**training_provenance(data, origin, windows), **started}
     check_same_data(folder, record["data"])
     stored_config = write_config(folder, config)

@@ -24,18 +24,17 @@ from cavin_pyro.criticism.subgoal_rollout import (
 )
 from cavin_pyro.criticism.verdicts.verdict import FEW, GOOD, NONE, Verdict, grade
 from cavin_pyro.storage.progress import progress_bar
+from models.model import Model
 
 
-def check_objects(context: CheckContext, objects: int) -> None:
+def check_objects(model: Model, objects: int) -> None:
     """Make sure that a model knows so many objects.
 
     Raises:
         UserError: it does not.
     """
-    if objects > context.model.maximum_objects:
-        raise UserError(
-            f"sizes.consistency.objects={objects}, but the model knows at most {context.model.maximum_objects}"
-        )
+    if objects > model.maximum_objects:
+        raise UserError(f"sizes.consistency.objects={objects}, but the model knows at most {model.maximum_objects}")
 
 
 def assess_consistency(context: CheckContext, *, scenes: int = 150, objects: int = 3, samples: int = 1024) -> Section:
@@ -47,7 +46,7 @@ def assess_consistency(context: CheckContext, *, scenes: int = 150, objects: int
     Raises:
         UserError: the model does not know so many objects.
     """
-    check_objects(context, objects)
+    check_objects(context.model, objects)
     values: dict[str, Any] = {"scenes": scenes, "objects": objects, "samples": samples, "selections": []}
     if not context.codes:
         nothing = ["The model has no codes and generates no pushes: there is nothing to execute."]

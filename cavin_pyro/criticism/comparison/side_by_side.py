@@ -10,10 +10,9 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.checks.consistency import check_objects
 from cavin_pyro.criticism.comparison.scores import FEATURES, LABELS, better, explained_sites, window_scores
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.loading import load_pair
+from cavin_pyro.criticism.loading import Accept, load_pair
 from cavin_pyro.criticism.report import Part, render, write_report
 from cavin_pyro.criticism.section import Section, Table
 from cavin_pyro.criticism.sections import fingerprint_of, run_sections
@@ -48,17 +47,17 @@ def check_pair(config: DictConfig) -> bool:
     return True
 
 
-def write_pair(config: DictConfig, names: Sequence[str], folder: Path) -> list[Part]:
+def write_pair(config: DictConfig, names: Sequence[str], folder: Path, accept: Accept | None = None) -> list[Part]:
     """Check both checkpoints, and write a report on both and one on each, in the folders a and b; resumes.
+
+    Args:
+        accept: see `cavin_pyro.criticism.loading.load_trained`.
 
     Raises:
         UserError: see `load_pair`.
     """
-    loaded = load_pair(config)
-    if "consistency" in names:  # before anything is written
-        for context, _ in loaded.values():
-            check_objects(context, config.sizes.consistency.objects)
     check_same_run(folder, config, ignore=("output", "sections"))
+    loaded = load_pair(config, accept)
     write_config(folder, config)
     parts = {}
     for name, (context, about) in loaded.items():

@@ -15,11 +15,12 @@ from cavin_pyro.criticism.recalibration.measurement import Measured
 from cavin_pyro.criticism.recalibration.sleep import sleep
 from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.dataset import content_records
-from cavin_pyro.storage.checkpoint import checkpoint_bytes
+from cavin_pyro.storage.checkpoint import checkpoint_bytes, find_checkpoint
 from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.files import atomic_write, write_json
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.trainer import unchecked_programs
+from models.model import Model
 from models.state import Window
 
 OPTIONS = ("steps", "batch_size", "learning_rate", "wake_weight", "seed")
@@ -31,12 +32,16 @@ def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
     Raises:
         UserError: a checkpoint or data that cannot be used, or a model without codes.
     """
-    loaded = load_trained(config, config.checkpoint)
-    if not loaded.model.codes:
-        raise UserError(
-            f"checkpoint {loaded.path} has model {type(loaded.model).__name__}, which has no codes, so that there is "
-            "no guide to calibrate"
-        )
+    path = find_checkpoint(config.checkpoint)
+
+    def accept(model: Model) -> None:
+        if not model.codes:
+            raise UserError(
+                f"checkpoint {path} has model {type(model).__name__}, which has no codes, so that there is no guide to "
+                "calibrate"
+            )
+
+    loaded = load_trained(config, config.checkpoint, accept)
     context, _ = context_of(config, loaded, CollectionConfig(), loaded.table.validation)
     return loaded, context
 

@@ -67,6 +67,13 @@ BAD_FILES = [
     ("train", "data=@damaged_data", "metadata.json is damaged"),
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
     ("train", "data=@lost_data", "lost_data/episodes-00001.h5 is missing or corrupt"),
+    ("train", "data=@noise", "noise, which is a file: give the folder that collect has written"),
+    # Before all of the data are read.
+    ("train", "data=@corrupt_data trained=[foo]", "'foo', which is no part of this model: choose from encoder, "),
+    ("train", "data=@corrupt_data initial=@flat", "is of another architecture"),
+    ("train", "data=@corrupt_data output=@used", "holds a run with"),
+    ("check", "data=@corrupt_data sizes.consistency.objects=6", "sizes.consistency.objects=6, but the model knows at"),
+    ("check", "data=@corrupt_data output=@used", "holds a run with"),
     ("train", "data=[@pushes,@long_data]", "episodes of different length cannot be joined"),
     ("train", "data=[@pushes,@nothing]", "python -m cavin_pyro.collect"),
     ("collect", "output=@old_data", "has format version 0"),

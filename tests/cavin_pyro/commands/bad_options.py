@@ -138,6 +138,7 @@ BAD_OPTIONS = [
     ("plan", "planner.samples=2.5", "planner.samples must be a whole number, not 2.5"),
     ("plan", "margin=wide", "margin must be a number, not wide"),
     ("plan", "video=maybe", "video must be true or false, not maybe"),
+    ("evaluate", "merge=", "merge must be a list, not ''"),
     ("plan", "trust=os", "trust must be a list, not os"),
     ("evaluate", "episodes=1.5", "episodes must be a whole number, not 1.5"),
     ("train", "trainer.learning_rate=small", "trainer.learning_rate must be a number, not small"),

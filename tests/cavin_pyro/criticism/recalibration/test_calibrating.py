@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from cavin_pyro.criticism.loading import load_programs
+from cavin_pyro.data.dataset import shard_path
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.geometry import geometry_of
@@ -60,9 +62,10 @@ def test_only_the_guide_changes_and_the_checkpoint_says_so(
 def test_a_model_without_codes_is_refused_in_one_line(
     small: SimpleNamespace, pushes: Path, shell: SimpleNamespace, tmp_path: Path
 ) -> None:
-    trained = tmp_path / "trained.safetensors"
+    trained, data = tmp_path / "trained.safetensors", shutil.copytree(pushes, tmp_path / "data")
+    shard_path(data, 1).unlink()  # which would be told if the data were read first
     small.save_baseline(trained, "dynamics", windows=WINDOWS, seed=1)
-    done = shell.run_command("calibrate", f"checkpoint={trained}", f"data={pushes}", "output=out", folder=tmp_path)
+    done = shell.run_command("calibrate", f"checkpoint={trained}", f"data={data}", "output=out", folder=tmp_path)
     assert done.status == 2
     assert len(done.complaints) == 1
     assert "DynamicsModel, which has no codes, so that there is no guide to calibrate" in done.errors
