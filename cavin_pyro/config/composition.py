@@ -6,6 +6,7 @@ import difflib
 import functools
 import itertools
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, ValidationError
 
@@ -77,7 +78,7 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
         UserError: an override that does not parse, an unknown option or preset, or a value out of its range.
     """
     if config_dir is not None:
-        overrides = [*overrides, f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"]
+        overrides = [*overrides, search_path(str(Path(config_dir).resolve()))]
     with _hydra():
         try:
             _check_additions(name, overrides)
@@ -90,6 +91,11 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserError(_explain_override(name, overrides, error)) from error
     return config
+
+
+def search_path(*folders: str) -> str:
+    """The override that lets presets lie in these folders as well."""
+    return f"hydra.searchpath=[{','.join(_in_quotes(f'file://{folder}') for folder in folders)}]"
 
 
 def presets_by_name(overrides: Sequence[str]) -> list[str]:
@@ -199,7 +205,9 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
         values = [one.value() for one in _parsed(overrides) if one.key_or_group == option]
         if wanted and values:
             return f"{option} must be {wanted}, not {shown(values[-1])}"
-    first = str(error).splitlines()[0].rstrip(".")
+    if isinstance(error, OverrideParseException) and (quoted := _quoted(error.override)):
+        return f"{error.override} holds a character that needs quotes: write {quoted}"
+    first = str(error).splitlines()[0].rstrip(".").removeprefix("LexerNoViableAltException: ")
     several = re.match(r"Ambiguous value for argument '(.+)'$", first)
     if several:
         return f"several values need -m: python -m cavin_pyro.{name} -m {several[1]}"
@@ -207,6 +215,29 @@ def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
     if group:
         return f"unknown override '{group[1]}.{group[2]}': the chosen {group[1]} has no {group[2]}"
     return f"{first}: write overrides as name=value"
+
+
+_ENTRY = r"[^][{},:\"']*[^][{},:\"'\x00-\x7F][^][{},:\"']*"  # of a list, with a character that is not ASCII
+
+
+def _in_quotes(value: str | re.Match[str]) -> str:
+    text = value if isinstance(value, str) else value[0]
+    return '"' + text.replace('"', '\\"') + '"'
+
+
+def _quoted(override: str) -> str | None:
+    """An override that does not parse, for the shell and with its value in quotes; None if that does not help.
+
+    Unquoted values may hold ASCII letters, digits, spaces and some signs (Hydra's grammar).
+    """
+    key, equals, value = override.partition("=")
+    if not equals:
+        return None
+    if value.startswith(("[", "{", "'", '"')):
+        quoted = f"{key}={re.sub(_ENTRY, _in_quotes, value)}"
+    else:
+        quoted = f"{key}={_in_quotes(value)}"
+    return shlex.quote(quoted) if _parsable([quoted]) else None
 
 
 def _unknown(key: str, known: DictConfig) -> str:

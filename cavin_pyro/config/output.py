@@ -9,7 +9,7 @@ from typing import Any
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.config.composition import preset_defaults
+from cavin_pyro.config.composition import preset_defaults, search_path
 
 # The folder of a run without overrides, and the options that never decide which folder it is: runs that differ only in
 # these are the same run.
@@ -48,8 +48,8 @@ def run_name(name: str, config: DictConfig, hydra_config: Any) -> str:
     """A name that identifies a run of a command: presets by name, other differences by their hash."""
     pattern, irrelevant = FOLDERS[name]
     # A folder of the user's own presets (--config-dir) is on the search path, which the composition here lacks.
-    own = [f"file://{one.path}" for one in hydra_config.runtime.config_sources if one.schema == "file"]
-    search = [f"hydra.searchpath=[{','.join(own)}]"] if own else []
+    own = [one.path for one in hydra_config.runtime.config_sources if one.schema == "file"]
+    search = [search_path(*own)] if own else []
     defaults, usual = preset_defaults(name, [*hydra_config.overrides.task, *search])
     choices = {str(group): choice for group, choice in hydra_config.runtime.choices.items()}
     values: dict[str, Any] = {**{str(key): value for key, value in config.items()}, **choices}

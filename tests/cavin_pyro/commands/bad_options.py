@@ -102,6 +102,13 @@ BAD_OPTIONS = [
     # Overrides that Hydra refuses.
     ("collect", "transitions", "'transitions': write overrides as name=value"),
     ("collect", "transitions=[1,", "write overrides as name=value"),
+    ("train", "data=data/bücher", "data=data/bücher holds a character that needs quotes: write 'data=\"data/bücher\"'"),
+    ("train", "data=[a/ü,b]", "data=[a/ü,b] holds a character that needs quotes: write 'data=[\"a/ü\",b]'"),
+    (
+        "plan",
+        "layout=my(1).yaml",
+        "layout=my(1).yaml holds a character that needs quotes: write 'layout=\"my(1).yaml\"'",
+    ),
     ("plan", "seed=1,2", "several values need -m: python -m cavin_pyro.plan -m seed=1,2"),
     ("plan", "--cfg nonsense", "argument --cfg/-c: invalid choice: 'nonsense'"),
     ("plan", "--info nonsense", "argument --info/-i: invalid choice: 'nonsense'"),

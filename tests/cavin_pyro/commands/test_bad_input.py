@@ -31,6 +31,11 @@ def name_of(command: str, overrides: str) -> str:
     return f"{command} {overrides}"
 
 
+def id_of(command: str, overrides: str) -> str:
+    """The name as pytest has it."""
+    return name_of(command, overrides).encode("unicode_escape").decode()
+
+
 @pytest.fixture(scope="module")
 def material(
     tmp_path_factory: pytest.TempPathFactory, pushes: Path, checkpoint_file: Path, small: SimpleNamespace
@@ -52,7 +57,7 @@ def answers(
     """How every case that is tested now ended, what it left in its folder, and what became of the material."""
     before = without_features(shell.contents(material))
     tested = {getattr(getattr(item, "callspec", None), "id", None) for item in request.session.items}
-    rows = [(command, "", "") for command in GOOD] + [row for row in BAD + MORE if name_of(*row[:2]) in tested]
+    rows = [(command, "", "") for command in GOOD] + [row for row in BAD + MORE if id_of(*row[:2]) in tested]
     cases = {}
     for command, overrides, _ in rows:
         line = f"output=out {GOOD[command]} {overrides}"

@@ -302,3 +302,11 @@ def test_a_signal_that_comes_while_python_frees_an_object_is_not_lost(capsys: py
         guarded(work)
     assert ended.value.code == 128 + signal.SIGTERM
     assert capsys.readouterr().err == "error: interrupted by SIGTERM; rerun the same command to resume, if it can\n"
+
+
+def test_presets_may_lie_in_a_folder_whose_name_needs_quotes(tmp_path: Path) -> None:
+    (tmp_path / "bücher (1)" / "env" / "ranges").mkdir(parents=True)
+    (tmp_path / "bücher (1)" / "env" / "ranges" / "mine.yaml").write_text("friction: [0.6, 0.6]\n", encoding="utf-8")
+    config = check_overrides("plan", ["env/ranges=mine"], str(tmp_path / "bücher (1)"))
+    assert config.env.ranges.friction == [0.6, 0.6]
+    assert completed("plan", config).output.startswith("runs/plan/")
