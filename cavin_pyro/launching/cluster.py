@@ -16,6 +16,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from cavin_pyro.config.errors import UserError, WorkerError
+from cavin_pyro.launching.order import Order
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -46,14 +47,14 @@ def in_cluster(
     try:
         # A processor runs one job at a time; Ray repeats a job whose process or node is lost.
         task = ray.remote(num_cpus=1)(function)
-        queue, early = enumerate(jobs), dict[int, Any]()
+        queue, order = enumerate(jobs), Order[Any](ordered=ordered)
         numbers: dict[Any, int] = {}  # of the jobs that were given
-        given, next_number, limit, looked = 0, 0, 0, 0.0
+        given, limit, looked = 0, 0, 0.0
         while True:
             if time.monotonic() - looked > LOOKING_SECONDS:
                 limit, looked = max(1, JOBS_PER_CPU * int(ray.cluster_resources().get("CPU", 0))), time.monotonic()
             # Ordered results wait for those before them: no job runs farther ahead than its result is kept.
-            free = limit - (given - next_number if ordered else len(numbers))
+            free = limit - (given - order.yielded if ordered else len(numbers))
             for number, job in islice(queue, max(0, free)):
                 numbers[task.remote(job)] = number
                 given += 1
@@ -61,14 +62,7 @@ def in_cluster(
                 return
             ready, _ = ray.wait(list(numbers), timeout=LOOKING_SECONDS)
             for reference in ready:
-                number, result = numbers.pop(reference), _result(ray, reference)
-                if not ordered:
-                    yield number, result
-                    continue
-                early[number] = result
-                while next_number in early:
-                    yield next_number, early.pop(next_number)
-                    next_number += 1
+                yield from order.add(numbers.pop(reference), _result(ray, reference))
     finally:
         ray.shutdown()
 

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from cavin_pyro.config.errors import WorkerError
 from cavin_pyro.config.imports import without_collections
+from cavin_pyro.launching.order import Order
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -49,24 +50,17 @@ def in_workers(
     """
     ahead = 2 * workers if ordered else None
     with _Workers(function, workers) as pool:
-        early: dict[int, Result] = {}
-        given, next_number = 0, 0
-        queue = enumerate(jobs)
+        order = Order[Result](ordered=ordered)
+        given, queue = 0, enumerate(jobs)
         while True:
-            free = pool.idle if ahead is None else min(pool.idle, next_number + ahead - given)
+            free = pool.idle if ahead is None else min(pool.idle, order.yielded + ahead - given)
             for job in itertools.islice(queue, max(0, free)):
                 pool.give(*job)
                 given += 1
             if not pool.busy:
                 break
             for number, result in pool.collect():
-                if not ordered:
-                    yield number, result
-                    continue
-                early[number] = result
-                while next_number in early:
-                    yield next_number, early.pop(next_number)
-                    next_number += 1
+                yield from order.add(number, result)
         pool.end()
 
 
