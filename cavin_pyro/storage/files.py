@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.lock import folder_lock
+from cavin_pyro.storage.lock import LOCK_NAME, folder_lock
 
+CONFIG_NAME = "config.yaml"  # the options of a run
 PARTIAL = ".partial"  # in the names of files that are being written
 OURS = ".cavin-"  # in the names of those that `atomic_write` makes, which alone are cleared away
 
@@ -60,7 +61,8 @@ def read_json(path: Path) -> Any:
 def output_folder(path: str | Path) -> Iterator[Path]:
     """Hold a folder for results: it exists, is writable and is locked, and what a killed run left half-written is gone.
 
-    A folder that was made for this and is still empty at the end is deleted, so that a refused command leaves nothing.
+    A folder that was made for this and is still empty at the end is deleted, and so is one that holds nothing but its
+    options when the command fails: a command that is refused, or that the memory does not allow, leaves nothing.
 
     Raises:
         UserError: the folder cannot be made or written to, or another process writes into it.
@@ -78,7 +80,17 @@ def output_folder(path: str | Path) -> Iterator[Path]:
             raise UserError(
                 f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
             ) from error
-        yield folder
+        try:
+            yield folder
+        except BaseException:
+            if folder in made and holds_no_result(folder):
+                (folder / CONFIG_NAME).unlink(missing_ok=True)
+            raise
+
+
+def holds_no_result(folder: Path) -> bool:
+    """Whether a run in a folder, if there is one, failed before its first result."""
+    return {one.name for one in folder.iterdir()} <= {CONFIG_NAME, LOCK_NAME}
 
 
 def clear_abandoned(folder: Path, *, older_than: float = 0.0) -> None:

@@ -12,8 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.files import atomic_write, read_json, write_json
-from cavin_pyro.storage.lock import LOCK_NAME
+from cavin_pyro.storage.files import CONFIG_NAME, atomic_write, holds_no_result, read_json, write_json
 from envs.tasks import TASKS, GeneratedLayouts
 
 # It only decides `checkpoint`, which is compared; older versions did not know it.
@@ -25,7 +24,7 @@ def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
     """Write `config.yaml` and return the configuration as plain data."""
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
-    with atomic_write(folder / "config.yaml") as temporary:
+    with atomic_write(folder / CONFIG_NAME) as temporary:
         temporary.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
     return {str(name): value for name, value in plain.items()}
 
@@ -39,9 +38,9 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
     Raises:
         UserError: the earlier run had another configuration; the first option that differs is named.
     """
-    path = folder / "config.yaml"
-    if not path.exists() or {one.name for one in folder.iterdir()} <= {"config.yaml", LOCK_NAME}:
-        return  # a run that failed before its first result holds nothing to protect
+    path = folder / CONFIG_NAME
+    if not path.exists() or holds_no_result(folder):
+        return  # there is nothing to protect
     try:
         earlier = stored_options(path)
     except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:

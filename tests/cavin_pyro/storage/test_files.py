@@ -108,3 +108,17 @@ def test_an_output_folder_in_which_nothing_was_written_is_deleted_if_it_was_made
         with pytest.raises(ZeroDivisionError), output_folder(tmp_path / place):
             raise ZeroDivisionError
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_a_run_that_fails_before_its_first_result_leaves_no_options_in_a_folder_made_for_it(tmp_path: Path) -> None:
+    (tmp_path / "earlier").mkdir()
+    for place, names in {"earlier": ["config.yaml"], "new": ["config.yaml"], "half": ["config.yaml", "row"]}.items():
+        with pytest.raises(MemoryError), output_folder(tmp_path / place) as folder:
+            for name in names:
+                (folder / name).touch()
+            raise MemoryError
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+    assert left == ["earlier/config.yaml", "half/config.yaml", "half/row"]
+    with output_folder(tmp_path / "whole") as folder:
+        (folder / "config.yaml").touch()
+    assert (tmp_path / "whole" / "config.yaml").exists()
