@@ -74,7 +74,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         storage=folder,
     )
     model.to(device), guide.to(device)  # made on the CPU: one seed makes the same weights for every device
-    where = _place(windows, device)
+    where = place(windows, device)
     if guide.amortized:
         check_compatibility(model, guide, windows.batch(windows.training[:2]))
         print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation{where}")
@@ -118,7 +118,7 @@ def _mirror_signs(reflect: bool, geometry: Geometry, guide: Guide) -> Tensor | N
     return signs
 
 
-def _place(windows: WindowTable, device: torch.device) -> str:
+def place(windows: WindowTable, device: torch.device) -> str:
     """Move the windows to a device; returns what there is to say about where they lie."""
     if device.type == "cpu":
         return ""

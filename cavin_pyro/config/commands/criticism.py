@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from cavin_pyro.config.commands.device import DeviceOptions
 from cavin_pyro.config.commands.episodes import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.commands.training import DATA
 from cavin_pyro.config.commands.world import WorldConfig, collection_world
@@ -45,7 +46,7 @@ class CheckConfig:
 
 
 @dataclass
-class CalibrateConfig:
+class CalibrateConfig(DeviceOptions):
     """Options of `python -m cavin_pyro.calibrate`."""
 
     defaults: list[Any] = field(default_factory=lambda: ["_self_", "base"])

@@ -19,11 +19,13 @@ from cavin_pyro.storage.checkpoint import checkpoint_bytes, find_checkpoint
 from cavin_pyro.storage.digests import file_digest
 from cavin_pyro.storage.files import atomic_write, write_json
 from cavin_pyro.storage.provenance import provenance
+from cavin_pyro.training.run import place
 from cavin_pyro.training.trainer import unchecked_programs
 from models.model import Model
 from models.state import Window
 
-OPTIONS = ("steps", "batch_size", "learning_rate", "wake_weight", "seed")
+CPU = torch.device("cpu")
+OPTIONS = ("steps", "batch_size", "learning_rate", "wake_weight", "seed", "device")
 
 
 def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
@@ -46,8 +48,13 @@ def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
     return loaded, context
 
 
-def calibrate_guide(config: DictConfig, loaded: Loaded) -> list[dict[str, float]]:
-    """Fit the guide in place on the windows that its training saw; returns the losses."""
+def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = CPU) -> list[dict[str, float]]:
+    """Fit the guide in place on the windows that its training saw, on a device; returns the losses.
+
+    Model and guide are on the CPU before and after.
+    """
+    place(loaded.table, device)
+    loaded.model.to(device), loaded.guide.to(device)
     generator = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)
 
@@ -55,7 +62,7 @@ def calibrate_guide(config: DictConfig, loaded: Loaded) -> list[dict[str, float]
         return loaded.table.batch(loaded.table.sample(config.batch_size, generator, bucketed=True))
 
     with unchecked_programs():
-        return sleep(
+        losses = sleep(
             loaded.model,
             loaded.guide,
             batch,
@@ -63,6 +70,8 @@ def calibrate_guide(config: DictConfig, loaded: Loaded) -> list[dict[str, float]
             learning_rate=config.learning_rate,
             wake_weight=config.wake_weight,
         )
+    loaded.model.to(CPU), loaded.guide.to(CPU)
+    return losses
 
 
 def write_calibrated(

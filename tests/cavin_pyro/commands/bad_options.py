@@ -56,7 +56,7 @@ BAD_OPTIONS = [
     (
         "check",
         "device=cuda",
-        "unknown override 'device': it is an option of pretrain, train, plan, evaluate, demo, reproduce; valid",
+        "unknown override 'device': it is an option of pretrain, train, calibrate, plan, evaluate, demo, reproduce",
     ),
     ("plan", "env.objects=toys", "unknown env.objects 'toys': choose from builtin, ycb, mixed, random"),
     ("plan", "env.objects=ycb", "give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to DIR"),

@@ -42,7 +42,7 @@ def test_everything_works_on_a_device_that_is_not_the_cpu(chosen: str, least: in
 
 
 @without_gpu
-@pytest.mark.parametrize("command", ["plan", "reproduce"])
+@pytest.mark.parametrize("command", ["plan", "reproduce", "calibrate"])
 def test_cuda_without_a_gpu_is_one_line_that_names_the_choices(
     command: str, shell: SimpleNamespace, tmp_path: Path
 ) -> None:

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, MixtureSameFamily, Normal
 from torch.utils._python_dispatch import _get_current_dispatch_mode
 
+from cavin_pyro.config.composition import compose
+from cavin_pyro.criticism.recalibration.run import calibrate_guide, load_calibration
 from cavin_pyro.data import windows
 from cavin_pyro.evaluation import factory
 from cavin_pyro.training import run
@@ -268,6 +270,26 @@ def test_pretraining_is_that_of_the_cpu(device: torch.device, tmp_path: Path) ->
     expected = weights(torch.device("cpu"))
     with PretendDevice():
         found = weights(device)
+    assert all(found[name].equal(value) for name, value in expected.items())
+
+
+def test_a_guide_is_calibrated_as_on_the_cpu_by_default(device: torch.device, data: Path, tmp_path: Path) -> None:
+    trained(data, tmp_path, "model.width=8", "guide.width=8")
+
+    def calibrated(where: torch.device) -> dict[str, Tensor]:
+        options = [f"checkpoint={tmp_path / 'checkpoint.safetensors'}", f"data={data}", "steps=2", "batch_size=8"]
+        config = compose("calibrate", *options, f"output={tmp_path}")
+        loaded, _ = load_calibration(config)
+        before = {name: value.clone() for name, value in loaded.guide.state_dict().items()}
+        losses = calibrate_guide(config, loaded, where)
+        after = loaded.guide.state_dict()
+        assert not any(isinstance(value, PretendTensor) for value in (*after.values(), *loaded.model.parameters()))
+        assert any(not value.equal(before[name]) for name, value in after.items())
+        return {**after, **{f"loss.{number}": torch.tensor(list(row.values())) for number, row in enumerate(losses)}}
+
+    expected = calibrated(torch.device("cpu"))
+    with PretendDevice():
+        found = calibrated(device)
     assert all(found[name].equal(value) for name, value in expected.items())
 
 
