@@ -35,6 +35,7 @@ class RangesConfig:
         unit="metres",
         minimum=0,
         group="objects",
+        limit=10,
     )
 
 

@@ -251,6 +251,7 @@ BAD_OPTIONS = [
     ("plan", "env.ranges.friction=[0.1,inf]", "env.ranges.friction must be between 0.001 and 10, not [0.1, inf]"),
     ("plan", "env.ranges.kilograms=10", "env.ranges.kilograms must be two positive numbers, low then high, not 10"),
     ("plan", "env.ranges.drop_height=-1", "env.ranges.drop_height must be at least 0 metres, not -1"),
+    ("plan", "env.ranges.drop_height=100", "env.ranges.drop_height must be at most 10 metres, not 100"),
     ("plan", "env.ranges.clearance=-1", "env.ranges.clearance must be at least 0 metres, not -1"),
     *(
         (command, f"{option}=0", f"{option} must be at least 1, not 0")

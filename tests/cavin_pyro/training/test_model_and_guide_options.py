@@ -115,6 +115,6 @@ def guide_class(option: str) -> str:
 @pytest.mark.parametrize("weight", ["0", "-1", "0.0"])
 def test_the_balance_of_states_and_actions_is_a_positive_number(weight: str) -> None:
     config = configuration("model=single_latent", f"model.action_weight={weight}")
-    with pytest.raises(UserError, match=f"^action_weight must be a positive number, not {weight}$"):
+    with pytest.raises(UserError, match=f"^model.action_weight must be a positive number, not {weight}$"):
         build_model(config)
     assert build_model(configuration("model=single_latent", "model.action_weight=2")).action_weight == 2
