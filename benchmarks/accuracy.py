@@ -196,9 +196,10 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
             moved = float(np.linalg.norm(body))
             kinds = [kind(push.before, push.action, slot) for push in pushes]
             best = min(kinds, key=("hit", "graze", "miss").index)
-            groups = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
-            before, seen = first.before.centers[slot], last.after.centers[slot]
             begun = all(push.begun for push in pushes)
+            groups = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
+            groups += ("all pushes begun",) if begun else ()
+            before, seen = first.before.centers[slot], last.after.centers[slot]
             for floor, again in (("hidden", first.replayed), ("place", first.displaced)):
                 stayed = again[ahead][np.isfinite(again[ahead][:, slot, 2]), slot]
                 if len(stayed):
