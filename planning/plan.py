@@ -10,10 +10,10 @@ from models.state import State
 
 
 class Evidence(NamedTuple):
-    """What planning as inference says about its own sample of plans (`planner.optimizer=smc`).
+    """Estimates of planning as inference, and their reliability (`planner.optimizer=smc`).
 
-    Z is the expected exp(return / temperature) of a plan from the prior. A low effective sample size says that few
-    plans carry all the weight, so neither Z nor the sample can be relied on.
+    Z is the expected exp(return / temperature) of a plan from the prior. With a low effective sample size few plans
+    carry all the weight, and neither Z nor the sample is reliable.
     """
 
     log_evidence: Tensor  # [B] float64: the logarithm of the estimate of Z; -inf if every weight was zero
@@ -23,9 +23,9 @@ class Evidence(NamedTuple):
 
 
 class Prospects(NamedTuple):
-    """What the search for a plan tells about its chances, by the way; NaN where a planner does not know it.
+    """By-products of a search that help to predict success; NaN where a planner does not compute one.
 
-    `Plan.expected_success`, `expected_return` and `segments` tell more.
+    `Plan.expected_success`, `expected_return` and `segments` are further predictors.
     """
 
     reaching: Tensor  # [B] share of all candidates that reach the goal by the model, as far as they were rolled out

@@ -36,7 +36,7 @@ class DynamicsModel(Protocol):
 
 @runtime_checkable
 class SampledDynamics(Protocol):
-    """Dynamics that say how sure they are: `planner.robustness.outcomes=sampled`."""
+    """Dynamics with a predictive distribution: `planner.robustness.outcomes=sampled`."""
 
     def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
         """A sample of f(s'' | s, a): `[...]`, which `uniform: [..., M, 2]` in [0, 1) determines."""
@@ -188,7 +188,7 @@ class PathReward(RewardFunction, Protocol):
 
 
 class WayToGoal(Protocol):
-    """The way that is left to the goal, for guidance beyond the horizon."""
+    """The remaining distance to the goal along allowed places, for guidance beyond the horizon."""
 
     def __call__(self, centers: Tensor, mask: Tensor, /) -> Tensor:
         """Metres left: `[...]`, from `centers: [..., M, 3]` metres and `mask: [..., M]` bool; 0 at the goal."""
@@ -199,7 +199,7 @@ class WayToGoal(Protocol):
 
 @runtime_checkable
 class GuidingReward(RewardFunction, Protocol):
-    """A reward function that knows the way to the goal."""
+    """A reward function that knows the remaining distance to the goal."""
 
     @property
     def way(self) -> WayToGoal:

@@ -1,4 +1,4 @@
-"""Goals of rearranging: from files or at random, and which place is whose."""
+"""Goals of rearranging, from files or at random, and their assignment to objects."""
 
 from __future__ import annotations
 

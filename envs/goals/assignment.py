@@ -1,4 +1,4 @@
-"""Which place is whose: each object goes where a goal shows one that looks like it."""
+"""Assignment of a goal's places to objects of similar shape."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from envs.goals.goal import Goal
 from envs.markings import Place
 from envs.observation import Observation
 
-SHAPE_WEIGHT = 100.0  # metres of way that one metre of difference in shape is worth; docs/measurements/success.md
+SHAPE_WEIGHT = 100.0  # metres of distance that one metre of shape difference is worth; docs/measurements/success.md
 
 
 def assign(observation: Observation, goal: Goal) -> tuple[Place, ...]:
     """A place (x, y) in metres for each object of an episode's first observation, in the objects' order.
 
-    The assignment of least cost, where an object and a place cost the way between them, plus `SHAPE_WEIGHT` times the
-    difference of their `outlines`. A millimetre of height or length so outweighs 10 cm of way; objects that look
-    the same take the nearest places.
+    The assignment of least cost: the distance of an object and a place, plus `SHAPE_WEIGHT` times the difference of
+    their `outlines`. So a millimetre of height or length costs as much as 10 cm of distance, and objects of equal shape
+    take the nearest places.
 
     Args:
         goal: with as many objects as the observation.
@@ -31,7 +31,7 @@ def assign(observation: Observation, goal: Goal) -> tuple[Place, ...]:
 
 
 def outlines(clouds: NDArray[np.floating]) -> NDArray[np.float64]:
-    """What of clouds [n, P, 3] metres does not change as an object turns on the table, [n, 3] metres.
+    """Measures of clouds [n, P, 3] metres that are invariant to rotation on the table, [n, 3] metres.
 
     These are the height of the top, and the standard deviations of the points along their longer and their shorter axis
     in the plan view.

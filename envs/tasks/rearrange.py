@@ -28,11 +28,11 @@ LEAST_TOLERANCE = 0.01  # metres; a planner's margin leaves at least this
 class Rearrange(Task):
     """Push every object to its place, in any order. Only falls off the table are forbidden.
 
-    Places are of centres, as the camera observes them: the mean of an object's visible points. Orientations do not
-    count. Which place is whose is decided once, when the episode starts: places that a file shows go to the objects
-    that look most alike, and among objects that look the same to the nearest ones (`envs.goals.assign`). Deciding again
-    after every push, by the best assignment of the moment, would let two objects that look alike trade places, but
-    noise in their outlines could then also swap objects that differ. A random goal samples a place for each object.
+    Places are for centres as observed: the mean of an object's visible points. Orientations do not count. Places in a
+    file are assigned once, when the episode starts, to the objects of the most similar shape, and among objects of
+    equal shape to the nearest ones (`envs.goals.assign`). A new assignment after every push would let two objects of
+    equal shape trade places, but noise in the outlines could then also swap objects that differ. A random goal samples
+    a place for each object.
 
     A margin makes the tolerance smaller for planners.
 

@@ -51,11 +51,11 @@ class Outcome(NamedTuple):
 
 
 class WayToGoal:
-    """The way that is left to a task's goal: of the target, or of all objects together, as the task is `about`.
+    """The remaining distance to a task's goal: of the target, or the sum over all objects, as the task is `about`.
 
-    It comes from the task's own rules for a single object: it may be where no rule is broken, and it has arrived
-    where the task is solved. Other objects are not in its way. Where each object has a goal of its own, it is the
-    distance that the task's `potential` tells.
+    It follows from the task's rules for a single object, which may be where no rule is broken, and has arrived where
+    the task is solved. Other objects do not block it. If each object has a goal of its own, it is the distance in the
+    task's `potential`.
     """
 
     def __init__(self, reward: TaskReward) -> None:
@@ -154,7 +154,7 @@ class TaskReward:
 
     @cached_property
     def way(self) -> WayToGoal:
-        """The way that is left to the goal, for planners; the margin counts. Takes about 0.1 s, once."""
+        """The remaining distance to the goal, for planners, with the margin. Computing it takes about 0.1 s, once."""
         return WayToGoal(self)
 
     @property

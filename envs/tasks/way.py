@@ -1,7 +1,7 @@
-"""The way that is left to the goal, along the places where an object may be: computed once, looked up for any points.
+"""The remaining distance to the goal along allowed places: a distance field, computed once and interpolated anywhere.
 
-A goal may lie farther away than a planner looks ahead. The straight distance then leads astray: on a bridge in the
-shape of a U, the end is near the start. The length of the shortest way that breaks no rule does not.
+A goal may lie beyond a planner's horizon. The straight distance is then misleading: on a U-shaped bridge the end is
+near the start. The length of the shortest path that breaks no rule is not.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _FIRST = tuple(low + SPACING / 2 for low in TABLE_LOW)
 
 
 class WayField:
-    """Length of the shortest way from each point of the table to the nearest goal point, along allowed points.
+    """Length of the shortest path from each point of the table to the nearest goal point, along allowed points.
 
-    From a point that is not allowed, or without such a way, it is the shortest way that then leads through places that
-    are not allowed. Between the points of the grid it is bilinear. Without a goal point it is 0 everywhere.
+    From a point that is not allowed, or without such a path, it is the length of the shortest path that also crosses
+    forbidden places. Between the points of the grid it is bilinear. Without a goal point it is 0 everywhere.
 
     Args:
         allowed, goal: which points of the `grid()` are, [rows, columns] bool.
@@ -55,7 +55,7 @@ class WayField:
         return moved
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Metres of way left from points [..., 2]: [...]. Off the table it is that of the nearest point on it."""
+        """Remaining metres from points [..., 2]: [...]; off the table, those of the nearest point on it."""
         first, last = self._first.to(points), self._last.to(points)
         places = ((points - first) / SPACING).nan_to_num(0.0).clamp(min=0.0).minimum(last)
         corner = places.floor()

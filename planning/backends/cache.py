@@ -27,7 +27,7 @@ MOST = 256  # files, of one to two megabytes each; those that were not used for 
 
 
 class UnsafeFolderError(OSError):
-    """A folder in which native code must not lie, in one line."""
+    """A folder that is unsafe for native code; the message is one line."""
 
 
 def default_folder() -> Path:
@@ -80,7 +80,7 @@ class CodeCache:
         return library
 
     def store(self, key: str, code: bytes) -> None:
-        """Keep a library, at once or not at all. Raises OSError, for example where the disk is full."""
+        """Store a library atomically. Raises OSError, for example if the disk is full."""
         descriptor, name = tempfile.mkstemp(dir=self.folder, prefix=f"{key}.", suffix=".partial")
         try:
             with os.fdopen(descriptor, "wb") as file:
@@ -140,7 +140,7 @@ def _check(folder: Path) -> None:
 
 
 def _complaint(status: os.stat_result) -> str | None:
-    """What is wrong with who may write a file or a folder, where the platform tells."""
+    """Why other users could change a file or a folder; None if they cannot, or the platform does not say."""
     if not hasattr(os, "geteuid"):
         return None
     if status.st_uid != os.geteuid():

@@ -45,13 +45,13 @@ class Compiled:
     """Native code, which torch's AOTInductor writes when a function is first called with its constants and shapes.
 
     This takes one or two minutes for the four or five functions of a planner. The code is kept in a folder of the
-    user's (`planning.backends.cache`), where later processes find it by a key of everything that decides it. Weights
+    user's (`planning.backends.cache`), where later processes find it by a key of everything that determines it. Weights
     become part of the code: they must not change afterwards.
 
     Matrix products of factors rounded to bfloat16 (torch's float32 precision "medium" or "high") are computed on
     tensors of bfloat16, so their results are rounded as well; with "highest" everything is float32.
 
-    Without such a folder, or for constants that cannot be digested, code is made for this process only.
+    Without such a folder, or for constants without a fingerprint, it compiles for this process only.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -124,7 +124,7 @@ class Compiled:
         return _Native(library, function.form())
 
     def _library(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> Library | None:
-        """From the cache, or made and put there; None where there is no cache, or it cannot take this function."""
+        """Loaded from the cache, or compiled and stored there; None without a cache or if it cannot store it."""
         if self._cache is None:
             return None
         try:
@@ -171,7 +171,7 @@ def _say(line: str) -> None:
 
 @cache
 def _circumstances() -> tuple[str, ...]:
-    """What else decides native code: versions, options, and this machine."""
+    """What else determines native code: versions, options, and this machine."""
     processor: Any = sorted((name, value) for name, value in torch.cpu.get_capabilities().items() if name not in COUNTS)
     with suppress(OSError):  # compilers are told to use all that this machine has, which Linux lists
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

@@ -1,4 +1,4 @@
-"""CAVIN's model without its two levels: the cascade's codes, searched together (what the hierarchy is worth)."""
+"""CAVIN's model without its two levels: an ablation that searches the codes of the cascade together."""
 
 from __future__ import annotations
 

@@ -27,11 +27,11 @@ class PushSearch(SearchingPlanner):
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
 
     Our additions, as in `CavinPlanner`: `warm_start`, `robustness`, `idle_distance` and `touchdown_distance`. There is
-    no subgoal to come close to, so perturbed rollouts of the executed segment only tell how often it fails. The chosen
-    sequence has the highest return minus `failure_cost / RETURN_WEIGHT` times the share of failed rollouts. By default
-    that is 200 times the share: a failure earns -100 where a sequence that reaches the goal promised +100. So the score
-    of a sequence that promises success is about its expected return. Sequences that reach the goal come first: the
-    rollouts of others may have stopped early, so their returns do not compare, and pushes that do nothing never fail.
+    no subgoal, so perturbed rollouts only estimate how often the executed segment fails. The chosen sequence has the
+    highest return minus `failure_cost / RETURN_WEIGHT` times the fraction of failed rollouts. By default this is 200
+    times the fraction, because a failure earns -100 instead of the +100 at the goal. So the score of a sequence with
+    predicted success is about its expected return. Sequences that reach the goal rank first: the rollouts of others may
+    have stopped early, so their returns are not comparable, and pushes that do nothing never fail.
     """
 
     has_codes: ClassVar[bool] = False  # the space searches motion codes

@@ -32,8 +32,8 @@ class SectarPlanner(SearchingPlanner):
     has one motion here, so perturbed rollouts compare effect plans: of those that reach the goal, the
     `robustness.candidates` with the highest return. Their cost is the distance of the pushes' outcome to the plan's own
     first subgoal and `failure_cost` for failures, as in `CavinPlanner`, minus `RETURN_WEIGHT` times the return. Without
-    the return the pushes that do least would win, since they come closest to their own subgoals. For the same reason,
-    where no plan reaches the goal, the one with the highest return is chosen, as without this addition.
+    the return, the pushes that move least would win, because they end closest to their own subgoals. For the same
+    reason, where no plan reaches the goal, the one with the highest return is chosen, as without this addition.
 
     model: p(c | s), h, g without motion codes, f. For the options see `CavinPlanner`. Raises ValueError for counts
     below 1, a horizon that T does not divide, and unknown names.

@@ -1,8 +1,8 @@
 """Another effect where no motion moves anything (our addition to Algorithm 1, between lines 10 and 7).
 
-Line 7 chooses an effect without knowing whether a motion brings it about. Where an obstacle takes the place from which
-the target would have to be pushed, f lets every motion without a failure move nothing, and the next plan chooses the
-same effect again.
+Line 7 chooses an effect without checking that a motion can achieve it. If an obstacle occupies the place from which to
+push the target, f predicts that no motion without a failure moves anything, and the next plan chooses the same effect
+again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from planning.plan import Plan
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.ranking import best_of
 
-EFFECT = 0.02  # metres; an effect that moves an object so far asks for a motion
+EFFECT = 0.02  # metres; an effect that moves an object farther needs a motion that moves something
 SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objects together
 
 

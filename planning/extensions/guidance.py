@@ -1,13 +1,13 @@
 """Guidance beyond the horizon (our addition to Algorithm 1, lines 7 and 10, and to the baselines).
 
-Under sparse rewards all plans that miss the goal have one return, so nothing tells them apart. Guidance adds a value to
-each, from a potential (Ng, Harada and Russell, ICML 1999): minus the way that a state leaves to the goal. It is 0 at
-the goal and nowhere positive, so the order among plans that reach the goal, and their lead over all others, stay. A
-failed plan gets the lowest potential of the layout, so a plan that fails gains on no other plan.
+Under sparse rewards all plans that miss the goal have the same return. Guidance adds a value to each, from a potential
+(Ng, Harada and Russell, ICML 1999): minus the remaining distance to the goal along allowed places. It is 0 at the goal
+and nowhere positive, so plans that reach the goal keep their order and rank first. A failed plan gets the lowest
+potential of the layout, so guidance never prefers it to another plan.
 
-The value is the expected potential where a plan breaks off, if it goes on after each segment with probability
-`CONTINUES`, and else ends in its last state. The last state's potential alone would not tell when a plan makes its way:
-such plans wait, and do so again in the next plan.
+The value is the expected potential of the state where a plan stops: it continues after each segment with probability
+`CONTINUES`, at most to its last state. The last state's potential alone would not reward early progress: plans would
+wait, in every plan again.
 """
 
 from __future__ import annotations

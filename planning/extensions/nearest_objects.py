@@ -14,8 +14,8 @@ from planning.protocol import RewardFunction, TargetedReward
 class NearestObjects(NamedTuple):
     """The target and the m - 1 objects nearest to it, of M.
 
-    h, g and the priors read and move only these, so that a model meets no more objects than in its training. f still
-    predicts all M: an object that is left out can be in the way of a push.
+    h, g and the priors read and move only these, so they read no more objects than in training. f still predicts all M,
+    because an excluded object can obstruct a push.
     """
 
     numbers: Tensor | None = None  # [B, m] int64, ascending: the target, object 0, comes first; None for all objects

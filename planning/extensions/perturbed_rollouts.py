@@ -22,7 +22,7 @@ from planning.rollouts.segment import actions_of
 
 QUARTER = 4  # one in four candidates continues in the next round, with four times as many rollouts
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
-# metres, is then worth 200: a failure earns -100 where a plan that reaches the goal promised +100.
+# metres, is then worth 200: a failure earns -100 instead of the +100 at the goal.
 RETURN_WEIGHT = 0.0015
 OUTCOMES = ("perturbed", "sampled")
 
@@ -31,8 +31,8 @@ OUTCOMES = ("perturbed", "sampled")
 class PerturbedRollouts:
     """Ranks the best motions by rollouts with perturbed pushes and perturbed outcomes.
 
-    The best of a thousand motions is often one about which f errs: a push that just meets the object according to f,
-    and just misses it on the table. A perturbed start reveals such pushes. The error of f also grows with the distance
+    The best of a thousand motions often exploits an error of f: a push just meets the object according to f, and just
+    misses it on the table. A perturbed start reveals such pushes. The error of f also grows with the distance
     that an object moves: a long push past a forbidden place fails more often than a short one.
 
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best quarter
@@ -42,8 +42,8 @@ class PerturbedRollouts:
     rollouts: of each candidate in the first round.
     rounds: of equally many rollouts in total, for fewer and fewer candidates; 1 gives every candidate the same number.
     outcomes: `perturbed`, with the two noises below, or `sampled` from f's own predictive distribution, push by push.
-        A sampled rollout goes on from where it came, its distance to the subgoal is its own, and its pushes start where
-        they should.
+        A sampled rollout continues from its own samples, which also give its distance to the subgoal; its pushes start
+        unperturbed.
     start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
     outcome_noise: standard deviation, in x and in y, of an object's centre after a push, per metre of its predicted
         move. The perturbed centres decide whether a rollout fails; its distance to the subgoal is that of f's

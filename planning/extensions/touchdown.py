@@ -1,7 +1,7 @@
 """No push that would touch down on an object (our addition to Algorithm 1, line 10, and to the baselines).
 
-A robot does not begin such a push. f has seen them fail in its data, but reads an object's centre and feature only, and
-of a thousand motions the search finds those about which f errs. The camera sees where the objects are.
+A robot does not execute such a push. f's training data contain such failures, but f reads an object's centre and
+feature only, and the search exploits its errors. The observed points show where the objects are.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def prefer_free(scores: Tensor, pushes: Tensor, observed: ObservedPoints | None,
     """Scores `[B, N]` that leave out candidates whose first push would touch down on an object.
 
     pushes: `[B, N, 4]`, the first of each candidate. observed: None where nothing is known. distance: metres between
-    the push's start and a point; 0 leaves out none. Where nothing would be left, the scores stay as they are. The
-    baselines' searches may have stopped before the others' ends, so their scores are those up to there.
+    the push's start and a point; 0 leaves out none. If none would be left, the scores stay as they are. The
+    baselines' searches may have stopped early, so the scores of their other candidates are partial.
     """
     if observed is None or not distance or observed.points.shape[1] == 0:
         return scores

@@ -1,7 +1,7 @@
-"""What may lead sequential Monte Carlo to good plans: proposal distributions of noise, and values of states.
+"""Proposal distributions of noise and values of states, which steer sequential Monte Carlo to good plans.
 
-Neither changes what is estimated. Weights divide out both: each segment's by prior / proposal, and a value by the value
-of the next segment. A bad proposal or value costs effective samples, and nothing else.
+Neither changes the estimated quantity. The weights divide out both: each segment's by prior / proposal, and a value by
+the value of the next segment. A bad proposal or value only costs effective samples.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from planning.rollouts.sampling import noise_each, sample
 class NoiseProposal(Protocol):
     """A distribution of the next segment's noise, in place of the prior N(0, I): a guide for plans.
 
-    It gives a distribution, never a weight: the optimizer samples it and computes the weight from its density, so the
-    weights are right whatever it is, if its density is positive everywhere.
+    It returns a distribution, and the optimizer computes the weight from its density. So the weights are correct for
+    any proposal whose density is positive everywhere.
     """
 
     def __call__(self, segment: int, plans: State, noise: Tensor, warm_start: Tensor | None) -> Distribution | None:
@@ -37,9 +37,9 @@ class NoiseProposal(Protocol):
 
 
 class Value(Protocol):
-    """The return that a plan may still earn, learned or guessed: a twisting function, in units of return.
+    """An estimate of a plan's later return, in units of return: a twisting function, learned or heuristic.
 
-    The best is `temperature * log E[exp(later return / temperature)]`.
+    The optimum is `temperature * log E[exp(later return / temperature)]`.
     """
 
     def __call__(self, segment: int, plans: State) -> Tensor:

@@ -29,7 +29,7 @@ SCHEDULES = ("constant", "linear")
 class SequentialMonteCarlo:
     """Extends, weights, resamples and moves particles, a segment at a time.
 
-    After segment k of K the particles stand for p(codes) exp((return so far + value) / temperature_k). A segment's
+    After segment k of K the particles target p(codes) exp((return so far + value) / temperature_k). A segment's
     weight is the ratio of this to the one before, times prior / proposal. Z is the normalising constant after segment
     K: the prior's expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight
     since the last resampling, is in the plan's `evidence`.

@@ -232,7 +232,7 @@ class Candidates:
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
 
     def in_full(self) -> Candidates:
-        """The same candidates with the same numbers, each to its own end: for whoever reads more than the best one.
+        """The same candidates and numbers, each rolled out to its end, for callers that read more than the best one.
 
         Those that were not reparameterised are returned as they are.
         """

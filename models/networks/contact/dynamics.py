@@ -1,4 +1,4 @@
-"""Dynamics that see contact: each object's outline, read in the frame of the push."""
+"""Contact-aware dynamics: they read each object's outline in the frame of the push."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _components_first(values: Tensor, ranks: int) -> Tensor:
 
 
 def _components_last(values: Tensor) -> Tensor:
-    """`[C, M, ...]` -> `[..., M, C]`, contiguous, for whoever multiplies it next. Two copies are faster than one."""
+    """`[C, M, ...]` -> `[..., M, C]`, contiguous, for the next matrix product. Two copies are faster than one."""
     return values.flatten(1).T.contiguous().unflatten(0, values.shape[1:]).movedim(0, -2).contiguous()
 
 
