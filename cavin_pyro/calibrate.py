@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("calibrate")
 def main(config: DictConfig) -> None:
-    """Fit a trained guide to windows that its model generates, so that its intervals hold what they say."""
+    """Fit a trained guide to windows that its model generates, so that its intervals have their nominal coverage."""
     import pyro
 
     from cavin_pyro.config.device import choose_device

@@ -9,9 +9,9 @@ from cavin_pyro.config.application import command
 
 @command("reproduce")
 def main(config: DictConfig) -> None:
-    """Run the paper's experiments from nothing: collect, pretrain, train four methods, evaluate every cell, draw.
+    """Run the paper's experiments from scratch: collect, pretrain, train four methods, evaluate every cell, draw.
 
-    Resumes what was interrupted, and never does again what is finished.
+    Resumes an interrupted run, and skips finished work.
     """
     from pathlib import Path
 

@@ -15,7 +15,7 @@ class UserError(Exception):
 
 
 class WorkerError(UserError):
-    """A worker process was killed or stopped: nobody's input is bad, and the same command may succeed."""
+    """A worker process was killed or stopped: the input may be valid, and the same command may succeed."""
 
     status = 1
 

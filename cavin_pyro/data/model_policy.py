@@ -1,9 +1,8 @@
-"""Pushes by a trained cascade, to collect data where its f is asked: among motions that it takes for the best.
+"""Pushes by a trained cascade, to collect data where planners query its f: at the motions with the best predictions.
 
-A planner picks of a thousand motions the one with the best prediction, and so those about which f errs. The heuristic
-makes few such pushes. Rounds of collection with the model, and training on them, show f what came of its choices
-(Ross, Gordon and Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret online
-learning").
+A planner that picks the best of a thousand motions exploits errors of f, and the heuristic makes few such pushes.
+Dataset aggregation corrects them: collect with the model, and train f on the outcomes (Ross, Gordon and Bagnell 2011,
+"A reduction of imitation learning and structured prediction to no-regret online learning").
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class PushingPolicy(Protocol):
 
 
 class ModelPushingPolicy:
-    """One segment of Algorithm 1 without a task: an effect of the prior, and the motion that by f comes nearest to it.
+    """One segment of Algorithm 1 without a task: an effect, and the motion that f predicts nearest to its subgoal.
 
     c ~ p(c | s); z_n ~ p(z | s, c), a_n = mean of g, for n = 1, ..., N; the T pushes of the best n by line 10, of those
     whose first push touches down on no object. Then it observes the table and begins again.

@@ -1,4 +1,4 @@
-"""How often a plan asks its model: rows of states and codes (or pushes) that h, g, f and the priors are called with."""
+"""How often a plan evaluates its model, in rows of states and codes (or pushes) passed to h, g, f and the priors."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class CountingModel:
 def count_evaluations(config: DictConfig) -> dict[str, int]:
     """The rows of the first plan of the scene `config.seed`, by part of the model; `config` is one of `evaluate`.
 
-    A row is one state with one code or push: a plan of T pushes asks f for T rows. Later plans may ask for fewer or
-    more, since searches stop early. Compiled planners ask for as many rows as eager ones, so `planner.compile` is
+    A row is one state with one code or push: a plan of T pushes evaluates T rows of f. Later plans may need fewer or
+    more, because searches stop early. Compiled planners evaluate as many rows as eager ones, so `planner.compile` is
     ignored. All are zero for a planner without a model.
 
     Raises:

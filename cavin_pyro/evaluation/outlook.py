@@ -1,4 +1,4 @@
-"""Whether plans reach the goal by the model, in one line: a search that finds no way pushes at random."""
+"""Whether plans reach the goal according to the model, in one line: without such a plan, pushes are random."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def outlook_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
         return ""
     if row["hopeful_plans"]:
         return f"{row['hopeful_plans']} of {row['plans']} plans reached the goal by the model"
-    return f"no plan reached the goal by the model, so the pushes were not led there: {_advice(config)}"
+    return f"no plan reached the goal by the model, so no push was aimed at it: {_advice(config)}"
 
 
 def outlook(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:

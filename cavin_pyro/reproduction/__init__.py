@@ -1,1 +1,1 @@
-"""The paper's experiments from nothing: stages, cells, table of episodes, statistics and figures."""
+"""The paper's experiments from scratch: stages, cells, table of episodes, statistics and figures."""

@@ -1,4 +1,4 @@
-"""The pipeline: what is finished is never done again, and a killed run goes on where it stopped."""
+"""The pipeline: a killed run resumes where it stopped, without repeating finished work."""
 
 from __future__ import annotations
 

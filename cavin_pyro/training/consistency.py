@@ -31,7 +31,7 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     and the term is -log of the mean over k of the density of `reached` over its largest value: 0 if all motions reach
     the subgoal. For K motions it is an upper bound of that of all. Its gradient reaches p(z | s, c) alone, as the
     sum over k of w_k grad log p(z_k | s, c), where w_k are the normalised densities (Bornschein and Bengio 2015,
-    "Reweighted wake-sleep"): no gradient passes through f, whose errors it would look for.
+    "Reweighted wake-sleep"): no gradient passes through f, whose errors it would exploit.
 
     Args:
         window: `[B]`, whose first states are read. motions: K. windows: how many of the B are taken, the first; their

@@ -1,7 +1,7 @@
-"""How far f is off where it reads its own predictions, as in planning: a term of the objective beside the bound.
+"""The error of f's multi-step rollouts, as in planning: a term of the objective beside the bound.
 
 The bound scores each push from the state that was observed before it. A plan's later pushes start from predictions,
-whose errors grow, and nothing in the bound tells f to keep them small.
+whose errors grow, and the bound does not penalise these.
 """
 
 from __future__ import annotations

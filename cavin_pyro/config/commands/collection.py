@@ -31,8 +31,8 @@ class CollectionOptions:
     )
     policy: str = option(
         "heuristic",
-        "what chooses the pushes; model takes effects of a checkpoint's prior, and of its motions for each the one "
-        "that comes nearest by its f",
+        "what chooses the pushes; model samples effects from a checkpoint's prior, and for each takes the motion that "
+        "f predicts nearest to the subgoal",
         choices=POLICIES,
         group="policy",
     )
@@ -43,7 +43,7 @@ class CollectionOptions:
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
     maximum_objects: int = option(
         OBJECT_SLOTS,
-        f"objects on the table, at most; with more than {OBJECT_SLOTS} the files have room for so many",
+        f"objects on the table, at most; files are padded to this number, or to {OBJECT_SLOTS} if it is less",
         group="data",
     )
     episodes_per_shard: int = option(

@@ -24,7 +24,7 @@ class CheckConfig:
         f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train",
         group="model",
     )
-    a: str | None = option(None, "a checkpoint to lay beside b, instead of checkpoint", group="model")
+    a: str | None = option(None, "a checkpoint to compare with b, instead of checkpoint", group="model")
     b: str | None = option(None, "the other: both are checked on windows that neither was trained on", group="model")
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
     data: Any = option("data/pushes", f"{DATA}; preferably the model's training data", group="data")

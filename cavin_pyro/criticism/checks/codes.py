@@ -151,7 +151,7 @@ def _verdict(values: dict[str, Any], codes: tuple[str, ...], episodes: Tensor) -
         f"Good if every code has an active dimension and costs more than {USED:g} nats at the lower end of its 95 % "
         f"interval over episodes; bad if one costs less than {UNUSED:g} at the upper end: it has collapsed."
     )
-    advice = "A code that costs nothing says nothing: lower the weight of its KL early in training, or leave it out."
+    advice = "A code without cost carries no information: lower the weight of its KL early in training, or remove it."
     windows = values["windows"]["dimensions"]
     return conclude(worst(levels), rule, advice, windows=windows, episodes=episodes)
 

@@ -89,7 +89,7 @@ def _verdict(numbers: Mapping[str, Any], name: str, scenes: int) -> Verdict:
     if "relative" not in numbers:
         return Verdict(NONE, "The model has no subgoals.")
     level = grade(numbers["low"], numbers["high"], good=NEAR, bad=FAR)
-    advice = "Where f expected less to be left, f is too hopeful: plan with planner.robustness or more perturbed data."
+    advice = "If f expected less to be left, f is too optimistic: plan with planner.robustness or more perturbed data."
     return Verdict(level, rule, advice if level != GOOD else "")
 
 

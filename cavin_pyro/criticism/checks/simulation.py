@@ -128,7 +128,7 @@ def _verdict(values: dict[str, Any], codes: tuple[str, ...], episodes: Tensor) -
     )
     advice = (
         "Too narrow: run calibrate, or train longer, or with guide=joint or guide=flow. If the deviation goes away "
-        "without noise in the features, mend their scale (scales=learned) instead."
+        "without noise in the features, correct their scale (scales=learned) instead."
     )
     return conclude(level, rule, advice, windows=len(episodes), episodes=episodes)
 

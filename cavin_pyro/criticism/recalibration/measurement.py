@@ -36,11 +36,11 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int, repeats:
         repeats: windows that are simulated from each first state.
 
     Returns:
-        `windows`, `simulated`, `episodes`; of simulated windows what 90 % intervals hold, by code: `held` over all
-        dimensions, `held_informed` over those that learn from the window (`informed` of `dimensions`), `held_worst` in
-        the dimension that holds least, and `joint`, of the region of highest density. Of real windows `minus_elbo`, in
-        nats, and `subgoal_held`, of the centres that moved, in 90 % intervals of h's predictions with codes of the
-        guide; None without h, or if nothing moved.
+        `windows`, `simulated`, `episodes`; of simulated windows the coverage of 90 % intervals, by code: `held` over
+        all dimensions, `held_informed` over those that learn from the window (`informed` of `dimensions`), `held_worst`
+        in the dimension of least coverage, and `joint`, of the region of highest density. Of real windows
+        `minus_elbo`, in nats, and `subgoal_held`, the coverage of the centres that moved by 90 % intervals of h's
+        predictions with codes of the guide; None without h, or if nothing moved.
     """
     window, episodes = context.held_out(windows)
     first, simulated_from = from_same_starts(window, episodes, repeats)

@@ -80,7 +80,7 @@ def _damage(path: Path, names: tuple[str, ...], metadata: Mapping[str, Any], arr
 
 
 def _disagreements(arrays: Arrays, number: int, known: EpisodeNumbers, metadata: Mapping[str, Any]) -> Iterator[str]:
-    """What readable arrays of a shard say that others, or the metadata, deny."""
+    """Contradictions between readable arrays of a shard, other shards and the metadata."""
     if "episode" in arrays:
         try:
             known.add(number, arrays["episode"])

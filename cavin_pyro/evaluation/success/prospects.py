@@ -1,4 +1,4 @@
-"""What a plan tells about the success of its episode: numbers, by-products of planning, kept in the episode's row."""
+"""By-products of planning that help to predict the success of an episode, stored in the episode's row."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def row(plans: int, hopeful: int, outcome: str = "timeout") -> dict[str, Any]:
 def test_an_episode_in_which_no_plan_reached_the_goal_says_so_and_what_to_try() -> None:
     config = compose("plan", "reward=sparse")
     said = outlook_of_episode(row(20, 0), config)
-    assert said == f"no plan reached the goal by the model, so the pushes were not led there: {ADVICE} or reward=dense"
+    assert said == f"no plan reached the goal by the model, so no push was aimed at it: {ADVICE} or reward=dense"
     guided = outlook_of_episode(row(20, 0), compose("plan", "planner.guidance=layout"))
     assert guided.endswith("horizon=30 pushes; try a longer one or reward=dense")
     assert outlook_of_episode(row(20, 3), config) == "3 of 20 plans reached the goal by the model"

@@ -1,7 +1,8 @@
 """Simulation-based calibration of a guide: codes from the prior, windows from the program, codes from the guide.
 
 Talts, Betancourt, Simpson, Vehtari and Gelman, "Validating Bayesian inference algorithms with simulation-based
-calibration", 2018. The posterior of a simulated window must hold its own code as often as it says, on average.
+calibration", 2018. On average, posterior intervals of a simulated window must cover its own code at their
+nominal rate.
 """
 
 from __future__ import annotations
@@ -83,13 +84,13 @@ def calibrate(
 
 
 def held(ranks: Tensor, level: float, episodes: Tensor) -> Interval:
-    """How much central intervals of a level hold, by ranks `[B, D]` or `[B]`: the mean over dimensions."""
+    """Coverage of central intervals of a level, by ranks `[B, D]` or `[B]`: the mean over dimensions."""
     inside = ((ranks - 0.5).abs() <= level / 2).double()
     return mean_interval(inside.flatten(1).mean(1) if inside.dim() > 1 else inside, episodes)
 
 
 def held_jointly(joint: Tensor, level: float, episodes: Tensor) -> Interval:
-    """How much the region of highest density of a level holds, by `Calibration.joint`."""
+    """Coverage of the region of highest density of a level, by `Calibration.joint`."""
     return mean_interval((joint <= level).double(), episodes)
 
 

@@ -24,7 +24,7 @@ def energy_test(
 
     2 E|x - y| - E|x - x'| - E|y - y'|, divided by 2 E|x - y|. Permutations exchange x and y within rows: what rows
     have in common (the state that both codes belong to) stays as it is, so the test holds for priors that depend on the
-    state as well. But it compares the two heaps of codes alone: a prior whose codes belong to other states passes.
+    state as well. But it compares the marginal samples only: a prior whose codes belong to other states passes.
     The p-value is at least 1 / (permutations + 1).
 
     Args:
