@@ -35,6 +35,8 @@ class PerturbedRollouts:
     misses it on the table. A perturbed start reveals such pushes. The error of f also grows with the distance
     that an object moves: a long push past a forbidden place fails more often than a short one.
 
+    The defaults are those of the baselines; `planning.cavin.FEW_CANDIDATES` are those of `planner=cavin`.
+
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best quarter
     continues, with four times as many rollouts each.
 
