@@ -30,8 +30,7 @@ from planning.rollouts.segment import Objective, SegmentRollout, actions_of, sel
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
-# Motions are sampled for one effect, and most bring it about: few of them and one round are enough.
-FEW_CANDIDATES = PerturbedRollouts(candidates=32, rollouts=8, rounds=1)
+FEW_CANDIDATES = PerturbedRollouts(candidates=64)  # motions are sampled for one effect, and most bring it about
 
 
 class CavinPlanner(SearchingPlanner):
@@ -45,8 +44,8 @@ class CavinPlanner(SearchingPlanner):
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
-    motion_samples: how many motions to sample at line 8: N in the paper; None takes a quarter of N, and 1 leaves
-        nothing to choose at line 10.
+    motion_samples: how many motions to sample at line 8: N in the paper; None takes half of N, and 1 leaves nothing to
+        choose at line 10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
@@ -100,7 +99,7 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        self.motion_samples = max(1, samples // 4) if motion_samples is None else motion_samples
+        self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
         self.motion_optimizer = make_optimizer(motion_optimizer or self.optimizer, samples=self.motion_samples)
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1

@@ -12,10 +12,10 @@ from cavin_pyro.reproduction.methods import WITHOUT_ADDITIONS
 from tests.cavin_pyro.evaluation.test_planner_options import save_untrained
 
 SMALL = ("task=crossing", "objects=2", "planner.samples=8", "planner.horizon=6", "seed=3")
-# Perturbed rollouts: 8 candidates 2 times, the best 2 of them 8 times, the last one 32 times; T pushes each. The 2
-# motions that CAVIN samples for an effect: 8 times each.
+# Perturbed rollouts: 8 candidates 2 times, the best 2 of them 8 times, the last one 32 times; T pushes each. Of the 4
+# motions that CAVIN samples for an effect: 2 times each, and the best one 8 times.
 PERTURBED = 3 * (8 * 2 + 2 * 8 + 1 * 32)
-PERTURBED_MOTIONS = 3 * (2 * 8)
+PERTURBED_MOTIONS = 3 * (4 * 2 + 1 * 8)
 
 
 def count(*overrides: str) -> dict[str, int]:
@@ -33,8 +33,8 @@ def rows(h: int, g: int, f: int, effects: int, motions: int) -> dict[str, int]:
         (("planner=paper", "planner.motion_horizon=first_segment"), rows(16, 8, 24, 16, 8)),
         (("planner=paper", "planner.motion_samples=1"), rows(16, 2, 6, 16, 2)),
         # A dense reward has no upper bound, so no search stops early.
-        (("planner=cavin", "reward=dense"), rows(16, 2, 6 + PERTURBED_MOTIONS, 16, 2)),
-        (("planner=cavin", "reward=dense", "planner.compile=true"), rows(16, 2, 6 + PERTURBED_MOTIONS, 16, 2)),
+        (("planner=cavin", "reward=dense"), rows(16, 4, 12 + PERTURBED_MOTIONS, 16, 4)),
+        (("planner=cavin", "reward=dense", "planner.compile=true"), rows(16, 4, 12 + PERTURBED_MOTIONS, 16, 4)),
         (("planner=mpc", *WITHOUT_ADDITIONS), rows(0, 0, 48, 0, 0)),
         (("planner=mpc", "reward=dense"), rows(0, 0, 48 + PERTURBED, 0, 0)),
         (("planner=cavin_without_effects", *WITHOUT_ADDITIONS), rows(0, 16, 48, 16, 16)),
