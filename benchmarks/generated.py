@@ -61,7 +61,7 @@ def line(cell: Cell, rows: list[dict[str, Any]], others: list[dict[str, Any]] | 
         f"{100 * rate['rate']:.0f} % ({100 * rate['low']:.1f} to {100 * rate['high']:.1f})",
         *(ends.count(name) for name in ("timeout", "violation", "fall")),
         f"{np.mean(pushes):.1f}" if pushes else "-",
-        f"{sum(row['hopeful_plans'] for row in rows) / sum(row['plans'] for row in rows):.0%}",
+        f"{sum(row['plans_reaching_goal'] for row in rows) / sum(row['plans'] for row in rows):.0%}",
     ]
     if others is not None:
         pair = compare(rows, others)

@@ -18,6 +18,7 @@ sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")] 
 
 from omegaconf import OmegaConf
 
+from cavin_pyro.evaluation.rows import with_current_names
 from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.cells import Cell, Evaluation
 from cavin_pyro.reproduction.table import CRITERIA, Row, episode_row, read_table, write_table
@@ -29,8 +30,8 @@ def collected(name: str, folder: Path, training_seed: int) -> list[Row]:
     """Rows of one evaluation."""
     config = OmegaConf.load(folder / "config.yaml")
     cell = Cell("cavin", name, config.task._target_.split(".")[-2], config.reward, config.objects)
-    lines = (folder / "episodes.jsonl").read_text().splitlines()
-    return [episode_row(Evaluation(cell, training_seed, config.seed, len(lines)), json.loads(line)) for line in lines]
+    rows = [with_current_names(json.loads(line)) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    return [episode_row(Evaluation(cell, training_seed, config.seed, len(rows)), row) for row in rows]
 
 
 def main() -> None:

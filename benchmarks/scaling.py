@@ -127,7 +127,7 @@ def push_of_an_episode(episodes: int, first: int) -> float:
 def finished(job: evaluation.Job) -> dict[str, Any]:
     """What an episode of usual length leaves, without the episode."""
     numbers = dict.fromkeys(("return", "strict_return", "subgoal_distance"), 90.919404)
-    counts = dict.fromkeys(("steps", "strict_steps", "unsafe", "ineffective", "plans", "hopeful_plans"), 14)
+    counts = dict.fromkeys(("steps", "strict_steps", "unsafe", "ineffective", "plans", "plans_reaching_goal"), 14)
     outcomes = dict.fromkeys(("outcome", "strict_outcome"), "success")
     return {"seed": job[1], **outcomes, **counts, **numbers, "planning_ms": [20.51] * 14}
 

@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.rows import violation
+from cavin_pyro.evaluation.rows import violation, with_current_names
 from cavin_pyro.storage.run_directory import flat_options, stored_options
 
 SAME_SCENES = (
@@ -83,6 +83,7 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
         ) from error
     except (ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
+    rows = [with_current_names(row) for row in rows] if isinstance(rows, list) else rows
     if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):
         why = "no list of episodes" if not isinstance(rows, list) else wrong
         raise UserError(f"compare={folder} holds damaged results ({why}): evaluate it again")

@@ -131,7 +131,7 @@ def episode_row(episode: Episode) -> Row:
         "unsafe": sum(transition.unsafe for transition in episode.transitions),
         "ineffective": sum(transition.ineffective for transition in episode.transitions),
         "plans": len(episode.plan_records),
-        "hopeful_plans": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
+        "plans_reaching_goal": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
         "prospects": columns_of([record.prospects for record in episode.plan_records]),
         "success_probability": _probabilities(episode),

@@ -17,8 +17,8 @@ def outlook_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
     """One line about an episode's plans, from its row of results; empty for planners that predict nothing."""
     if expects_nothing(config) or not row["plans"]:
         return ""
-    if row["hopeful_plans"]:
-        return f"{row['hopeful_plans']} of {row['plans']} plans reached the goal by the model"
+    if row["plans_reaching_goal"]:
+        return f"{row['plans_reaching_goal']} of {row['plans']} plans reached the goal by the model"
     return f"no plan reached the goal by the model, so no push was aimed at it: {_advice(config)}"
 
 
@@ -27,9 +27,9 @@ def outlook(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
     plans = sum(row["plans"] for row in rows)
     if expects_nothing(config) or not plans:
         return ""
-    hopeful = sum(row["hopeful_plans"] for row in rows)
-    without = [row for row in rows if not row["hopeful_plans"]]
-    line = f"{100 * hopeful / plans:.1f} % of {plans} plans reached the goal by the model"
+    reaching = sum(row["plans_reaching_goal"] for row in rows)
+    without = [row for row in rows if not row["plans_reaching_goal"]]
+    line = f"{100 * reaching / plans:.1f} % of {plans} plans reached the goal by the model"
     if not without:
         return f"{line}, some in each episode"
     failed = sum(row["outcome"] != "success" for row in without)

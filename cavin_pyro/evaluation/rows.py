@@ -57,10 +57,18 @@ LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not writ
     "strict_steps": _count,
     "strict_return": _number,
     "plans": _count,
-    "hopeful_plans": _count,
+    "plans_reaching_goal": _count,
     "prospects": _prospects,
     "success_probability": _probabilities,
 }
+RENAMED = {"hopeful_plans": "plans_reaching_goal"}  # in the files of older versions: old name, new name
+
+
+def with_current_names(row: Any) -> Any:
+    """A stored row under the names of this version; anything else as it is."""
+    if not isinstance(row, Mapping):
+        return row
+    return {name if RENAMED.get(name, name) in row else RENAMED[name]: value for name, value in row.items()}
 
 
 def violation(row: Any) -> str | None:
@@ -92,7 +100,7 @@ def finished_episodes(path: Path) -> dict[int, Row]:
         raise UserError(f"{path} is damaged ({error}): move it away to run its episodes again") from error
     for number, line in enumerate(lines, 1):
         try:
-            row = json.loads(line)
+            row = with_current_names(json.loads(line))
         except (ValueError, RecursionError):
             continue  # cut off by a kill: its episode is run again
         wrong = violation(row)

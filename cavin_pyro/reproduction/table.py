@@ -11,6 +11,7 @@ import pyarrow
 from pyarrow import parquet
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.rows import RENAMED, with_current_names
 from cavin_pyro.reproduction.cells import Evaluation
 from cavin_pyro.storage.files import atomic_write
 
@@ -34,7 +35,7 @@ SCHEMA = pyarrow.schema(
         ("unsafe", pyarrow.int16()),
         ("ineffective", pyarrow.int16()),
         ("plans", pyarrow.int16()),
-        ("hopeful_plans", pyarrow.int16()),  # of these, those that the model expects to reach the goal
+        ("plans_reaching_goal", pyarrow.int16()),  # of these, those that the model expects to reach the goal
         ("subgoal_distance", pyarrow.float64()),  # metres, mean over segments; null for planners without subgoals
     ]
 )
@@ -42,7 +43,7 @@ Row = dict[str, Any]
 
 
 def episode_row(evaluation: Evaluation, row: Mapping[str, Any]) -> Row:
-    """A row of the table from a line of `episodes.jsonl`, of an episode by the published criterion.
+    """A row of the table from a line of `episodes.jsonl` (current names), of an episode by the published criterion.
 
     Times are left out: they differ from run to run.
     """
@@ -57,7 +58,7 @@ def episode_row(evaluation: Evaluation, row: Mapping[str, Any]) -> Row:
         "seed": row["seed"],
         **{f"strict_{name}": row[f"strict_{name}"] for name in ("outcome", "steps", "return")},
         **{f"published_{name}": row[name] for name in ("outcome", "steps", "return")},
-        **{name: row[name] for name in ("unsafe", "ineffective", "plans", "hopeful_plans", "subgoal_distance")},
+        **{name: row[name] for name in ("unsafe", "ineffective", "plans", "plans_reaching_goal", "subgoal_distance")},
     }
 
 
@@ -74,7 +75,10 @@ def read_table(path: Path) -> list[Row]:
         UserError: the file cannot be read, or holds something else.
     """
     try:
-        return list(parquet.read_table(path, schema=SCHEMA).to_pylist())
+        stored = parquet.read_schema(path).names
+        old_names = {new: old for old, new in RENAMED.items() if old in stored}
+        schema = pyarrow.schema([field.with_name(old_names.get(field.name, field.name)) for field in SCHEMA])
+        return [with_current_names(row) for row in parquet.read_table(path, schema=schema).to_pylist()]
     except (OSError, pyarrow.ArrowException) as error:
         why = str(error).splitlines()[0]
         raise UserError(f"{path} is no table of episodes ({why}): give an episodes.parquet of reproduce") from error

@@ -43,10 +43,10 @@ def caption(row: Row, criterion: str) -> str:
     steps, kind = row[f"{criterion}_steps"], kind_of(row, criterion)
     scene = f"scene {row['seed']}, training {row['training_seed']}"
     pushes = f"{steps} push" if steps == 1 else f"{steps} pushes"
-    hope = f"{row['hopeful_plans']} of {row['plans']} plans expected success"
+    predicted = f"{row['plans_reaching_goal']} of {row['plans']} plans expected success"
     reason = {
         "success": f"success after {pushes}",
         "violation": f"failure after {pushes}: a constraint was violated",
         "fall": f"failure after {pushes}: an object left the table",
-    }.get(kind, f"failure: {pushes} were not enough; {hope}")
+    }.get(kind, f"failure: {pushes} were not enough; {predicted}")
     return f"{scene}: {reason}"

@@ -31,9 +31,9 @@ def kind_of(row: Mapping[str, Any], criterion: str) -> str:
     outcome = str(row[f"{criterion}_outcome"])
     if outcome != "timeout":
         return outcome
-    if row["hopeful_plans"] == 0:
+    if row["plans_reaching_goal"] == 0:
         return "never"
-    return "seldom" if row["hopeful_plans"] < SELDOM * row["plans"] else "promised"
+    return "seldom" if row["plans_reaching_goal"] < SELDOM * row["plans"] else "promised"
 
 
 def failures(rows: Sequence[Row]) -> list[dict[str, Any]]:

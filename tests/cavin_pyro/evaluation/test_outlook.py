@@ -8,8 +8,8 @@ from cavin_pyro.evaluation.outlook import outlook, outlook_of_episode
 ADVICE = "the goal may lie beyond planner.horizon=30 pushes; try planner.guidance=layout, a longer one"
 
 
-def row(plans: int, hopeful: int, outcome: str = "timeout") -> dict[str, Any]:
-    return {"plans": plans, "hopeful_plans": hopeful, "outcome": outcome}
+def row(plans: int, reaching: int, outcome: str = "timeout") -> dict[str, Any]:
+    return {"plans": plans, "plans_reaching_goal": reaching, "outcome": outcome}
 
 
 def test_an_episode_in_which_no_plan_reached_the_goal_says_so_and_what_to_try() -> None:

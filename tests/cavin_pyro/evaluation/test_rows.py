@@ -30,7 +30,7 @@ ROW: dict[str, Any] = {
     "unsafe": 0,
     "ineffective": 1,
     "plans": 2,
-    "hopeful_plans": 2,
+    "plans_reaching_goal": 2,
     "prospects": PROSPECTS,
     "success_probability": [0.9, 1],
     "subgoal_distance": None,
@@ -53,12 +53,21 @@ def test_rows_of_this_and_of_older_versions_are_read(tmp_path: Path) -> None:
     assert finished_episodes(path) == {10: ROW, 11: {**older, "seed": 11}}
 
 
+def test_rows_with_an_old_name_are_read_under_the_new_one(tmp_path: Path) -> None:
+    old = {"hopeful_plans" if name == "plans_reaching_goal" else name: value for name, value in ROW.items()}
+    assert finished_episodes(written(tmp_path, old, {**ROW, "seed": 11})) == {10: ROW, 11: {**ROW, "seed": 11}}
+    (tmp_path / "config.yaml").write_text("seed: 10\n")
+    (tmp_path / "results.json").write_text(json.dumps({"per_episode": [old]}))
+    assert earlier_rows(tmp_path, OmegaConf.create({"seed": 10})) == [ROW]
+
+
 @pytest.mark.parametrize(
     ("row", "said"),
     [
         ([1], "it is no section"),
         ({"seed": 11}, "'outcome' is missing"),
         ({**ROW, "outcom": "success"}, "'outcom' is unknown"),
+        ({**ROW, "hopeful_plans": 3}, "'hopeful_plans' is unknown"),  # beside the new name
         ({**ROW, "seed": 11, "outcome": "sucess"}, 'outcome cannot be "sucess"'),
         ({**ROW, "seed": "11"}, 'seed cannot be "11"'),
         ({**ROW, "seed": True}, "seed cannot be true"),

@@ -37,7 +37,7 @@ def row(seed: int, outcome: str, strict: str | None = None, **more: Any) -> dict
         "published_outcome": outcome,
         "strict_outcome": strict or outcome,
         **{f"{criterion}_{name}": 10 for criterion in ("strict", "published") for name in ("steps", "return")},
-        **{"unsafe": 1, "ineffective": 2, "plans": 20, "hopeful_plans": 0},
+        **{"unsafe": 1, "ineffective": 2, "plans": 20, "plans_reaching_goal": 0},
         **more,
     }
 
@@ -74,7 +74,7 @@ def test_the_criterion_decides_what_a_success_is_and_few_failures_are_all_chosen
 
 
 @pytest.mark.parametrize(
-    ("outcome", "hopeful", "kind", "said"),
+    ("outcome", "reaching", "kind", "said"),
     [
         ("success", 20, "success", "scene 7, training 1: success after 10 pushes"),
         ("violation", 0, "violation", "scene 7, training 1: failure after 10 pushes: a constraint was violated"),
@@ -84,8 +84,8 @@ def test_the_criterion_decides_what_a_success_is_and_few_failures_are_all_chosen
         ("timeout", 2, "promised", "10 pushes were not enough; 2 of 20 plans expected success"),
     ],
 )
-def test_a_failure_has_a_reason(outcome: str, hopeful: int, kind: str, said: str) -> None:
-    one = row(7, outcome, hopeful_plans=hopeful)
+def test_a_failure_has_a_reason(outcome: str, reaching: int, kind: str, said: str) -> None:
+    one = row(7, outcome, plans_reaching_goal=reaching)
     assert kind_of(one, "strict") == kind
     assert caption(one, "published").endswith(said)
 
@@ -94,7 +94,7 @@ def test_failures_are_counted_by_hand(tmp_path: Path) -> None:
     table = [
         row(0, "success", strict="violation", published_steps=4, unsafe=3),
         row(1, "timeout", published_steps=60, unsafe=12, ineffective=30),
-        row(2, "timeout", published_steps=60, hopeful_plans=15, unsafe=0, ineffective=0),
+        row(2, "timeout", published_steps=60, plans_reaching_goal=15, unsafe=0, ineffective=0),
         row(3, "fall", published_steps=1, unsafe=0, ineffective=0),
         row(4, "fall", reward="dense"),
         row(5, "fall", objects=4),

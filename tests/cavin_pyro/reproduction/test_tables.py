@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig
+from pyarrow import parquet
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
@@ -28,7 +29,7 @@ def played() -> list[dict[str, Any]]:
     for one in evaluations(SCALES["minimal"], METHODS, ["paper"]):
         outcome = "success" if one.cell.method == "cavin" else "timeout"
         line = {"seed": one.seed, "outcome": outcome, "steps": 2, "return": 97.5, "unsafe": 1, "ineffective": 0}
-        line |= {"plans": 2, "hopeful_plans": 1, "subgoal_distance": None}
+        line |= {"plans": 2, "plans_reaching_goal": 1, "subgoal_distance": None}
         strict = {"strict_outcome": outcome, "strict_steps": 2, "strict_return": 97.5}
         rows.append(episode_row(one, {**line, **strict, "planning_ms": [1.0]}))
     return rows
@@ -51,6 +52,15 @@ def test_a_table_comes_back_as_it_was_and_has_the_same_bytes(tmp_path: Path) -> 
         write_table(tmp_path / name, played())
     assert read_table(tmp_path / "one") == played()
     assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+
+
+def test_a_table_with_an_old_name_is_read_under_the_new_one(tmp_path: Path) -> None:
+    write_table(tmp_path / "new", played())
+    table = parquet.read_table(tmp_path / "new")
+    old = ["hopeful_plans" if name == "plans_reaching_goal" else name for name in table.column_names]
+    parquet.write_table(table.rename_columns(old), tmp_path / "old")
+    assert "hopeful_plans" in parquet.read_schema(tmp_path / "old").names
+    assert read_table(tmp_path / "old") == played()
 
 
 def test_shards_are_joined_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
