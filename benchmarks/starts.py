@@ -2,9 +2,9 @@
 
 In the first state of each scene of a generated layout, pushes at the target are tried in the simulator, each from the
 same state: from 4 to 14 cm away, in a random direction, as far as the tool reaches. Of each scene it says how many of
-them leave the target's way to the goal shorter by 1 cm and break no rule. Where hardly any does, little is left to a
-planner, whatever its model. `--seeds` names single scenes. The last lines count the scenes by their share of such
-pushes.
+them leave the target 1 cm nearer to the goal along allowed places and break no rule. Where hardly any does, little is
+left to a planner, whatever its model. `--seeds` names single scenes. The last lines count the scenes by their share of
+such pushes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW, normalised_pus
 
 AWAY = 0.04, 0.14  # metres from where a push begins to the point at which it aims
 AIM = 0.03  # metres, on each axis, from the target's centre
-GAIN = 0.01  # metres of way
+GAIN = 0.01  # metres
 SHARES = 0.0, 0.05, 0.1, 1.0
 
 
@@ -48,8 +48,8 @@ def try_pushes(env: PushingEnv, seed: int, pushes: int) -> Start:
     scene = env.scene
     before, poses = scene.observe(), scene.ground_truth()
     centers, mask = torch.from_numpy(before.centers), torch.from_numpy(before.mask)
-    way = env.reward.way
-    target, left = before.centers[0, :2].astype(np.float64), float(way(centers[None], mask[None]))
+    distance_to_goal = env.reward.distance_to_goal
+    target, left = before.centers[0, :2].astype(np.float64), float(distance_to_goal(centers[None], mask[None]))
     generator = np.random.default_rng(seed)
     counts = {"tried": 0, "moved": 0, "broke": 0, "nearer": 0}
     for _ in range(20 * pushes):
@@ -70,7 +70,7 @@ def try_pushes(env: PushingEnv, seed: int, pushes: int) -> Start:
         failed = bool(env.reward(centers, after, mask, fallen=report.fallen).failure)
         counts["moved"] += bool((after[0, :2] - centers[0, :2]).norm() > GAIN)
         counts["broke"] += failed
-        counts["nearer"] += not failed and left - float(way(after[None], mask[None])) > GAIN
+        counts["nearer"] += not failed and left - float(distance_to_goal(after[None], mask[None])) > GAIN
     return Start(seed, (float(target[0]), float(target[1])), **counts)
 
 

@@ -159,7 +159,7 @@ class CavinPlanner(SearchingPlanner):
         ends = effects.score_state.segments.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
         tracking_cost: Objective = TrackingCost(subgoals, ends, self.feature_weight)
         reached = effects.score_state.succeeded.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
-        tracking_cost = guided_tracking(tracking_cost, self.way, reached)
+        tracking_cost = guided_tracking(tracking_cost, self.distance_to_goal, reached)
         if self.avoid_failures:
             tracking_cost = AvoidFailures(tracking_cost, ends, reward)
         motions = self.search(
@@ -195,7 +195,7 @@ class CavinPlanner(SearchingPlanner):
             motion_codes=z_star,
             subgoals=subgoals,
             predicted_centers=path,
-            **summary(effects, i, self.way, failures),
+            **summary(effects, i, self.distance_to_goal, failures),
         )
 
 

@@ -30,8 +30,8 @@ class Prospects(NamedTuple):
 
     reaching: Tensor  # [B] share of all candidates that reach the goal by the model, as far as they were rolled out
     failures: Tensor  # [B] share of the perturbed rollouts of the chosen motion that fail
-    way: Tensor  # [B] metres left to the goal from the observed state (`planner.guidance=layout`)
-    way_after: Tensor  # [B] metres left at the end of the chosen plan, by the model
+    distance_to_goal: Tensor  # [B] metres left to the goal from the observed state (`planner.guidance=layout`)
+    distance_to_goal_after: Tensor  # [B] metres left at the end of the chosen plan, by the model
 
 
 class Plan(NamedTuple):

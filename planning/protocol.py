@@ -187,7 +187,7 @@ class PathReward(RewardFunction, Protocol):
         """
 
 
-class WayToGoal(Protocol):
+class DistanceToGoal(Protocol):
     """The remaining distance to the goal along allowed places, for guidance beyond the horizon."""
 
     def __call__(self, centers: Tensor, mask: Tensor, /) -> Tensor:
@@ -202,8 +202,8 @@ class GuidingReward(RewardFunction, Protocol):
     """A reward function that knows the remaining distance to the goal."""
 
     @property
-    def way(self) -> WayToGoal:
-        """The way, the same object in every call."""
+    def distance_to_goal(self) -> DistanceToGoal:
+        """The distance to the goal, the same object in every call."""
 
 
 class Planner(Protocol):

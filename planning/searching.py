@@ -11,7 +11,7 @@ from torch import Tensor
 from models.state import State
 from planning.backends.compiled import Compiled
 from planning.backends.eager import Backend, eager
-from planning.extensions.guidance import check_guidance, guided_return, way_of
+from planning.extensions.guidance import check_guidance, distance_to_goal_of, guided_return
 from planning.extensions.idle_pushes import IDLE_DISTANCE, idle_last
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
@@ -20,12 +20,12 @@ from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
 from planning.plan import Plan, Prospects
 from planning.protocol import (
+    DistanceToGoal,
     DynamicsModel,
     EpisodicReward,
     ModelRequirements,
     RewardFunction,
     SampledDynamics,
-    WayToGoal,
 )
 from planning.rollouts.candidates import Candidates, SearchProblem
 from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
@@ -73,7 +73,7 @@ class SearchingPlanner:
         self.reparameterized = warm_start or compile
         if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
             raise ValueError("robustness.outcomes=sampled needs a model that samples f: it has no sampled_next_state")
-        _ = self.cumulative_reward(), self.way  # refuse bad options now, not in the first plan
+        _ = self.cumulative_reward(), self.distance_to_goal  # refuse bad options now, not in the first plan
         self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
         self.touchdown_distance = touchdown_distance
         self.samples = samples
@@ -90,9 +90,9 @@ class SearchingPlanner:
         return self._reward.current if isinstance(self._reward, EpisodicReward) else self._reward
 
     @property
-    def way(self) -> WayToGoal | None:
-        """The way to the goal, in this episode; None without guidance."""
-        return way_of(self.guidance, self.reward)
+    def distance_to_goal(self) -> DistanceToGoal | None:
+        """The distance to the goal, in this episode; None without guidance."""
+        return distance_to_goal_of(self.guidance, self.reward)
 
     def cumulative_reward(self) -> CumulativeReward:
         """The objective of effect codes and pushes, in this episode."""
@@ -137,7 +137,7 @@ class SearchingPlanner:
     ) -> Candidates:
         """Candidates `[B, N]` of K segments, searched by cumulative reward, with a warm start from `previous`."""
         warm_start = warm_start_noise(previous, generators) if self.warm_start else None
-        objective = guided_return(self.cumulative_reward(), self.way)
+        objective = guided_return(self.cumulative_reward(), self.distance_to_goal)
         return self.search(space, objective, state, generators, warm_start=warm_start, best_only=True)
 
     def prefer_free(self, scores: Tensor, pushes: Tensor, observed: ObservedPoints | None) -> Tensor:
@@ -157,12 +157,12 @@ class SearchingPlanner:
 
 
 def summary(
-    candidates: Candidates, best: Tensor, way: WayToGoal | None, failures: Tensor | None = None
+    candidates: Candidates, best: Tensor, distance_to_goal: DistanceToGoal | None, failures: Tensor | None = None
 ) -> dict[str, Any]:
     """The fields of a `Plan` about its search, from `segments` to `prospects`.
 
     candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, number of the chosen one.
-    way: that guided the search. failures: `[B]` share of the chosen motion's perturbed rollouts that fail.
+    distance_to_goal: that guided the search. failures: `[B]` share of the chosen motion's perturbed rollouts that fail.
     """
     progress = candidates.score_state
     environments = torch.arange(len(best), device=best.device)
@@ -175,17 +175,21 @@ def summary(
         "candidate_centers": candidates.centers,
         "candidate_returns": progress.earned,
         "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,
-        "prospects": _prospects(candidates, chosen, way, failures),
+        "prospects": _prospects(candidates, chosen, distance_to_goal, failures),
     }
 
 
-def _prospects(candidates: Candidates, chosen: Candidates, way: WayToGoal | None, failures: Tensor | None) -> Prospects:
+def _prospects(
+    candidates: Candidates, chosen: Candidates, distance_to_goal: DistanceToGoal | None, failures: Tensor | None
+) -> Prospects:
     """For `candidates: [B, N]` and the `chosen: [B, 1]` one."""
     here, mask = candidates.problem.state.centers, candidates.problem.state.mask
     unknown = here.new_full(mask.shape[:1], torch.nan)
     return Prospects(
         reaching=candidates.score_state.succeeded.to(here.dtype).mean(-1),
         failures=unknown if failures is None else failures,
-        way=unknown if way is None else way(here, mask),
-        way_after=unknown if way is None else way(chosen.plans.centers[:, 0], mask),
+        distance_to_goal=unknown if distance_to_goal is None else distance_to_goal(here, mask),
+        distance_to_goal_after=(
+            unknown if distance_to_goal is None else distance_to_goal(chosen.plans.centers[:, 0], mask)
+        ),
     )

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from envs.tasks.distance_field import DistanceField, grid
 from envs.tasks.step import Step, off_table
 from envs.tasks.task import Task
-from envs.tasks.way import WayField, grid
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 REWARD_NAMES = ("dense", "sparse")
@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
         return Outcome(reward, {name: term[..., index] for name, term in self.terms.items()}, success, violation, fall)
 
 
-class WayToGoal:
+class DistanceToGoal:
     """The remaining distance to a task's goal: of the target, or the sum over all objects, as the task is `about`.
 
     It follows from the task's rules for a single object, which may be where no rule is broken, and has arrived where
@@ -64,7 +64,7 @@ class WayToGoal:
         if self._own_goals is not None:
             return
         outcome = _alone(reward, grid())
-        self._field = WayField(~outcome.failure, outcome.success).to(reward.device)
+        self._field = DistanceField(~outcome.failure, outcome.success).to(reward.device)
 
     def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
         """Metres left: [...], from centers [..., M, 3] metres and mask [..., M] bool; object 0 is the target."""
@@ -153,9 +153,9 @@ class TaskReward:
         return self.task.about
 
     @cached_property
-    def way(self) -> WayToGoal:
+    def distance_to_goal(self) -> DistanceToGoal:
         """The remaining distance to the goal, for planners, with the margin. Computing it takes about 0.1 s, once."""
-        return WayToGoal(self)
+        return DistanceToGoal(self)
 
     @property
     def maximum_return(self) -> float:

@@ -75,5 +75,5 @@ class PushSearch(SearchingPlanner):
             motion_codes=codes if self.has_codes else no_codes,
             subgoals=state.map(lambda field: field[:, None][:, :0]),
             predicted_centers=path,
-            **summary(candidates, best, self.way, failures),
+            **summary(candidates, best, self.distance_to_goal, failures),
         )

@@ -89,7 +89,7 @@ class SectarPlanner(SearchingPlanner):
             motion_codes=effect_codes.new_empty(len(actions), 0, 0),
             subgoals=chosen.states.map(lambda field: field[:, 0]),
             predicted_centers=centers,
-            **summary(effects, best, self.way, failures),
+            **summary(effects, best, self.distance_to_goal, failures),
         )
 
     def _most_robust(self, effects: Candidates, returns: Tensor, generators: Sequence[torch.Generator]) -> MostRobust:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning.protocol import GuidingReward, RewardFunction, WayToGoal
+from planning.protocol import DistanceToGoal, GuidingReward, RewardFunction
 from planning.rollouts.cumulative_reward import CumulativeReward
 from planning.rollouts.returns import Progress
 from planning.rollouts.segment import Objective, SegmentRollout, select_segment
@@ -72,7 +72,7 @@ class GuidedReturn:
     """Cumulative reward plus the value of the states that a plan leads to: the objective at line 7."""
 
     objective: CumulativeReward
-    way: WayToGoal
+    distance_to_goal: DistanceToGoal
 
     def start(self, plans: State) -> GuidedProgress:
         """Progress of candidates without a segment, `plans: [B, n]`."""
@@ -90,12 +90,12 @@ class GuidedReturn:
         return self.valued(progress, passed + CONTINUES * arrives * potential, passed, before.mask)
 
     def potential(self, centers: Tensor, mask: Tensor) -> Tensor:
-        """Minus the way left, in pushes: `[B, n]`."""
-        return -PUSHES_PER_METRE * self.way(centers, mask)
+        """Minus the distance to the goal, in pushes: `[B, n]`."""
+        return -PUSHES_PER_METRE * self.distance_to_goal(centers, mask)
 
     def valued(self, progress: Progress, value: Tensor, passed: Tensor, mask: Tensor) -> GuidedProgress:
         """The state of plans with that value, if they have not ended."""
-        lowest = -PUSHES_PER_METRE * self.way.longest(mask)
+        lowest = -PUSHES_PER_METRE * self.distance_to_goal.longest(mask)
         value = torch.where(progress.failed, lowest, torch.where(progress.succeeded, 0.0, value))
         return GuidedProgress(progress, value, passed)
 
@@ -107,14 +107,14 @@ class GuidedReturn:
 
 
 class GuidedTracking(NamedTuple):
-    """The tracking cost of line 10, which grows where f leaves a longer way to the goal than the subgoal does.
+    """The tracking cost of line 10, which grows where f ends farther from the goal than the subgoal.
 
     A tracking cost alone has no direction: three centimetres short of a subgoal cost as much as three beyond it. Only
     plans that miss the goal are guided; the motions of a plan that reaches it are ranked as without guidance.
     """
 
     objective: Any  # `planning.cavin.TrackingCost`
-    way: WayToGoal
+    distance_to_goal: DistanceToGoal
     guided: Tensor  # [B] bool: the chosen effect plan misses the goal
 
     def start(self, plans: State) -> Any:
@@ -126,7 +126,8 @@ class GuidedTracking(NamedTuple):
         tracking = self.objective.advance(state, segment, before, rollout)
         counts = (self.guided & (segment < self.objective.segments)).unsqueeze(-1)  # [B, 1]
         subgoal = self.objective.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
-        behind = self.way(rollout.states.centers, before.mask) - self.way(subgoal.centers, subgoal.mask)
+        left = self.distance_to_goal(rollout.states.centers, before.mask)
+        behind = left - self.distance_to_goal(subgoal.centers, subgoal.mask)
         return tracking._replace(cost=tracking.cost + torch.where(counts, behind.clamp(min=0.0).square(), 0.0))
 
     def early_stopped(self, state: Any) -> Tensor:
@@ -140,23 +141,25 @@ def check_guidance(guidance: str) -> None:
         raise ValueError(f"unknown guidance '{guidance}': choose {' or '.join(GUIDANCE)}")
 
 
-def way_of(guidance: str, reward: RewardFunction) -> WayToGoal | None:
-    """The way to the goal of this episode; None without guidance.
+def distance_to_goal_of(guidance: str, reward: RewardFunction) -> DistanceToGoal | None:
+    """The distance to the goal in this episode; None without guidance.
 
     Raises ValueError if the reward function knows none.
     """
     if guidance == "none":
         return None
     if not isinstance(reward, GuidingReward):
-        raise ValueError(f"guidance='{guidance}' needs a reward function with a `way`: choose guidance='none'")
-    return reward.way
+        raise ValueError(
+            f"guidance='{guidance}' needs a reward function with a `distance_to_goal`: choose guidance='none'"
+        )
+    return reward.distance_to_goal
 
 
-def guided_return(objective: CumulativeReward, way: WayToGoal | None) -> Objective:
-    """The objective of effect codes and pushes, guided if there is a way."""
-    return objective if way is None else GuidedReturn(objective, way)
+def guided_return(objective: CumulativeReward, distance_to_goal: DistanceToGoal | None) -> Objective:
+    """The objective of effect codes and pushes, guided if there is a distance to the goal."""
+    return objective if distance_to_goal is None else GuidedReturn(objective, distance_to_goal)
 
 
-def guided_tracking(cost: Objective, way: WayToGoal | None, succeeded: Tensor) -> Objective:
-    """The tracking cost of motions, guided if there is a way; `succeeded: [B]` bool, the effect plan's."""
-    return cost if way is None else GuidedTracking(cost, way, ~succeeded)
+def guided_tracking(cost: Objective, distance_to_goal: DistanceToGoal | None, succeeded: Tensor) -> Objective:
+    """The tracking cost of motions, guided if a distance is given; `succeeded: [B]` bool, the effect plan's."""
+    return cost if distance_to_goal is None else GuidedTracking(cost, distance_to_goal, ~succeeded)

@@ -45,10 +45,12 @@ def test_the_way_is_told_with_guidance_alone(toy: SimpleNamespace) -> None:
     for guidance in ("none", "layout"):
         told = prospects(toy.plain(toy.PointMass(), reward, 256, 6, guidance=guidance), toy, (0.0, 0.0), (0.5, 0.0))
         if guidance == "none":
-            assert told.way.isnan().all() and told.way_after.isnan().all()
+            assert told.distance_to_goal.isnan().all() and told.distance_to_goal_after.isnan().all()
         else:
-            assert told.way[0] - told.way[1] == pytest.approx(0.5)
-            assert ((told.way_after < told.way - 0.1) & (told.way_after > 0.0)).all()
+            assert told.distance_to_goal[0] - told.distance_to_goal[1] == pytest.approx(0.5)
+            assert (
+                (told.distance_to_goal_after < told.distance_to_goal - 0.1) & (told.distance_to_goal_after > 0.0)
+            ).all()
 
 
 def test_planners_that_predict_nothing_tell_nothing(toy: SimpleNamespace) -> None:

@@ -28,7 +28,7 @@ def left(plan: Prospects) -> float:
 
 
 def without_progress(plans: Sequence[Prospects]) -> int:
-    """Pushes since the way left was last shortened by `CLOSER`."""
+    """Pushes since the distance left was last shortened by `CLOSER`."""
     nearest, since = math.inf, plans[0]["step"]
     for plan in plans:
         if left(plan) < nearest - CLOSER:

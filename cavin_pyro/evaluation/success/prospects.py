@@ -14,7 +14,7 @@ Prospects = Mapping[str, float]  # the numbers of one plan, by name; NaN where i
 Columns = Mapping[str, Sequence[float | None]]  # those of all plans of an episode, as in its row: None for NaN
 DIGITS = 5  # significant ones, of numbers in a row
 
-# All are known when the plan is made.
+# All are known when the plan is made. The names are those in stored rows.
 PROSPECTS = {
     "step": "pushes made before",
     "pushes_left": "pushes that the episode still allows",
@@ -47,8 +47,8 @@ def prospects_of(
         "pushes_left": pushes_left,
         "objects": int(mask.sum()),
         "distance": distance,
-        "way": told.way.item(),
-        "way_after": told.way_after.item(),
+        "way": told.distance_to_goal.item(),
+        "way_after": told.distance_to_goal_after.item(),
         "reaches": int(plan.expected_success.item()),
         "reaching": told.reaching.item(),
         "segments": int(plan.segments.item()),

@@ -186,7 +186,7 @@ def test_rewards_of_a_device_are_those_of_the_cpu_and_copy_nothing(name: str, de
         expected = judged(TaskReward(task, **options), states, mask)
         with PretendDevice() as both:
             reward, here = TaskReward(task, **options, device=device), (states.to(device), mask.to(device))
-            _ = reward.way  # of a layout, computed once
+            _ = reward.distance_to_goal  # of a layout, computed once
             both.copies.clear()
             found = judged(reward, *here)
             assert not both.copies
@@ -203,7 +203,7 @@ def scenes() -> tuple[Tensor, Tensor]:
 def judged(reward: TaskReward, states: Tensor, mask: Tensor) -> list[Tensor]:
     outcome = reward.along(states, mask)
     step = reward(states[:, 0], states[:, 1], mask)
-    left = reward.way(states[:, 0], mask), reward.way.longest(mask)
+    left = reward.distance_to_goal(states[:, 0], mask), reward.distance_to_goal.longest(mask)
     return [outcome.reward, outcome.success, outcome.failure, step.reward, step.success, step.failure, *left]
 
 

@@ -1,4 +1,4 @@
-"""Guidance beyond the horizon: the way that is left decides among plans that miss the goal, and among no others."""
+"""Guidance beyond the horizon: the remaining distance decides among plans that miss the goal, and among no others."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def bridge(**options: Any) -> TaskReward:
     return TaskReward(parse_task("crossing", tiles), **options)
 
 
-class StraightWay:
-    """The straight way of the target to the middle of a disc, at most 2 metres."""
+class StraightDistance:
+    """The straight distance of the target to the middle of a disc, at most 2 metres."""
 
     def __init__(self, disc: Any) -> None:
         self.disc = disc
@@ -44,7 +44,7 @@ class StraightWay:
 
 def guided_disc(toy: SimpleNamespace, **options: Any) -> Any:
     disc = toy.GoalDisc(**options)
-    disc.way = StraightWay(disc)
+    disc.distance_to_goal = StraightDistance(disc)
     return disc
 
 
@@ -92,7 +92,7 @@ def test_the_baselines_are_guided_too(toy: SimpleNamespace) -> None:
 
 def test_complete_plans_keep_their_order_and_their_lead_and_failed_ones_gain_on_nobody(toy: SimpleNamespace) -> None:
     disc = guided_disc(toy, goal=(0.0, 0.0))
-    objective = GuidedReturn(CumulativeReward(disc), disc.way)
+    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
     torch.manual_seed(0)
     plans = toy.scenes([[(x, y)] for x, y in torch.empty(300, 2).uniform_(-1.2, 1.2).tolist()])
     ends = torch.arange(300) % 3  # succeeded, failed, active
@@ -107,7 +107,7 @@ def test_complete_plans_keep_their_order_and_their_lead_and_failed_ones_gain_on_
     assert torch.equal(returns[failed].argsort(), earned[failed].argsort())
     # Every failed plan loses at least as much as any other plan.
     assert ((earned - returns)[failed].min() >= (earned - returns)[active].max()).all()
-    left = disc.way(plans.centers, plans.mask)[active]
+    left = disc.distance_to_goal(plans.centers, plans.mask)[active]
     assert returns[active].argmax() == left.argmin() and returns[active].argmin() == left.argmax()
 
 
@@ -127,7 +127,7 @@ def test_where_a_plan_reaches_the_goal_guidance_changes_nothing(toy: SimpleNames
 
 def test_a_search_does_not_stop_for_a_failed_plan_that_guidance_puts_behind_others(toy: SimpleNamespace) -> None:
     disc = guided_disc(toy, goal=(0.0, 0.0))
-    objective = GuidedReturn(CumulativeReward(disc), disc.way)
+    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
     # Without its value the failed plan leads an active one that has used 250 steps, whatever that may still earn.
     progress = Progress(
         torch.tensor([[-101.0, -250.0]]),
@@ -145,7 +145,7 @@ def test_a_search_does_not_stop_for_a_failed_plan_that_guidance_puts_behind_othe
 
 def test_of_two_plans_to_one_place_the_one_that_is_there_earlier_leads(toy: SimpleNamespace) -> None:
     disc = guided_disc(toy, goal=(1.0, 0.0), radius=0.0)
-    objective = GuidedReturn(CumulativeReward(disc), disc.way)
+    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
     places = {"early": [0.5, 0.5, 0.5], "late": [0.0, 0.0, 0.5], "astray": [0.5, 0.5, 0.0], "still": [0.0] * 3}
     returns = {}
     for name, path in places.items():
@@ -183,7 +183,7 @@ def test_motions_that_fall_behind_their_subgoal_cost_more_and_those_beyond_it_do
     reached = toy.scenes([[(0.4, 0.0)], [(0.5, 0.0)], [(0.6, 0.0)]] * 3).map(lambda field: field.unflatten(0, (3, 3)))
     rollout = SegmentRollout(torch.zeros(3, 3, 1), None, reached, reached.centers.unsqueeze(2))
     # Guided; its plan reaches the goal; its plan has ended before this segment.
-    cost: Any = GuidedTracking(Tracked(subgoals), disc.way, torch.tensor([True, False, True]))
+    cost: Any = GuidedTracking(Tracked(subgoals), disc.distance_to_goal, torch.tensor([True, False, True]))
     after = cost.advance(cost.start(reached), 0, reached, rollout)
     torch.testing.assert_close(after.cost, torch.tensor([[0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3]))
     assert not after.executed_cost.any()
@@ -202,5 +202,5 @@ def test_an_environment_is_guided_as_it_would_be_alone(toy: SimpleNamespace) -> 
 def test_what_cannot_guide_is_refused_in_one_line(toy: SimpleNamespace) -> None:
     with pytest.raises(ValueError, match=r"^unknown guidance 'roadmap': choose none or layout$"):
         CavinPlanner(toy.PointMass(), toy.Line(), guidance="roadmap")
-    with pytest.raises(ValueError, match=r"^guidance='layout' needs a reward function with a `way`"):
+    with pytest.raises(ValueError, match=r"^guidance='layout' needs a reward function with a `distance_to_goal`"):
         CavinPlanner(toy.PointMass(), toy.Line(), guidance="layout")

@@ -20,7 +20,7 @@ _COUNT = tuple(round((high - low) / SPACING) for low, high in zip(TABLE_LOW, TAB
 _FIRST = tuple(low + SPACING / 2 for low in TABLE_LOW)
 
 
-class WayField:
+class DistanceField:
     """Length of the shortest path from each point of the table to the nearest goal point, along allowed points.
 
     From a point that is not allowed, or without such a path, it is the length of the shortest path that also crosses
@@ -48,7 +48,7 @@ class WayField:
         self._first = torch.tensor(_FIRST)
         self._last = torch.tensor([count - 1.001 for count in _COUNT])  # within the last cell
 
-    def to(self, device: torch.device) -> WayField:
+    def to(self, device: torch.device) -> DistanceField:
         """The same field with its numbers on a device; points elsewhere cost a copy in every call."""
         moved = copy.copy(self)
         moved._cells, moved._first, moved._last = (part.to(device) for part in (self._cells, self._first, self._last))
@@ -75,9 +75,9 @@ def grid() -> Tensor:
 
 
 def _eikonal(lengths: NDArray[np.float64], allowed: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Shortest ways from the points with a finite length over the allowed ones (Godunov's upwind scheme).
+    """Lengths of the shortest paths over allowed points, by Godunov's upwind scheme.
 
-    Points with a finite length keep it.
+    Paths begin at the points with a finite length, which keep it.
     """
     known = np.isfinite(lengths)
     padded = np.full([count + 2 for count in lengths.shape], np.inf)
