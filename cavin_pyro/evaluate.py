@@ -17,7 +17,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
     from cavin_pyro.evaluation.evaluation import NOT_COMPARED, evaluate, merge, seeds_of
     from cavin_pyro.evaluation.factory import make_runner, planner_name
-    from cavin_pyro.evaluation.outlook import outlook
+    from cavin_pyro.evaluation.plan_summary import plan_summary
     from cavin_pyro.evaluation.statistics import summarize, table
     from cavin_pyro.evaluation.success.sentences import calibration_of, sentence
     from cavin_pyro.evaluation.success.sentences import record as calibration_record
@@ -38,7 +38,7 @@ def main(config: DictConfig) -> None:
         text = table(results, f"{scene}, {planner_name(config)}")
         calibration = calibration_of(results["per_episode"])
         results["calibration"] = calibration_record(calibration)
-        for said in (outlook(results["per_episode"], config), sentence(calibration, runner.probability)):
+        for said in (plan_summary(results["per_episode"], config), sentence(calibration, runner.probability)):
             text += f"\n{said}" if said else ""
         if others:
             comparison = compare(results["per_episode"], others)

@@ -8,24 +8,24 @@ from typing import Any
 from omegaconf import DictConfig
 
 
-def expects_nothing(config: DictConfig) -> bool:
+def predicts_nothing(config: DictConfig) -> bool:
     """Whether the planner predicts nothing, so that its plans say nothing about the goal."""
     return "horizon" not in config.planner
 
 
-def outlook_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
+def plan_summary_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
     """One line about an episode's plans, from its row of results; empty for planners that predict nothing."""
-    if expects_nothing(config) or not row["plans"]:
+    if predicts_nothing(config) or not row["plans"]:
         return ""
     if row["plans_reaching_goal"]:
         return f"{row['plans_reaching_goal']} of {row['plans']} plans reached the goal by the model"
     return f"no plan reached the goal by the model, so no push was aimed at it: {_advice(config)}"
 
 
-def outlook(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
+def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
     """The same about all episodes; what to try is added if in some of them no plan reached the goal."""
     plans = sum(row["plans"] for row in rows)
-    if expects_nothing(config) or not plans:
+    if predicts_nothing(config) or not plans:
         return ""
     reaching = sum(row["plans_reaching_goal"] for row in rows)
     without = [row for row in rows if not row["plans_reaching_goal"]]
