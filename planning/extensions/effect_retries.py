@@ -47,7 +47,7 @@ def try_other_effects(
         if not stuck.any():
             break
         if number == 0:
-            effects = effects.in_full()
+            effects = effects.rolled_out()
             scores = effects.returns
         scores = leave_out_similar(scores, first_moves(near, effects), chosen, stuck)
         chosen = best_of(scores, "returns of effect plans")

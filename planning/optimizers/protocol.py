@@ -29,6 +29,6 @@ def search(optimizer: Optimizer, problem: SearchProblem, samples: int) -> Candid
     """
     try:
         optimizer.optimize(problem, samples)
-        return problem.take_considered()
+        return problem.pop_candidates()
     except OptimizerError as error:
         raise OptimizerError(f"optimizer {type(optimizer).__name__}: {error}") from error

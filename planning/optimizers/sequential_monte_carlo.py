@@ -110,7 +110,7 @@ class SequentialMonteCarlo:
             evidence = evidence + factor
             sizes.append(effective_sample_size(logarithms))
             if number == problem.segments:
-                problem.consider(particles)
+                problem.add_candidates(particles)
             always = self.resample_below == 1 or number == problem.segments
             due = (sizes[-1] <= self.resample_below * count) | always
             particles = particles.take(_resample(relative, problem.generators, due))
@@ -119,7 +119,7 @@ class SequentialMonteCarlo:
             for _ in range(self.moves):
                 particles, proposed = self._move(particles, inverse)
                 if number == problem.segments:
-                    problem.consider(proposed)
+                    problem.add_candidates(proposed)
             tempered = inverse.unsqueeze(-1) * self._scores(particles).nan_to_num(neginf=0.0)
         if known is not None:
             problem.evaluate(known)  # last, so that a new plan wins among equals

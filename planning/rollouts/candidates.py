@@ -26,7 +26,7 @@ class SearchProblem:
 
     An optimizer needs `noise`, `generators`, `warm_start` and the call itself: noise `[B, n, K, D]` in, returns
     `[B, n]` out. `evaluate` and `sample` also replace failed candidates; with `begin` an optimizer extends candidates
-    segment by segment. `considered` collects all evaluated candidates, from which the planner chooses.
+    segment by segment. `evaluated` collects all evaluated candidates, from which the planner chooses.
     """
 
     space: SearchSpace
@@ -38,7 +38,7 @@ class SearchProblem:
     warm_start: Tensor | None = None  # [B, h, K, D] noise of promising candidates, from the last plan
     best_only: bool = False  # the caller reads only the best candidate
     backend: Backend = eager  # runs the extension of reparameterised candidates
-    considered: list[Candidates] = field(default_factory=list, init=False, compare=False)  # whole candidates
+    evaluated: list[Candidates] = field(default_factory=list, init=False, compare=False)  # whole candidates
     evidence: list[Evidence] = field(default_factory=list, init=False, compare=False)  # of optimizers that estimate it
 
     def __call__(self, noise: Tensor) -> Tensor:
@@ -84,23 +84,23 @@ class SearchProblem:
         return self._roll_out(noise.shape[1], noise.unbind(2), replacement, early_stopped)
 
     def begin(self, count: int) -> Candidates:
-        """n = `count` candidates without a segment. Call `consider` with their extensions."""
+        """n = `count` candidates without a segment. Call `add_candidates` with their extensions."""
         plans = self.state.expand_plans(count)
         return Candidates(self, plans, self.objective.start(plans))
 
-    def consider(self, candidates: Candidates) -> None:
+    def add_candidates(self, candidates: Candidates) -> None:
         """Add whole candidates, from which the planner then also chooses."""
-        self.considered.append(candidates)
+        self.evaluated.append(candidates)
 
-    def take_considered(self) -> Candidates:
+    def pop_candidates(self) -> Candidates:
         """Remove and return all whole candidates so far, in order (they refer to this problem).
 
         Raises OptimizerError if there are none.
         """
-        if not self.considered:
+        if not self.evaluated:
             raise OptimizerError("it has evaluated no candidate, call problem(noise) at least once")
-        candidates = join(self.considered)
-        self.considered.clear()
+        candidates = join(self.evaluated)
+        self.evaluated.clear()
         return candidates
 
     def _roll_out(
@@ -117,7 +117,7 @@ class SearchProblem:
             else:
                 last = number == len(noise)
                 candidates, early_stopped = candidates.extend_and_replace(segment, chance, early_stopped, last=last)
-        self.consider(candidates)
+        self.add_candidates(candidates)
         return candidates
 
 
@@ -231,7 +231,7 @@ class Candidates:
         segments = (*self.segments, SegmentRecord(noise, rollout, self.score_state))
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
 
-    def in_full(self) -> Candidates:
+    def rolled_out(self) -> Candidates:
         """The same candidates and numbers, each rolled out to its end, for callers that read more than the best one.
 
         Those that were not reparameterised are returned as they are.

@@ -98,9 +98,9 @@ def test_a_search_stops_early_when_no_candidate_can_be_better(toy: SimpleNamespa
 def test_candidates_of_a_search_that_stopped_early_can_be_rolled_out_in_full(toy: SimpleNamespace) -> None:
     noise = places((0, 1))
     all_plans = search(toy, dense=False).evaluate(noise, replacement=True)
-    in_full = search(toy, dense=False).evaluate(noise, replacement=True, early_stopping=True).in_full()
-    assert torch.equal(in_full.returns[:, 1:], all_plans.returns[:, 1:])  # all but the copies
-    assert torch.equal(in_full.codes[:, 1:], all_plans.codes[:, 1:])
+    rolled_out = search(toy, dense=False).evaluate(noise, replacement=True, early_stopping=True).rolled_out()
+    assert torch.equal(rolled_out.returns[:, 1:], all_plans.returns[:, 1:])  # all but the copies
+    assert torch.equal(rolled_out.codes[:, 1:], all_plans.codes[:, 1:])
 
 
 def test_what_an_environment_finds_does_not_depend_on_when_others_stop_early(toy: SimpleNamespace) -> None:
