@@ -53,19 +53,19 @@ class Arrangement:
         excess = (np.abs(observed[:, None] - levels) - TOLERANCE) / (CAP - TOLERANCE)
         self._misfit = (MISFIT * np.clip(excess, 0.0, 1.0)).astype(np.float32)
 
-    def lay(self, number: int, pose: Pose | None) -> None:
+    def place(self, number: int, pose: Pose | None) -> None:
         """Place a shape at a pose, or remove it."""
         self.poses.pop(number, None)
         self._layers.pop(number, None)
         if pose is not None:
             self.poses[number], self._layers[number] = pose, self._layer(number, pose)
 
-    def set_out(self, poses: Mapping[int, Pose]) -> None:
+    def place_only(self, poses: Mapping[int, Pose]) -> None:
         """Place these shapes and no others."""
         for number in range(len(self.shapes)):
-            self.lay(number, poses.get(number))
+            self.place(number, poses.get(number))
 
-    def laid(self, number: int) -> Shape:
+    def placed(self, number: int) -> Shape:
         """A placed shape."""
         return replace(self.shapes[number], pose=self.poses[number])
 
@@ -153,7 +153,7 @@ class Arrangement:
     def _turn(self, number: int, pose: Pose) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Cells and levels of a shape, computed once for all poses that differ by whole cells."""
         if (number, pose) not in self._turned:
-            cells, heights = self.shapes[number].laid(pose)
+            cells, heights = self.shapes[number].covered_cells(pose)
             self._turned[number, pose] = cells, np.rint(heights / LEVEL).astype(np.intp)
         return self._turned[number, pose]
 

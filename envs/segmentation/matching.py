@@ -72,7 +72,7 @@ def match_together(
         region = owners == index
         if region.sum() * CELL**2 >= MINIMUM_AREA:
             fits = arrangement.saved(index) >= RECOGNISED * shape.area
-            found[number] = Match(region, arrangement.laid(index).shifted(row, column) if fits else None)
+            found[number] = Match(region, arrangement.placed(index).shifted(row, column) if fits else None)
     return found | _left_over({n: shape for n, shape in moved.items() if n not in found}, found, concerned, heights)
 
 

@@ -32,7 +32,7 @@ def explain(heights: NDArray[np.float32], shapes: Sequence[Shape], still: Sequen
         poses, total = dict(arrangement.poses), arrangement.total()
         _arrange(arrangement, ())
         if arrangement.total() > total:
-            arrangement.set_out(poses)
+            arrangement.place_only(poses)
     return arrangement
 
 
@@ -43,27 +43,27 @@ def _arrange(arrangement: Arrangement, still: Sequence[int]) -> None:
     movable.sort(key=lambda number: -shapes[number].area)
     begun = []
     for start, order in _starts(arrangement, movable):
-        arrangement.set_out({number: shapes[number].pose for number in (*still, *start)})
+        arrangement.place_only({number: shapes[number].pose for number in (*still, *start)})
         for number in order:
             gain, pose = arrangement.search(number, arrangement.savings(number))
-            arrangement.lay(number, pose if gain > PRESENT * shapes[number].area else None)
+            arrangement.place(number, pose if gain > PRESENT * shapes[number].area else None)
         begun.append((arrangement.total(), dict(arrangement.poses)))
         if all(arrangement.saved(number) > GOOD * shape.area for number, shape in enumerate(shapes)):
             break
-    arrangement.set_out(min(begun, key=lambda one: one[0])[1])
+    arrangement.place_only(min(begun, key=lambda one: one[0])[1])
     for _ in range(SWEEPS):
-        improved = [_lay_anew(arrangement, number, number in still) for number in range(len(shapes))]
+        improved = [_place_anew(arrangement, number, number in still) for number in range(len(shapes))]
         if not any(improved):
             exchanged = [_exchange(arrangement, *pair) for pair in combinations(movable, 2)]
             if not any(exchanged):
                 break
     for number, pose in list(arrangement.poses.items()):
-        arrangement.lay(number, arrangement.refine(number, pose, arrangement.savings(number), FINE)[1])
+        arrangement.place(number, arrangement.refine(number, pose, arrangement.savings(number), FINE)[1])
 
 
 def _starts(arrangement: Arrangement, movable: Sequence[int]) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
     """Shapes to leave at their last poses, and orders to place the others; the best guess comes first."""
-    arrangement.set_out({number: shape.pose for number, shape in enumerate(arrangement.shapes)})
+    arrangement.place_only({number: shape.pose for number, shape in enumerate(arrangement.shapes)})
     areas = arrangement.areas
     stay = [number for number in movable if arrangement.saved(number) >= POOR * areas[number]]
     if stay:
@@ -73,7 +73,7 @@ def _starts(arrangement: Arrangement, movable: Sequence[int]) -> Iterator[tuple[
         yield (), order
 
 
-def _lay_anew(arrangement: Arrangement, number: int, still: bool) -> bool:
+def _place_anew(arrangement: Arrangement, number: int, still: bool) -> bool:
     """Place a shape where it saves the most, given the others; returns whether it moved."""
     table, former = arrangement.savings(number), arrangement.saved(number)
     least = PRESENT * arrangement.areas[number]
@@ -83,7 +83,7 @@ def _lay_anew(arrangement: Arrangement, number: int, still: bool) -> bool:
         gain, pose = arrangement.search(number, table)
     if max(gain, least) <= former + IMPROVEMENT:
         return False
-    arrangement.lay(number, pose if gain > least or still else None)
+    arrangement.place(number, pose if gain > least or still else None)
     return True
 
 
@@ -93,11 +93,11 @@ def _exchange(arrangement: Arrangement, one: int, other: int) -> bool:
     small, large = sorted(arrangement.areas[number] for number in (one, other))
     if one not in poses or other not in poses or small < EXCHANGED * large:
         return False
-    arrangement.lay(one, None)
-    arrangement.lay(other, None)
+    arrangement.place(one, None)
+    arrangement.place(other, None)
     for number, there in ((one, other), (other, one)):
-        arrangement.lay(number, arrangement.search(number, arrangement.savings(number), near=poses[there])[1])
+        arrangement.place(number, arrangement.search(number, arrangement.savings(number), near=poses[there])[1])
     if arrangement.total() < total - IMPROVEMENT:
         return True
-    arrangement.set_out(poses)
+    arrangement.place_only(poses)
     return False

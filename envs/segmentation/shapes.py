@@ -43,7 +43,7 @@ class Shape:
         """The same shape on a map with another origin."""
         return replace(self, pose=replace(self.pose, row=self.pose.row + rows, column=self.pose.column + columns))
 
-    def laid(self, pose: Pose) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def covered_cells(self, pose: Pose) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """The cells [C, 2] that the shape covers at a pose, and its heights there [C]; each takes the nearest's."""
         high, wide = self.patch.shape
         cosine, sine = np.cos(pose.turn), np.sin(pose.turn)

@@ -269,10 +269,10 @@ def test_an_object_taken_to_stand_still_may_turn_out_to_have_moved_on() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.floats(-3.1, 3.1), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
-def test_a_shape_covers_as_many_cells_wherever_it_is_laid(turn: float, row: float, column: float) -> None:
+def test_a_shape_covers_as_many_cells_wherever_it_is_placed(turn: float, row: float, column: float) -> None:
     (one,) = boxes_on_map((40, 40, 0.0, *SIDES[0]))
     shape = shape_of(one > 0, one)
-    cells, heights = shape.laid(Pose(row, column, turn))
+    cells, heights = shape.covered_cells(Pose(row, column, turn))
     assert len(np.unique(cells, axis=0)) == len(cells) == pytest.approx(shape.area, rel=0.1)
     np.testing.assert_allclose(cells.mean(axis=0), (row, column), atol=1.0)
     assert set(heights) == {np.float32(SIDES[0][2])}
