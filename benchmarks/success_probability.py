@@ -30,8 +30,8 @@ from cavin_pyro.evaluation.evaluation import evaluate
 from cavin_pyro.evaluation.success.calibration import Calibration, calibration
 from cavin_pyro.evaluation.success.configuration import planner_mismatch
 from cavin_pyro.evaluation.success.fit import RIDGE, Evaluated, by_planner, fit, read_evaluation, write_regressions
+from cavin_pyro.evaluation.success.predictors import plans_of
 from cavin_pyro.evaluation.success.probability import Regression, read_regressions
-from cavin_pyro.evaluation.success.prospects import plans_of
 from cavin_pyro.evaluation.success.sentences import bounds
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import check_same_run, write_config

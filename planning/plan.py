@@ -22,7 +22,7 @@ class Evidence(NamedTuple):
     particles: Tensor  # [B] int64: the largest possible effective sample size
 
 
-class Prospects(NamedTuple):
+class SuccessPredictors(NamedTuple):
     """By-products of a search that help to predict success; NaN where a planner does not compute one.
 
     `Plan.expected_success`, `expected_return` and `segments` are further predictors.
@@ -58,4 +58,4 @@ class Plan(NamedTuple):
     noise: Tensor  # [B, K, D] of the searched codes or pushes, or [B, 0, 0]; see `extensions.warm_start`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
     evidence: Evidence | None = None  # of the search by return; None for optimizers that do not sample by weights
-    prospects: Prospects | None = None  # None for planners that predict nothing
+    success_predictors: SuccessPredictors | None = None  # None for planners that predict nothing

@@ -18,7 +18,7 @@ from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, pr
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
-from planning.plan import Plan, Prospects
+from planning.plan import Plan, SuccessPredictors
 from planning.protocol import (
     DistanceToGoal,
     DynamicsModel,
@@ -159,7 +159,7 @@ class SearchingPlanner:
 def summary(
     candidates: Candidates, best: Tensor, distance_to_goal: DistanceToGoal | None, failures: Tensor | None = None
 ) -> dict[str, Any]:
-    """The fields of a `Plan` about its search, from `segments` to `prospects`.
+    """The fields of a `Plan` about its search, from `segments` to `success_predictors`.
 
     candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, number of the chosen one.
     distance_to_goal: that guided the search. failures: `[B]` share of the chosen motion's perturbed rollouts that fail.
@@ -175,17 +175,17 @@ def summary(
         "candidate_centers": candidates.centers,
         "candidate_returns": progress.earned,
         "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,
-        "prospects": _prospects(candidates, chosen, distance_to_goal, failures),
+        "success_predictors": _success_predictors(candidates, chosen, distance_to_goal, failures),
     }
 
 
-def _prospects(
+def _success_predictors(
     candidates: Candidates, chosen: Candidates, distance_to_goal: DistanceToGoal | None, failures: Tensor | None
-) -> Prospects:
+) -> SuccessPredictors:
     """For `candidates: [B, N]` and the `chosen: [B, 1]` one."""
     here, mask = candidates.problem.state.centers, candidates.problem.state.mask
     unknown = here.new_full(mask.shape[:1], torch.nan)
-    return Prospects(
+    return SuccessPredictors(
         reaching=candidates.score_state.succeeded.to(here.dtype).mean(-1),
         failures=unknown if failures is None else failures,
         distance_to_goal=unknown if distance_to_goal is None else distance_to_goal(here, mask),

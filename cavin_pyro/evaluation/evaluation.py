@@ -16,7 +16,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
-from cavin_pyro.evaluation.success.prospects import columns_of
+from cavin_pyro.evaluation.success.predictors import columns_of
 from cavin_pyro.launching.launcher import Launcher, as_launcher, of_shard
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
@@ -133,7 +133,7 @@ def episode_row(episode: Episode) -> Row:
         "plans": len(episode.plan_records),
         "plans_reaching_goal": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
-        "prospects": columns_of([record.prospects for record in episode.plan_records]),
+        "prospects": columns_of([record.success_predictors for record in episode.plan_records]),
         "success_probability": _probabilities(episode),
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.evaluation.success.prospects import Prospects, prospects_of
+from cavin_pyro.evaluation.success.predictors import SuccessPredictors, success_predictors
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
 from models.networks.geometry import Geometry
@@ -32,7 +32,7 @@ class PlanRecord:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
         milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
         clouds: [M, 256, 3] metres, as observed, if a photograph was asked for.
-        prospects: what the plan tells about success; None if its planner predicts nothing.
+        success_predictors: what the plan tells about success; None if its planner predicts nothing.
         success_probability: of the episode; None where no fit is known.
     """
 
@@ -43,7 +43,7 @@ class PlanRecord:
     milliseconds: float
     photograph: NDArray[np.uint8] | None = None
     clouds: NDArray[np.float32] | None = None
-    prospects: Prospects | None = None
+    success_predictors: SuccessPredictors | None = None
     success_probability: float | None = None
 
     @property
@@ -139,7 +139,7 @@ def rollout(
     seed: int,
     pushes_per_plan: int | None = None,
     photograph: bool = False,
-    probability: Callable[[Sequence[Prospects]], float | None] | None = None,
+    probability: Callable[[Sequence[SuccessPredictors]], float | None] | None = None,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
 ) -> Episode:
@@ -175,7 +175,7 @@ def rollout(
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
             clouds=observation["clouds"] if photograph else None,
-            prospects=prospects_of(
+            success_predictors=success_predictors(
                 plan,
                 step=len(episode.transitions),
                 pushes_left=env.maximum_steps - len(episode.transitions),
@@ -183,9 +183,9 @@ def rollout(
                 mask=observation["mask"],
             ),
         )
-        if probability is not None and record.prospects is not None:
-            told = [one.prospects for one in episode.plan_records if one.prospects is not None]
-            record = replace(record, success_probability=probability([*told, record.prospects]))
+        if probability is not None and record.success_predictors is not None:
+            told = [one.success_predictors for one in episode.plan_records if one.success_predictors is not None]
+            record = replace(record, success_probability=probability([*told, record.success_predictors]))
         episode.plan_records.append(record)
         for callback in callbacks:
             callback.on_plan(record)

@@ -10,7 +10,7 @@ from typing import Any
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.rollout import OUTCOMES
-from cavin_pyro.evaluation.success.prospects import PROSPECTS
+from cavin_pyro.evaluation.success.predictors import SUCCESS_PREDICTORS
 
 Row = dict[str, Any]
 
@@ -27,11 +27,11 @@ def _outcome(value: Any) -> bool:
     return value in OUTCOMES
 
 
-def _prospects(value: Any) -> bool:
+def _success_predictors(value: Any) -> bool:
     """One list per name, all of one length; or none, of a planner that predicts nothing."""
     if value is None:
         return True
-    if not isinstance(value, Mapping) or set(value) != set(PROSPECTS):
+    if not isinstance(value, Mapping) or set(value) != set(SUCCESS_PREDICTORS):
         return False
     columns = list(value.values())
     numbers = all(isinstance(column, list) and all(one is None or _number(one) for one in column) for column in columns)
@@ -58,7 +58,7 @@ LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not writ
     "strict_return": _number,
     "plans": _count,
     "plans_reaching_goal": _count,
-    "prospects": _prospects,
+    "prospects": _success_predictors,
     "success_probability": _probabilities,
 }
 RENAMED = {"hopeful_plans": "plans_reaching_goal"}  # in the files of older versions: old name, new name

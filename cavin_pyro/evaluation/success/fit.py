@@ -16,20 +16,20 @@ from scipy.special import expit
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.success.configuration import Situation, joined, situation_of
-from cavin_pyro.evaluation.success.predictors import PREDICTORS
+from cavin_pyro.evaluation.success.predictors import SuccessPredictors, plans_of
 from cavin_pyro.evaluation.success.probability import FORMAT, Regression
-from cavin_pyro.evaluation.success.prospects import Prospects, plans_of
+from cavin_pyro.evaluation.success.regressors import REGRESSORS
 from cavin_pyro.storage.files import write_json
 from cavin_pyro.storage.run_directory import stored_options
 
 RIDGE = 1.0  # see `logistic`
 FEWEST = 10  # episodes of a fit
-CONSTANT = 1e-9  # standard deviation of a predictor, against its size, that is rounding
+CONSTANT = 1e-9  # standard deviation of a regressor, against its size, that is rounding
 Array = NDArray[np.float64]
 
 
 class Evaluated(NamedTuple):
-    """A finished evaluation whose rows hold prospects."""
+    """A finished evaluation whose rows hold success predictors."""
 
     situation: Situation
     rows: list[Row]
@@ -45,7 +45,9 @@ def read_evaluation(folder: Path) -> Evaluated:
         raise UserError(f"{folder} holds no evaluation: give folders of evaluate")
     rows = list(finished_episodes(folder / "episodes.jsonl").values())
     if not rows or any(row.get("prospects") is None for row in rows):
-        raise UserError(f"{folder} holds no prospects of plans: evaluate it again, with a planner that predicts")
+        raise UserError(
+            f"{folder} holds no success predictors of plans: evaluate it again, with a planner that predicts"
+        )
     return Evaluated(situation_of(stored_options(folder / "config.yaml")), rows)
 
 
@@ -72,13 +74,13 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
     ends = np.array([row["outcome"] == "success" for row in rows])
     if len(ends) < FEWEST:
         raise UserError(f"{len(ends)} episodes of {name} are too few for a fit: evaluate at least {FEWEST}")
-    episodes = [predictors_of(plans_of(row["prospects"])) for row in rows]
-    names = [one for number, one in enumerate(PREDICTORS) if all(np.isfinite(x[:, number]).all() for x in episodes)]
-    kept = [list(PREDICTORS).index(one) for one in names]
+    episodes = [regressors_of(plans_of(row["prospects"])) for row in rows]
+    names = [one for number, one in enumerate(REGRESSORS) if all(np.isfinite(x[:, number]).all() for x in episodes)]
+    kept = [list(REGRESSORS).index(one) for one in names]
     x = np.concatenate([one[:, kept] for one in episodes])
     y = np.concatenate([np.full(len(one), float(end)) for one, end in zip(episodes, ends, strict=True)])
     weights = np.concatenate([np.full(len(one), 1.0 / len(one)) for one in episodes])
-    intercept, slopes = logistic(x, y, weights, ridge, [PREDICTORS[one].sign for one in names])
+    intercept, slopes = logistic(x, y, weights, ridge, [REGRESSORS[one].sign for one in names])
     odds = intercept + x @ slopes
     situation = evaluations[0].situation
     return Regression(
@@ -96,10 +98,10 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
     )
 
 
-def predictors_of(plans: Sequence[Prospects]) -> Array:
-    """The predictors of every plan of an episode: [plans, predictors]; NaN for what its planner does not know."""
+def regressors_of(plans: Sequence[SuccessPredictors]) -> Array:
+    """The regressors of every plan of an episode: [plans, regressors]; NaN for what its planner does not know."""
     sofar = [plans[: number + 1] for number in range(len(plans))]
-    return np.array([[predictor.value(some) for predictor in PREDICTORS.values()] for some in sofar], dtype=np.float64)
+    return np.array([[regressor.value(some) for regressor in REGRESSORS.values()] for some in sofar], dtype=np.float64)
 
 
 def logistic(
@@ -107,13 +109,13 @@ def logistic(
 ) -> tuple[float, Array]:
     """Intercept and slopes [d] of the log odds, by weighted maximum likelihood with a ridge penalty.
 
-    The penalty is half of `ridge` times the squared slopes per standard deviation of their predictors: a normal prior
-    with variance 1 / ridge. The intercept, at the mean predictors, has Jeffreys' prior of a rate: as if half an
+    The penalty is half of `ridge` times the squared slopes per standard deviation of their regressors: a normal prior
+    with variance 1 / ridge. The intercept, at the mean regressors, has Jeffreys' prior of a rate: as if half an
     observation more had succeeded and half a one failed. So no probability is 0 or 1, even if all outcomes are alike.
 
     Args:
         x: [n, d]. y: [n] in {0, 1}. weights: [n], whose sum is the number of independent observations.
-        signs: 1 or -1 for each predictor whose slope must not have the other sign; 0 or None: either.
+        signs: 1 or -1 for each regressor whose slope must not have the other sign; 0 or None: either.
     """
     mean = np.average(x, axis=0, weights=weights)
     scale = np.sqrt(np.average((x - mean) ** 2, axis=0, weights=weights))

@@ -12,8 +12,8 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.success.configuration import Scenes, planner_mismatch, situation
-from cavin_pyro.evaluation.success.predictors import PREDICTORS
-from cavin_pyro.evaluation.success.prospects import Prospects
+from cavin_pyro.evaluation.success.predictors import SuccessPredictors
+from cavin_pyro.evaluation.success.regressors import REGRESSORS
 from cavin_pyro.storage.files import read_json
 
 FORMAT = "cavin_pyro success probability"
@@ -27,7 +27,7 @@ class Regression:
 
     Attributes:
         name: of the planner, for people. planner, checkpoint, scenes: what it was fitted for.
-        intercept, slopes: of the log odds; a slope is per unit of its predictor.
+        intercept, slopes: of the log odds; a slope is per unit of its regressor.
         lowest, highest: of the log odds in the fit; probabilities beyond are not extrapolated.
         episodes, successes, plans: in the fit.
     """
@@ -44,9 +44,9 @@ class Regression:
     successes: int
     plans: int
 
-    def __call__(self, plans: Sequence[Prospects]) -> float | None:
+    def __call__(self, plans: Sequence[SuccessPredictors]) -> float | None:
         """P(success | the last of an episode's plans so far); None if it does not tell what the fit needs."""
-        odds = self.intercept + sum(slope * PREDICTORS[name].value(plans) for name, slope in self.slopes.items())
+        odds = self.intercept + sum(slope * REGRESSORS[name].value(plans) for name, slope in self.slopes.items())
         if not math.isfinite(odds):
             return None
         return 1.0 / (1.0 + math.exp(-min(max(odds, self.lowest), self.highest)))
@@ -58,7 +58,7 @@ class Unfitted:
 
     why: str
 
-    def __call__(self, plans: Sequence[Prospects]) -> None:
+    def __call__(self, plans: Sequence[SuccessPredictors]) -> None:
         """No number is better than a wrong one."""
         return None
 
@@ -120,8 +120,8 @@ def read_regressions(path: Path) -> list[Regression]:
 
 def _regression(plain: dict[str, Any]) -> Regression:
     slopes = {str(name): float(value) for name, value in plain["slopes"].items()}
-    if unknown := sorted(set(slopes) - set(PREDICTORS)):
-        raise ValueError(f"unknown predictor {unknown[0]!r}")
+    if unknown := sorted(set(slopes) - set(REGRESSORS)):
+        raise ValueError(f"unknown regressor {unknown[0]!r}")
     intercept, lowest, highest = (float(plain[name]) for name in ("intercept", "lowest", "highest"))
     if not all(map(math.isfinite, (intercept, lowest, highest, *slopes.values()))):
         raise ValueError("a number is not finite")

@@ -14,11 +14,11 @@ from cavin_pyro.evaluation import evaluation, factory
 from cavin_pyro.evaluation.comparison import earlier_rows
 from cavin_pyro.evaluation.evaluation import evaluate
 from cavin_pyro.evaluation.rows import finished_episodes
-from cavin_pyro.evaluation.success.prospects import PROSPECTS as MEANING
+from cavin_pyro.evaluation.success.predictors import SUCCESS_PREDICTORS as MEANING
 from planning.inputs import NoFiniteCandidateError
 
-PROSPECTS: dict[str, list[Any]] = {name: [0, 0.5] for name in MEANING} | {"pushes_left": [60, 59], "way": [None, None]}
-SHORT = json.dumps(PROSPECTS)[:40]
+PREDICTORS: dict[str, list[Any]] = {name: [0, 0.5] for name in MEANING} | {"pushes_left": [60, 59], "way": [None, None]}
+SHORT = json.dumps(PREDICTORS)[:40]
 ROW: dict[str, Any] = {
     "seed": 10,
     "outcome": "success",
@@ -31,7 +31,7 @@ ROW: dict[str, Any] = {
     "ineffective": 1,
     "plans": 2,
     "plans_reaching_goal": 2,
-    "prospects": PROSPECTS,
+    "prospects": PREDICTORS,
     "success_probability": [0.9, 1],
     "subgoal_distance": None,
     "planning_ms": [1.5, 2],
@@ -76,7 +76,7 @@ def test_rows_with_an_old_name_are_read_under_the_new_one(tmp_path: Path) -> Non
         ({**ROW, "seed": 11, "planning_ms": 5}, "planning_ms cannot be 5"),
         ({**ROW, "seed": 11, "success_probability": [1.5]}, "success_probability cannot be [1.5]"),
         ({**ROW, "seed": 11, "prospects": {"step": [0]}}, 'prospects cannot be {"step": [0]}'),
-        ({**ROW, "prospects": {**PROSPECTS, "way": 1}, "seed": 11}, f"prospects cannot be {SHORT}"),
+        ({**ROW, "prospects": {**PREDICTORS, "way": 1}, "seed": 11}, f"prospects cannot be {SHORT}"),
         ({**ROW, "steps": 5}, "an earlier line has another episode with seed 10"),
     ],
 )

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from scipy.special import expit
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.evaluation.success.prospects import PROSPECTS
+from cavin_pyro.evaluation.success.predictors import SUCCESS_PREDICTORS
 from tests.cavin_pyro.evaluation.test_rows import ROW
 
 INTERCEPT, PER_METRE, IF_REACHES = 1.0, -4.0, 1.5  # of the log odds; 60 pushes are left
@@ -24,7 +24,7 @@ def rows(count: int, *, seed: int = 0) -> list[dict[str, Any]]:
         plans = int(generator.integers(1, 3))
         distance, reaches = float(generator.uniform(0.0, 1.0)), int(generator.random() < 0.5)
         success = generator.random() < expit(INTERCEPT + PER_METRE * distance + IF_REACHES * reaches)
-        columns: dict[str, list[Any]] = {name: [0.0] * plans for name in PROSPECTS}
+        columns: dict[str, list[Any]] = {name: [0.0] * plans for name in SUCCESS_PREDICTORS}
         columns |= {"distance": [distance] * plans, "reaches": [reaches] * plans, "pushes_left": [60] * plans}
         columns |= {name: [None] * plans for name in ("way", "way_after")}
         end = "success" if success else "timeout"

@@ -13,7 +13,7 @@ from scipy.special import expit
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.success.calibration import calibration
 from cavin_pyro.evaluation.success.fit import by_planner, fit, logistic, read_evaluation
-from cavin_pyro.evaluation.success.prospects import plans_of
+from cavin_pyro.evaluation.success.predictors import plans_of
 from tests.cavin_pyro.evaluation.success.made_up import IF_REACHES, INTERCEPT, PER_METRE, evaluation, rows
 
 
@@ -92,7 +92,7 @@ def test_episodes_that_tell_nothing_are_refused(tmp_path: Path) -> None:
     folder = evaluation(tmp_path / "a", 5)
     older = [{name: value for name, value in row.items() if name != "prospects"} for row in rows(5)]
     (folder / "episodes.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in older))
-    with pytest.raises(UserError, match="holds no prospects"):
+    with pytest.raises(UserError, match="holds no success predictors"):
         read_evaluation(folder)
     (folder / "episodes.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows(5)))
     with pytest.raises(UserError, match="5 episodes of mine are too few for a fit: evaluate at least 10"):

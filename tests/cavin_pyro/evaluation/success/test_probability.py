@@ -11,8 +11,8 @@ import pytest
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.success.fit import fit, read_evaluation, write_regressions
+from cavin_pyro.evaluation.success.predictors import plans_of
 from cavin_pyro.evaluation.success.probability import Regression, Unfitted, probability_for, read_regressions
-from cavin_pyro.evaluation.success.prospects import plans_of
 from tests.cavin_pyro.evaluation.success.made_up import evaluation, rows
 
 

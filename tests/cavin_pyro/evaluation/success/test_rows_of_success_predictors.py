@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from cavin_pyro.evaluation.success.predictors import PREDICTORS, without_progress
-from cavin_pyro.evaluation.success.prospects import PROSPECTS, columns_of, plans_of, prospects_of
+from cavin_pyro.evaluation.success.predictors import SUCCESS_PREDICTORS, columns_of, plans_of, success_predictors
+from cavin_pyro.evaluation.success.regressors import REGRESSORS, without_progress
 from planning import RandomPlanner
-from planning.plan import Prospects
+from planning.plan import SuccessPredictors
 from tests.cavin_pyro.visualization.test_figures import made_up_plan, state
 
 MASK = np.arange(5) < 3
@@ -17,17 +17,19 @@ MASK = np.arange(5) < 3
 
 def told() -> dict[str, float]:
     plan = made_up_plan()._replace(
-        prospects=Prospects(*(torch.tensor([value]) for value in (0.123456789, 0.25, math.nan, math.nan))),
+        success_predictors=SuccessPredictors(
+            *(torch.tensor([value]) for value in (0.123456789, 0.25, math.nan, math.nan))
+        ),
         expected_success=torch.tensor([True]),
     )
-    found = prospects_of(plan, step=2, pushes_left=58, distance=0.5, mask=MASK)
+    found = success_predictors(plan, step=2, pushes_left=58, distance=0.5, mask=MASK)
     assert found is not None
     return dict(found)
 
 
 def test_a_plan_tells_every_number_as_its_row_has_it() -> None:
     found = told()
-    assert list(found) == list(PROSPECTS)
+    assert list(found) == list(SUCCESS_PREDICTORS)
     assert found["reaching"] == 0.12346 and found["reaches"] == 1 and found["objects"] == 3
     assert found["tracking"] == pytest.approx(0.0, abs=1e-6)
     columns = columns_of([found, found])
@@ -37,7 +39,7 @@ def test_a_plan_tells_every_number_as_its_row_has_it() -> None:
 
 def test_a_planner_that_predicts_nothing_tells_nothing() -> None:
     plan = RandomPlanner().plan(state(), [torch.Generator().manual_seed(0)])
-    assert prospects_of(plan, step=0, pushes_left=60, distance=0.5, mask=MASK) is None
+    assert success_predictors(plan, step=0, pushes_left=60, distance=0.5, mask=MASK) is None
     assert columns_of([None, None]) is None is columns_of([])
 
 
@@ -49,7 +51,7 @@ def test_progress_counts_from_the_last_two_centimetres() -> None:
 
 def test_every_predictor_is_a_number_and_reads_only_the_past() -> None:
     first, second = {**told(), "way": 0.5, "way_after": 0.2}, {**told(), "way": 0.1, "way_after": 0.0}
-    for name, predictor in PREDICTORS.items():
-        assert math.isfinite(predictor.value([first, second])), name
-    assert PREDICTORS["metres per push left"].value([first, second]) == pytest.approx(0.1 / 58)
-    assert PREDICTORS["metres per push left"].value([told()]) == pytest.approx(0.5 / 58)  # the task's distance
+    for name, regressor in REGRESSORS.items():
+        assert math.isfinite(regressor.value([first, second])), name
+    assert REGRESSORS["metres per push left"].value([first, second]) == pytest.approx(0.1 / 58)
+    assert REGRESSORS["metres per push left"].value([told()]) == pytest.approx(0.5 / 58)  # the task's distance
