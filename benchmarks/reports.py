@@ -18,6 +18,7 @@ from typing import Any
 sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.verdicts.verdict import RENAMED
 from cavin_pyro.storage.files import read_json
 
 Values = Mapping[str, Any]
@@ -217,7 +218,7 @@ def cell(report: Values, place: str, written: Callable[[Any], str]) -> str:
 
 def verdict(section: Values) -> str:
     level: str = section["verdict"]["level"]
-    return NOTHING if level == "none" else level
+    return NOTHING if level == "none" else RENAMED.get(level, level)
 
 
 def table(head: str, reports: Mapping[str, Values], rows: Iterable[tuple[str, str, Callable[[Any], str]]]) -> str:

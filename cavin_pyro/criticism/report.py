@@ -6,7 +6,7 @@ Keys of report.json:
                 `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check),
                 `graph` of the program (see `cavin_pyro.criticism.graph`)
-    sections    by name: `title`, `verdict` (`level`: good, look, bad, too few or none; `rule`; `advice`, what to do
+    sections    by name: `title`, `verdict` (`level`: good, inspect, bad, too few or none; `rule`; `advice`, what to do
                 next), `findings` (sentences) and `values`, which the section's function documents
 
 Floats have six significant digits; non-finite numbers are null.

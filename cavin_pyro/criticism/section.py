@@ -36,7 +36,7 @@ class Section:
     Attributes:
         name: key in report.json. title: heading. explanation: the measurement, its data, and how to read it.
         findings: of this run, a sentence each, derived from the values.
-        verdict: good, look or bad, by which rule, and what to do next.
+        verdict: good, inspect or bad, by which rule, and what to do next.
         values: for report.json: numbers, strings, lists and dictionaries of them.
     """
 

@@ -68,9 +68,9 @@ def cascade() -> Report:
     words = "all codes: at least 19 nats short; k-hat is above 0.67 for 34% of the windows (28% to 41%)."
     guide_error = {"joint": {"rises": rises, "pareto_k": {"above_limit": 0.34}}, "motion_code": {"rises": rises}}
     sections = {
-        "elbo": section("The ELBO", "look", {"difference": difference}),
+        "elbo": section("The ELBO", "inspect", {"difference": difference}),
         "guide_error": section(
-            "The guide", "look", {**guide_error, "effect_code_given_subgoal": {"rises": rises}}, words
+            "The guide", "inspect", {**guide_error, "effect_code_given_subgoal": {"rises": rises}}, words
         ),
         "amortization": section(
             "The gap", "bad", {"gap": error(17.25), "gap_median": 5.379, "approximation_gap": error(0.7)}
@@ -104,13 +104,13 @@ def cascade() -> Report:
         ),
         "growth": section(
             "Growth",
-            "look",
+            "inspect",
             {
                 "errors": {name: [{"mean": 0.025}, {"mean": 0.08}, {"mean": 0.127}] for name in "fh"},
                 "relative": interval(0.6),
             },
         ),
-        "consistency": section("Consistency", "look", {"selections": selections}),
+        "consistency": section("Consistency", "inspect", {"selections": selections}),
     }
     about = {"windows": {"training": 2000, "validation": 1624}, "episodes": {"training": 1556, "validation": 437}}
     return {"about": about, "sections": sections}
@@ -176,7 +176,7 @@ def test_a_model_with_both_codes_has_every_figure(shown: dict[str, list[str]]) -
 
 def test_what_does_not_apply_to_a_model_is_a_dash(shown: dict[str, list[str]]) -> None:
     assert {label: shown[label][1] for label in ("The ELBO", "The prior", "Consistency")} == {
-        "The ELBO": "look",
+        "The ELBO": "inspect",
         "The prior": "-",
         "Consistency": "-",
     }
@@ -202,6 +202,19 @@ def test_another_report_changes_the_verdict_and_the_figure_that_it_changes_and_n
         "a guide's and a prior's codes told apart": ["78 % (76 to 81)", "55 % (53 to 58)"],
         "stated scale over RMS error: starts of pushes of g": ["1.40 (1.38 to 1.43)", "-"],
     }
+
+
+def test_a_report_with_an_old_level_is_shown_with_the_new_one(
+    reports: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = cascade()
+    for section in old["sections"].values():
+        if section["verdict"]["level"] == "inspect":
+            section["verdict"]["level"] = "look"
+    folders = written(tmp_path / "old", old), written(tmp_path / "new", cascade())
+    found = tables(reports, capsys, monkeypatch, *folders)
+    assert found["The ELBO"] == ["inspect", "inspect"]
+    assert all(len(set(cells)) == 1 for label, cells in found.items() if not label.startswith(("section", "fig")))
 
 
 @pytest.mark.parametrize(

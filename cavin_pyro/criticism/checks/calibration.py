@@ -28,7 +28,7 @@ from cavin_pyro.criticism.statistics.predictions import (
     transform,
 )
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdicts.verdict import LOOK, Verdict, conclude, within, worst
+from cavin_pyro.criticism.verdicts.verdict import INSPECT, Verdict, conclude, within, worst
 from models.model import Model
 from models.state import Window
 
@@ -143,7 +143,7 @@ def _scales(
 
 def _verdict(scales: Mapping[str, Scale], episodes: Tensor) -> Verdict:
     levels = {name: within(one.ratio.low, one.ratio.high, good=GOOD, bad=BAD) for name, one in scales.items()}
-    level = worst(levels.values()) if levels else LOOK
+    level = worst(levels.values()) if levels else INSPECT
     named = ", ".join(SCALES[name][0] for name, one in levels.items() if one == level)
     rule = (
         f"Every stated scale over the RMS error: good if the 95 % interval over episodes lies within {GOOD[0]:.2f} to "

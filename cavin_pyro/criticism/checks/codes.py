@@ -25,7 +25,7 @@ from cavin_pyro.criticism.statistics.inference.simulation import simulate, simul
 from cavin_pyro.criticism.statistics.prior.classifier import divergence_bound, held_out_logits
 from cavin_pyro.criticism.statistics.prior.features import describe
 from cavin_pyro.criticism.statistics.windows import seeded
-from cavin_pyro.criticism.verdicts.verdict import BAD, GOOD, LOOK, Verdict, conclude, worst
+from cavin_pyro.criticism.verdicts.verdict import BAD, GOOD, INSPECT, Verdict, conclude, worst
 from cavin_pyro.training.elbo import window_terms
 from models.model import Model
 from models.state import Window
@@ -146,7 +146,7 @@ def _verdict(values: dict[str, Any], codes: tuple[str, ...], episodes: Tensor) -
     for name in codes:
         rate = values[name]["kl"]
         low, high = (rate["mean"] + sign * NORMAL * rate["standard_error"] for sign in (-1, 1))
-        levels.append(GOOD if low >= USED and values[name]["active"] else BAD if high <= UNUSED else LOOK)
+        levels.append(GOOD if low >= USED and values[name]["active"] else BAD if high <= UNUSED else INSPECT)
     rule = (
         f"Good if every code has an active dimension and costs more than {USED:g} nats at the lower end of its 95 % "
         f"interval over episodes; bad if one costs less than {UNUSED:g} at the upper end: it has collapsed."

@@ -18,7 +18,7 @@ from cavin_pyro.criticism.statistics.clusters import Interval, mean_interval
 from cavin_pyro.criticism.statistics.pushing import Nearness, Statistic, statistics_of
 from cavin_pyro.criticism.statistics.replicates import compare, replicate, summaries
 from cavin_pyro.criticism.statistics.windows import Outcome, generated, observed, seeded
-from cavin_pyro.criticism.verdicts.verdict import LOOK, Verdict, conclude, grade, worst
+from cavin_pyro.criticism.verdicts.verdict import INSPECT, Verdict, conclude, grade, worst
 
 SOURCES = {
     "prior_means": "prior, as planned",
@@ -128,7 +128,7 @@ def _verdict(effects: dict[str, Interval], labels: dict[str, str], episodes: Ten
         for name, effect in effects.items()
         if math.isfinite(effect.mean)
     }
-    level = worst(graded.values()) if graded else LOOK
+    level = worst(graded.values()) if graded else INSPECT
     named = [f"{labels[name]} ({effects[name].mean:+.2f})" for name, one in graded.items() if one == level]
     rule = (
         "The difference of each statistic, as planned, from the observed one, in standard deviations of single "

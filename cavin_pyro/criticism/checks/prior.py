@@ -23,7 +23,7 @@ from cavin_pyro.criticism.statistics.prior.expected_coverage import (
 from cavin_pyro.criticism.statistics.prior.features import decode, describe
 from cavin_pyro.criticism.statistics.pushing import Nearness, push_starts
 from cavin_pyro.criticism.statistics.windows import observed, seeded
-from cavin_pyro.criticism.verdicts.verdict import LOOK, Verdict, conclude, grade, worst
+from cavin_pyro.criticism.verdicts.verdict import INSPECT, Verdict, conclude, grade, worst
 from models.model import Model
 from models.state import State, Window
 
@@ -205,7 +205,7 @@ def _verdict(
         "Have the planner choose among many samples instead of trusting one; train with prior=mixture, or for "
         "longer, and check again."
     )
-    return conclude(worst(levels) if levels else LOOK, rule, advice, windows=len(episodes), episodes=episodes)
+    return conclude(worst(levels) if levels else INSPECT, rule, advice, windows=len(episodes), episodes=episodes)
 
 
 def _findings(

@@ -1,4 +1,4 @@
-"""Verdicts of sections: good, look or bad, by a rule that is printed with them; a warning where too little was seen.
+"""Verdicts of sections: good, inspect or bad, by a rule that is printed with them; a warning where too little was seen.
 
 A verdict rests on the size of an effect and its interval over episodes, never on a large p: a test that finds nothing
 may have been too weak.
@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-GOOD, LOOK, BAD = "good", "look", "bad"
+GOOD, INSPECT, BAD = "good", "inspect", "bad"
 FEW = "too few"  # windows or episodes for a conclusion
 NONE = "none"  # nothing of the kind in this model
-SEVERITY = (NONE, GOOD, LOOK, BAD)
+SEVERITY = (NONE, GOOD, INSPECT, BAD)
+RENAMED = {"look": INSPECT}  # in reports of older versions: old level, new level
 MINIMUM_WINDOWS = 100
 MINIMUM_EPISODES = 50
 
@@ -24,7 +25,7 @@ class Verdict:
     """What a section concludes.
 
     Attributes:
-        level: good, look, bad, too few or none. rule: how it came about. advice: what to do next.
+        level: good, inspect, bad, too few or none. rule: how it came about. advice: what to do next.
     """
 
     level: str
@@ -35,10 +36,10 @@ class Verdict:
 def grade(low: float, high: float, *, good: float, bad: float) -> str:
     """Of an effect that should be small, with the ends of its interval.
 
-    good: even the upper end is at most `good`. bad: even the lower end is at least `bad`. look: all between, and what
-    is not known.
+    good: even the upper end is at most `good`. bad: even the lower end is at least `bad`. inspect: all between, and
+    what is not known.
     """
-    return GOOD if high <= good else BAD if low >= bad else LOOK
+    return GOOD if high <= good else BAD if low >= bad else INSPECT
 
 
 def within(low: float, high: float, *, good: tuple[float, float], bad: tuple[float, float]) -> str:
@@ -48,7 +49,7 @@ def within(low: float, high: float, *, good: tuple[float, float], bad: tuple[flo
     """
     if low >= good[0] and high <= good[1]:
         return GOOD
-    return BAD if high < bad[0] or low > bad[1] else LOOK
+    return BAD if high < bad[0] or low > bad[1] else INSPECT
 
 
 def worst(levels: Iterable[str]) -> str:

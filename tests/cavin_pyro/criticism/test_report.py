@@ -80,7 +80,7 @@ def section(**changes: Any) -> Section:
         "explanation": "One.\n\nTwo <em>.",
         "findings": ['It is "<b>bold</b>".'],
         "values": {"rate": np.float32(1 / 3), "list": torch.arange(2), "none": math.nan, "far": [math.inf]},
-        "verdict": Verdict("look", "By <s>rule</s>.", "Do <i>this</i>."),
+        "verdict": Verdict("inspect", "By <s>rule</s>.", "Do <i>this</i>."),
         "tables": [Table(["name", "x<y"], [["<a>", 0.12345], ["b", math.nan], ["c", -math.inf]], digits=2)],
         "pictures": [
             Picture("sampled", "Lines <u>.", figure(photograph=False)),

@@ -44,15 +44,15 @@ def test_what_cannot_be_known_has_no_interval() -> None:
 def test_levels_follow_the_interval_not_the_estimate() -> None:
     assert [grade(*ends, good=1, bad=2) for ends in ((0, 1), (0, 1.5), (1.5, 3), (2, 9))] == [
         "good",
-        "look",
-        "look",
+        "inspect",
+        "inspect",
         "bad",
     ]
-    assert grade(math.nan, math.nan, good=1, bad=2) == "look"
+    assert grade(math.nan, math.nan, good=1, bad=2) == "inspect"
     bands = {"good": (0.86, 0.94), "bad": (0.8, 0.98)}
     ends = ((0.87, 0.93), (0.84, 0.92), (0.6, 0.7), (0.985, 1.0), (0.7, 0.95))
-    assert [within(*one, **bands) for one in ends] == ["good", "look", "bad", "bad", "look"]
-    assert worst(["good", "bad", "look"]) == "bad" and worst([]) == "none"
+    assert [within(*one, **bands) for one in ends] == ["good", "inspect", "bad", "bad", "inspect"]
+    assert worst(["good", "bad", "inspect"]) == "bad" and worst([]) == "none"
 
 
 def test_too_little_gives_a_warning_in_place_of_a_verdict() -> None:
