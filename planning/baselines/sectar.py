@@ -68,9 +68,9 @@ class SectarPlanner(SearchingPlanner):
         failures = None
         if self.robustness is not None:
             returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
-            hopeful, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, returns, generators)
-            best = torch.where(hopeful, robust.number, best)
-            failures = torch.where(hopeful, robust.failures, torch.nan)
+            finite, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, returns, generators)
+            best = torch.where(finite, robust.number, best)
+            failures = torch.where(finite, robust.failures, torch.nan)
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
         # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
