@@ -101,7 +101,8 @@ def test_errors_of_mistakes_are_those_of_the_page(tmp_path: Path) -> None:
     assert {name: answer.status for name, answer in answers.items()} == dict.fromkeys(cases, 2), answers
     for name, answer in answers.items():
         (line,) = answer.complaints
-        assert is_told(line.removeprefix("error: ")), f"{name}: {line}"
+        # Where a planner cannot be built, a command names the option as typed.
+        assert is_told(line.removeprefix("error: ").removeprefix("planner.")), f"{name}: {line}"
 
 
 def test_other_errors_of_a_users_class_keep_their_traceback(tmp_path: Path) -> None:
