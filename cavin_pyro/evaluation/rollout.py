@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.evaluation.success.predictors import SuccessPredictors, success_predictors
+from cavin_pyro.evaluation.success.predictors import PredictorValues, success_predictors
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
 from models.networks.geometry import Geometry
@@ -43,7 +43,7 @@ class PlanRecord:
     milliseconds: float
     photograph: NDArray[np.uint8] | None = None
     clouds: NDArray[np.float32] | None = None
-    success_predictors: SuccessPredictors | None = None
+    success_predictors: PredictorValues | None = None
     success_probability: float | None = None
 
     @property
@@ -139,7 +139,7 @@ def rollout(
     seed: int,
     pushes_per_plan: int | None = None,
     photograph: bool = False,
-    probability: Callable[[Sequence[SuccessPredictors]], float | None] | None = None,
+    probability: Callable[[Sequence[PredictorValues]], float | None] | None = None,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
 ) -> Episode:

@@ -16,7 +16,7 @@ from scipy.special import expit
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.success.configuration import Situation, joined, situation_of
-from cavin_pyro.evaluation.success.predictors import SuccessPredictors, plans_of
+from cavin_pyro.evaluation.success.predictors import PredictorValues, plans_of
 from cavin_pyro.evaluation.success.probability import FORMAT, Regression
 from cavin_pyro.evaluation.success.regressors import REGRESSORS
 from cavin_pyro.storage.files import write_json
@@ -98,7 +98,7 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
     )
 
 
-def regressors_of(plans: Sequence[SuccessPredictors]) -> Array:
+def regressors_of(plans: Sequence[PredictorValues]) -> Array:
     """The regressors of every plan of an episode: [plans, regressors]; NaN for what its planner does not know."""
     sofar = [plans[: number + 1] for number in range(len(plans))]
     return np.array([[regressor.value(some) for regressor in REGRESSORS.values()] for some in sofar], dtype=np.float64)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from planning import Plan
 
-SuccessPredictors = Mapping[str, float]  # the numbers of one plan, by name; NaN where its planner does not know one
+PredictorValues = Mapping[str, float]  # the numbers of one plan, by name; NaN where its planner does not know one
 Columns = Mapping[str, Sequence[float | None]]  # those of all plans of an episode, as in its row: None for NaN
 DIGITS = 5  # significant ones, of numbers in a row
 
@@ -33,7 +33,7 @@ SUCCESS_PREDICTORS = {
 
 def success_predictors(
     plan: Plan, *, step: int, pushes_left: int, distance: float, mask: NDArray[np.bool_]
-) -> SuccessPredictors | None:
+) -> PredictorValues | None:
     """The numbers `SUCCESS_PREDICTORS` of a plan for one environment; None if its planner predicts nothing.
 
     Args:
@@ -59,7 +59,7 @@ def success_predictors(
     return {name: _rounded(value) for name, value in numbers.items()}
 
 
-def columns_of(plans: Sequence[SuccessPredictors | None]) -> dict[str, list[float | None]] | None:
+def columns_of(plans: Sequence[PredictorValues | None]) -> dict[str, list[float | None]] | None:
     """The numbers of all plans of an episode by name, for its row; None if its planner predicts nothing."""
     known = [plan for plan in plans if plan is not None]
     if not known or len(known) < len(plans):
@@ -67,7 +67,7 @@ def columns_of(plans: Sequence[SuccessPredictors | None]) -> dict[str, list[floa
     return {name: [_known(plan[name]) for plan in known] for name in SUCCESS_PREDICTORS}
 
 
-def plans_of(columns: Columns) -> list[SuccessPredictors]:
+def plans_of(columns: Columns) -> list[PredictorValues]:
     """The numbers of each plan, from an episode's row."""
     lines = zip(*(columns[name] for name in SUCCESS_PREDICTORS), strict=True)
     return [

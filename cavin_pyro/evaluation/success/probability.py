@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.success.configuration import Scenes, planner_mismatch, situation
-from cavin_pyro.evaluation.success.predictors import SuccessPredictors
+from cavin_pyro.evaluation.success.predictors import PredictorValues
 from cavin_pyro.evaluation.success.regressors import REGRESSORS
 from cavin_pyro.storage.files import read_json
 
@@ -44,7 +44,7 @@ class Regression:
     successes: int
     plans: int
 
-    def __call__(self, plans: Sequence[SuccessPredictors]) -> float | None:
+    def __call__(self, plans: Sequence[PredictorValues]) -> float | None:
         """P(success | the last of an episode's plans so far); None if it does not tell what the fit needs."""
         odds = self.intercept + sum(slope * REGRESSORS[name].value(plans) for name, slope in self.slopes.items())
         if not math.isfinite(odds):
@@ -58,7 +58,7 @@ class Unfitted:
 
     why: str
 
-    def __call__(self, plans: Sequence[SuccessPredictors]) -> None:
+    def __call__(self, plans: Sequence[PredictorValues]) -> None:
         """No number is better than a wrong one."""
         return None
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from cavin_pyro.evaluation.success.predictors import SuccessPredictors
+from cavin_pyro.evaluation.success.predictors import PredictorValues
 
 FEW = 1e-3  # added to the share of candidates before its logarithm: about one of 1,024
 CLOSER = 0.02  # metres; less is no progress
@@ -19,15 +19,15 @@ class Regressor(NamedTuple):
     """
 
     sign: int
-    value: Callable[[Sequence[SuccessPredictors]], float]
+    value: Callable[[Sequence[PredictorValues]], float]
 
 
-def left(plan: SuccessPredictors) -> float:
+def left(plan: PredictorValues) -> float:
     """Metres left to the goal: along allowed places where guidance knows them, else by the task's potential."""
     return plan["distance"] if math.isnan(plan["way"]) else plan["way"]
 
 
-def without_progress(plans: Sequence[SuccessPredictors]) -> int:
+def without_progress(plans: Sequence[PredictorValues]) -> int:
     """Pushes since the distance left was last shortened by `CLOSER`."""
     nearest, since = math.inf, plans[0]["step"]
     for plan in plans:
