@@ -104,6 +104,12 @@ def standard_features(values: Tensor) -> Tensor:
     return values * values.square().sum(0, keepdim=True).rsqrt()
 
 
+def mean_extent(features: Tensor) -> Tensor:
+    """Metres from the centre to the outline, on average over directions: `features: [..., 64]` -> `[...]`."""
+    scaled = features[..., 0] / (STANDARD_UNIT * features[..., -1].clamp_min(0.02))
+    return OUTLINE_UNIT * (OUTLINE_MEAN + OUTLINE_SPREAD * scaled)
+
+
 def outline_values(features: Tensor) -> Tensor:
     """`features: [..., 64]` -> `[..., 63]`: series of three outlines and heights, in units of 0.05 m."""
     values = standard_values(features.movedim(-1, 0)).movedim(0, -1)
@@ -116,8 +122,8 @@ def turned(outlines: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
     `outlines: [L, 2 K + 1, ...]` series; `cosines, sines: [K, ...]` of 1 to K times the angle of the new x axis.
     """
     mean, real, imaginary = outlines.split((1, HARMONICS, HARMONICS), 1)
-    new_real = real * cosines - imaginary * sines
-    new_imaginary = real * sines + imaginary * cosines
+    new_real = torch.addcmul(real * cosines, imaginary, sines, value=-1)
+    new_imaginary = torch.addcmul(real * sines, imaginary, cosines)
     return torch.cat((mean.expand(-1, 1, *new_real.shape[2:]), new_real, new_imaginary), 1)
 
 
@@ -128,27 +134,24 @@ def supports(outlines: Tensor, cosines: Tensor, sines: Tensor) -> tuple[Tensor, 
     direction's angle in the axes of the series. Only signs differ: order k, a quarter further on, is i^k times itself.
     """
     mean, real, imaginary = outlines.split((1, HARMONICS, HARMONICS))
-    along = real * cosines - imaginary * sines
-    across = real[::2] * sines[::2] + imaginary[::2] * cosines[::2]  # odd orders
-    even, odd = along[1::2], along[::2].sum(0)
-    even, alternating = even.sum(0), even[1::2].sum(0) - even[::2].sum(0)
-    side = across[1::2].sum(0) - across[::2].sum(0)
+    along = torch.addcmul(real * cosines, imaginary, sines, value=-1)
+    across = torch.addcmul(real[::2] * sines[::2], imaginary[::2], cosines[::2])  # odd orders
+    odd, even = along.unflatten(0, (-1, 2)).sum(0)
+    sides = torch.stack((across, along[1::2]), 1)
+    side, alternating = sides[1::2].sum(0) - sides[::2].sum(0)
     mean, unit = OUTLINE_UNIT * mean.squeeze(0), 2.0 * OUTLINE_UNIT
+    on_axis, beside = torch.add(mean, even, alpha=unit), torch.add(mean, alternating, alpha=unit)
     return (
-        mean + unit * (even + odd),
-        mean + unit * (even - odd),
-        mean + unit * (alternating + side),
-        mean + unit * (alternating - side),
+        torch.add(on_axis, odd, alpha=unit),
+        torch.sub(on_axis, odd, alpha=unit),
+        torch.add(beside, side, alpha=unit),
+        torch.sub(beside, side, alpha=unit),
     )
 
 
-def multiples(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine `[...]` of an angle -> those of 1 to K times the angle, `[K, ...]` each."""
-    cosines, sines = cosine.unsqueeze(0), sine.unsqueeze(0)
-    while len(cosines) < HARMONICS:  # the angles so far, and these added to the largest of them
-        largest, other = cosines[-1], sines[-1]
-        cosines, sines = (
-            torch.cat((cosines, cosines * largest - sines * other)),
-            torch.cat((sines, sines * largest + cosines * other)),
-        )
-    return cosines[:HARMONICS], sines[:HARMONICS]
+def multiples(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosines and sines of 1 to K times the angle of vectors `[...]`, of any length: `[K, ...]` each; 0 has angle 0."""
+    nothing = (x == 0) & (y == 0)
+    angle = torch.atan2(y, torch.where(nothing, 1.0, x))  # whose gradient is finite
+    angles = torch.arange(1, HARMONICS + 1, device=angle.device).view(-1, *angle.dim() * [1]) * angle
+    return angles.cos(), angles.sin()

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from models.networks.shapes import fixed_shapes
 from planning import records
 from planning.backends import passes
 from planning.backends.cache import VARIABLE, CodeCache, UnsafeFolderError, default_folder
@@ -100,7 +101,7 @@ class Compiled:
             torch.set_num_threads(threads)  # setting it in a worker thread also changes it here
 
     def _first(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
-        with self._compiling, _distributions_unchecked():
+        with self._compiling, _distributions_unchecked(), fixed_shapes():
             if version not in self._versions:  # another thread may have made it
                 try:
                     self._versions[version] = self._make(version, function, tensors)

@@ -106,7 +106,7 @@ class EpisodeConfig(DeviceOptions):
         group="planning",
     )
     matmul_precision: str = option(
-        "bfloat16",
+        "float32",
         "precision of the factors of matrix products in plans; bfloat16 is TF32 on a GPU",
         choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
         group="planning",

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import permutations
 
 import torch
 from torch import Tensor, nn
 
 from models.networks.contact.objects import PAIR_MEASURES, pair_contact
+from models.networks.contact.reach import in_reach
+from models.networks.contact.rows import ChosenRows, EveryRow, Pairs, Rows, components_first, near_pairs
 from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, ToolContact, endpoints
 from models.networks.dynamics import PushOutcome
 from models.networks.layers import fully_connected, relative_positions
-from models.networks.neighbours import nearest_pairs
 from models.networks.outline import (
     FEATURES,
     HEIGHTS,
@@ -21,11 +21,13 @@ from models.networks.outline import (
     SPREAD,
     TYPICAL,
     Outline,
+    mean_extent,
     multiples,
     standard_features,
     standard_values,
     turned,
 )
+from models.networks.shapes import shapes_are_fixed
 from models.state import State
 
 MAXIMUM_DISPLACEMENT = 0.2  # metres, by one push, along each axis
@@ -47,10 +49,15 @@ class ContactDynamics(PushOutcome):
 
     Of more than `neighbours` others the nearest enter relation_i. Both changes are turned back. It takes no features of
     the state encoder. Equivariant to the order of objects; padding does not change and does not affect other objects.
+
+    With a `reach_margin` objects out of the push's reach (`models.networks.contact.reach.in_reach`) stay as they are,
+    to within `still_scale`, do not enter relations, and are not computed where shapes may depend on values
+    (`models.networks.shapes`).
     """
 
     typical: Tensor  # [2 K + 1]
     spread: Tensor
+    still_scale: Tensor  # [2] logarithms, of centres and of features, as the layers predict them
 
     geometry = Outline
     reads_encoding = False
@@ -64,14 +71,19 @@ class ContactDynamics(PushOutcome):
         object_width: int = 128,
         pair_width: int = 48,
         shape_width: int = 64,
+        reach_margin: float | None = None,
     ) -> None:
         """Widths of the layers for an object, a pair and an object's shape; `width`, of the state encoder, is not read.
 
-        Raises `ValueError` for features that are no outlines.
+        `reach_margin`: metres, by which a push may pass an object that it can move; None, and all are within reach.
+        Raises `ValueError` for features that are no outlines and for a negative margin.
         """
         if feature_dimension != FEATURES:
             raise ValueError(f"dynamics=contact reads outlines with {FEATURES} numbers, not {feature_dimension}")
+        if reach_margin is not None and not reach_margin >= 0:
+            raise ValueError(f"reach_margin must be null or at least 0 metres, not {reach_margin}")
         super().__init__()
+        self.reach_margin = reach_margin
         self.contact = ToolContact()
         self.object = nn.Sequential(fully_connected(INPUTS, object_width), fully_connected(object_width, object_width))
         self.alone = nn.Linear(object_width, 2)
@@ -86,98 +98,110 @@ class ContactDynamics(PushOutcome):
         nn.init.zeros_(self.shape_head.bias)
         for name, values in (("typical", TYPICAL), ("spread", SPREAD)):
             self.register_buffer(name, values[:PER_OUTLINE].clone(), persistent=False)
+        if reach_margin is None:
+            self.register_buffer("still_scale", torch.zeros(2), persistent=False)  # of padding, which is not read
+        else:
+            self.still_scale = nn.Parameter(torch.zeros(2))
+
+    def forward(self, state: State, encoded: Tensor | None, action: Tensor) -> State:
+        """See `PushOutcome`; `encoded` is ignored."""
+        return self._predict(state, action)[0]
 
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor]:
         """The mean and scales of `state: [...]` after `action: [..., 4]`, see `PushOutcome`; `encoded` is ignored."""
+        mean, rows, scales = self._predict(state, action)
+        still = _scales(self.still_scale.unsqueeze(1)).T.expand(state.objects, -1)
+        return mean, rows.write(still, _scales(scales))
+
+    def _predict(self, state: State, action: Tensor) -> tuple[State, Rows, Tensor]:
+        """The mean `[...]`, what was computed, and logarithms of its scales `[2, R, ...]`."""
         # In here components come first and objects second, [C, M, ...]: loops then run over candidates.
         start, motion = (values.movedim(-1, 0).contiguous().unsqueeze(1) for values in endpoints(action))  # [2, 1, ...]
-        length = motion.square().sum(0).clamp_min(1e-8).sqrt()
-        cosine, sine = direction = motion / length
-        cosines, sines = multiples(cosine, sine)  # [K, 1, ...]
+        length = motion.square().sum(0, keepdim=True).clamp_min(1e-8).sqrt()
+        direction = motion / length
 
         ranks = action.dim() - 1
-        centers, features, real = (_components_first(field, ranks) for field in (*state[:2], state.mask.unsqueeze(-1)))
-        x, y = centers[:2] - start
-        along, across = x * cosine + y * sine, y * cosine - x * sine  # [M, ...]
-        batch = along.shape
-        values = standard_values(features)
+        x, y = components_first(state.centers[..., :2], ranks) - start
+        place = _in_axes(x, y, *direction)  # [2, M, ...] along and across the push
+        real = components_first(state.mask.unsqueeze(-1), ranks).squeeze(0).expand(place.shape[1:])
+        near = near_pairs(place, real, self.neighbours)
+        rows = self._rows(state.features, place, length.squeeze(0), real)
+
+        # From here on objects are rows, [C, R, ...].
+        place, push = rows.of_objects(place), rows.of_objects(torch.cat((direction, length)))
+        direction, length = push.split((2, 1))
+        cosines, sines = multiples(*direction)  # [K, R, ...]
+        along, across = place.split(1)
+        centers, values = rows.of_fields(state.centers), standard_values(rows.of_fields(state.features))
         shape, heights = values.split((OUTLINES * PER_OUTLINE, HEIGHTS))
         shape = turned(shape.unflatten(0, (OUTLINES, PER_OUTLINE)), cosines, sines)
-        outline = _each(self.typical, batch) + _each(self.spread, batch) * shape[0]
-        contact = self.contact(along, across, outline, length)
-        table = _components_first(relative_positions(state.centers), ranks)
-        place = torch.stack((along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT))
-        parts = (place, (length / PUSH_UNIT).unsqueeze(0), shape.flatten(0, 1), heights, direction, table, contact)
-        each = torch.cat([part.expand(-1, *batch) for part in parts])
-        each = each.flatten(1).T  # [M ..., INPUTS]
+        outline = torch.addcmul(_each(self.typical, rows.shape), _each(self.spread, rows.shape), shape[0])
+        contact = self.contact(*place, outline, length.squeeze(0))
+        table = relative_positions(centers.movedim(0, -1)).movedim(-1, 0)
+        where = (along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT)
+        parts = (*where, shape.flatten(0, 1), heights, direction, table, contact)
+        each = torch.cat([part.expand(-1, *rows.shape) for part in parts])
+        each = each.flatten(1).T  # [R ..., INPUTS]
 
-        move, scale = self._motion(each, torch.stack((along, across)), outline, real.squeeze(0)).split((3, 1))
-        change = _unflat(self.shape_head(self.shape(each)), batch)
+        move, scale = self._motion(each, place, outline, rows, rows.pairs(near)).split((3, 1))
+        change = _unflat(self.shape_head(self.shape(each)), rows.shape)
         shape_change, heights_change, shape_scale = change.split((OUTLINES * PER_OUTLINE, HEIGHTS, 1))
-        forward, sideways, up = MAXIMUM_DISPLACEMENT * (move * (DISPLACEMENT_UNIT / MAXIMUM_DISPLACEMENT)).tanh() * real
-        moved = torch.stack((forward * cosine - sideways * sine, forward * sine + sideways * cosine, up))
+        forward, sideways, up = MAXIMUM_DISPLACEMENT * (move * (DISPLACEMENT_UNIT / MAXIMUM_DISPLACEMENT)).tanh()
+        cosine, sine = direction
+        moved = torch.stack((*_in_axes(forward, sideways, cosine, -sine), up))
         shape_change = turned(shape_change.unflatten(0, (OUTLINES, PER_OUTLINE)), cosines, -sines).flatten(0, 1)
         changed = standard_features(values + torch.cat((shape_change, heights_change)))
-        features = torch.where(real, changed, features)
-        spread = torch.cat(
-            ((0.2 * DISPLACEMENT_UNIT) * scale.clamp(-6.0, 3.0).exp(), 0.05 * shape_scale.clamp(-6.0, 3.0).exp())
-        )
-        centers, features, spread = (_components_last(field) for field in (centers + moved, features, spread))
-        return State(centers, features, state.mask.expand(centers.shape[:-1])), spread
+        new_centers = rows.write(state.centers, centers + moved)
+        mask = state.mask.expand(new_centers.shape[:-1])
+        return State(new_centers, rows.write(state.features, changed), mask), rows, torch.cat((scale, shape_scale))
 
-    def _motion(self, each: Tensor, place: Tensor, outline: Tensor, real: Tensor) -> Tensor:
-        """Motion in units of `DISPLACEMENT_UNIT` and the logarithm of its scale, `[4, M, ...]`.
+    def _rows(self, features: Tensor, place: Tensor, length: Tensor, real: Tensor) -> Rows:
+        """The objects that are computed: `features: [..., M, 64]`, `place: [2, M, ...]`, `real: [M, ...]`."""
+        if self.reach_margin is None:
+            return EveryRow(real)
+        with torch.no_grad():
+            radius = components_first(mean_extent(features).unsqueeze(-1), real.dim() - 1).squeeze(0)
+            along, across = place
+            counting = real & in_reach(along, across, length, radius.expand(real.shape), self.reach_margin)
+        return EveryRow(counting) if shapes_are_fixed() else ChosenRows(counting)
 
-        each: `[M ..., INPUTS]`. place: `[2, M, ...]`. outline: `[2 K + 1, M, ...]`. real: `[M, ...]`.
+    def _motion(self, each: Tensor, place: Tensor, outline: Tensor, rows: Rows, pairs: Pairs | None) -> Tensor:
+        """Motion in units of `DISPLACEMENT_UNIT` and the logarithm of its scale, `[4, R, ...]`.
+
+        each: `[R ..., INPUTS]`. place: `[2, R, ...]`. outline: `[2 K + 1, R, ...]`.
         """
-        batch, objects = place.shape[1:], len(place[0])
         alone = self.object(each)
-        motion = _unflat(self.alone(alone), batch)
+        motion = _unflat(self.alone(alone), rows.shape)
         relation = each.new_zeros(len(each), self.pair.out_features)
-        if objects > 1:
-            measures = pair_contact(place, outline, *_aim(motion.detach() * real))
-            pairs, second = _pairs(objects, each.device)
-            hidden = self.pair(measures.flatten(1, 2).index_select(1, pairs).flatten(1).T)
-            own, other = (layer(each).unflatten(0, (objects, -1)) for layer in (self.own, self.other))
-            hidden = hidden.unflatten(0, (objects, objects - 1, -1)) + own.unsqueeze(1)
-            hidden = (hidden.flatten(0, 1) + other.index_select(0, second)).relu_()
-            counts = real.expand(batch).index_select(0, second)
-            if self.neighbours is not None and objects - 1 > self.neighbours:
-                near = nearest_pairs(
-                    place.movedim((0, 1), (-1, -2)), real.expand(batch).movedim(0, -1), self.neighbours
-                )
-                counts = counts * near.movedim((-2, -1), (0, 1)).flatten(0, 1).index_select(0, pairs)
-            related = self.relation(hidden) * counts.flatten(1).unsqueeze(-1)
-            relation = related.unflatten(0, (objects, -1)).sum(1).flatten(0, 1)
-        after = self.head(self.second(torch.cat((alone, relation), -1)))
-        return torch.cat((motion, torch.zeros_like(motion))) + _unflat(after, batch)
+        if pairs is not None:
+            measures = pair_contact(place, outline, *_aim(motion.detach()), rows, pairs)
+            hidden = self.pair(measures.flatten(1).T)
+            hidden = hidden + rows.of_pairs(self.own, each, pairs.first) + rows.of_pairs(self.other, each, pairs.second)
+            related = self.relation(hidden.relu_()) * pairs.real.flatten().unsqueeze(-1)
+            relation = rows.sum_of_pairs(related, pairs)
+        after = _unflat(self.head(self.second(torch.cat((alone, relation), -1))), rows.shape)
+        return torch.cat((after[:2] + motion, after[2:]))
 
 
-def _components_first(values: Tensor, ranks: int) -> Tensor:
-    """`[..., M, C]` -> `[C, M, ...]`, with at least as many leading dimensions as `ranks`."""
-    values = values.movedim((-1, -2), (0, 1)).contiguous()
-    return values.reshape(values.shape[:2] + (ranks + 2 - values.dim()) * (1,) + values.shape[2:])
+def _in_axes(x: Tensor, y: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Vectors in axes that are turned by an angle: `[2, ...]`."""
+    return torch.stack((torch.addcmul(x * cosine, y, sine), torch.addcmul(y * cosine, x, sine, value=-1)))
 
 
-def _components_last(values: Tensor) -> Tensor:
-    """`[C, M, ...]` -> `[..., M, C]`, contiguous, for the next matrix product. Two copies are faster than one."""
-    return values.flatten(1).T.contiguous().unflatten(0, values.shape[1:]).movedim(0, -2).contiguous()
+def _scales(logarithms: Tensor) -> Tensor:
+    """`[2, ...]` -> scales of centres, in metres, and of features."""
+    center, shape = logarithms.clamp(-6.0, 3.0).exp()
+    return torch.stack(((0.2 * DISPLACEMENT_UNIT) * center, 0.05 * shape))
 
 
-def _each(values: Tensor, batch: Sequence[int]) -> Tensor:
-    """`[C]` -> `[C, 1, ..., 1]`, which broadcasts to `[C, *batch]`."""
-    return values.view(-1, *len(batch) * [1])
+def _each(values: Tensor, shape: Sequence[int]) -> Tensor:
+    """`[C]` -> `[C, 1, ..., 1]`, which broadcasts to `[C, *shape]`."""
+    return values.view(-1, *len(shape) * [1])
 
 
-def _unflat(values: Tensor, batch: Sequence[int]) -> Tensor:
-    """Rows `[prod(batch), C]` -> components `[C, *batch]`."""
-    return values.T.contiguous().unflatten(1, batch)
-
-
-def _pairs(objects: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Numbers of all ordered pairs of different objects, of `M^2`, and of the second object of each; M (M - 1)."""
-    pairs = torch.tensor([objects * i + j for i, j in permutations(range(objects), 2)], device=device)
-    return pairs, pairs % objects
+def _unflat(values: Tensor, shape: Sequence[int]) -> Tensor:
+    """A matrix `[prod(shape), C]` -> components `[C, *shape]`."""
+    return values.T.contiguous().unflatten(1, shape)
 
 
 def _aim(motion: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from models.networks.outline import DIRECTIONS, OUTLINE_UNIT, PER_OUTLINE, series
 
 REACH_LOW, REACH_HIGH = (0.30, -0.55), (0.80, 0.55)  # metres; where starts and ends of pushes may lie
+_REACH = torch.tensor((REACH_LOW, REACH_HIGH), dtype=torch.float64)
 PUSH_UNIT = 0.1  # metres, maximum motion of the tool along an axis
 DISPLACEMENT_UNIT = 0.05  # metres, a typical motion of an object
 TOOL_RADIUS = 0.01  # metres
@@ -26,6 +27,7 @@ class ToolContact(nn.Module):
 
     normals: Tensor  # [2, N] of N half planes: the E that are entered, as many that are left, and those beside
     extents: Tensor  # [N, 2 K + 1], from a series to metres in their directions
+    units: Tensor  # [MEASURES] units per metre
     slowness: Tensor  # [2 E], distance along the push per distance to the half plane; its negative for those left
 
     def __init__(self) -> None:
@@ -40,6 +42,8 @@ class ToolContact(nn.Module):
         weights[0] = OUTLINE_UNIT
         self.register_buffer("normals", normals, persistent=False)
         self.register_buffer("extents", series(angles) * weights, persistent=False)
+        lengths = 1 / PUSH_UNIT, 1 / DISPLACEMENT_UNIT, 1 / PUSH_UNIT, 1 / PUSH_UNIT, 1.0, 1.0, 1.0, 1 / PUSH_UNIT
+        self.register_buffer("units", torch.tensor(lengths), persistent=False)
         self.register_buffer("slowness", 1.0 / normals[0, : 2 * self.entered].abs(), persistent=False)
 
     def forward(self, along: Tensor, across: Tensor, outline: Tensor, length: Tensor) -> Tensor:
@@ -57,37 +61,27 @@ class ToolContact(nn.Module):
             (x, y) and its y if it hits at all; the distance from the start to the object, negative inside.
         """
         outline = outline.expand(-1, *along.shape)
-        extents = (self.extents @ outline.flatten(1)).unflatten(1, along.shape)
-        x, y = (each.view(-1, *along.dim() * [1]) for each in self.normals)
-        gaps = -(x * along + y * across) - extents - TOOL_RADIUS  # metres from start to half plane, positive outside
+        extents = (self.extents @ outline.flatten(1)).unflatten(1, along.shape) + TOOL_RADIUS
+        ones = along.dim() * [1]
+        x, y = (each.view(-1, *ones) for each in self.normals)
+        gaps = torch.addcmul(torch.addcmul(extents, x, along), y, across).neg()  # metres from start, positive outside
         crossed, beside = gaps[: 2 * self.entered], gaps[2 * self.entered :].amax(0)
-        times = crossed * self.slowness.view(-1, *along.dim() * [1])
+        times = crossed * self.slowness.view(-1, *ones)
         enter, leave = times[: self.entered].amax(0), -times[self.entered :].amax(0)
         chord = torch.where(beside > 0, -beside, leave - enter).clamp(-0.2, 0.2)
         rest = (length - enter).clamp(-0.1, 0.2)
         hit = ((chord > 0) & (rest > 0)).to(along.dtype)
-        sharp = ((times[: self.entered] - enter) / CORNER).softmax(0)
+        sharp = (times[: self.entered] / CORNER).softmax(0)
         normal_x, normal_y = (self.normals[:, : self.entered] @ sharp.flatten(1)).unflatten(1, along.shape)
-        return torch.stack(
-            (
-                enter.clamp(-0.2, 0.3) / PUSH_UNIT,
-                chord / DISPLACEMENT_UNIT,
-                rest / PUSH_UNIT,
-                rest * hit / PUSH_UNIT,
-                normal_x,
-                normal_y,
-                hit * normal_y,
-                crossed.amax(0) / PUSH_UNIT,
-            )
-        )
+        enter, inside = enter.clamp(-0.2, 0.3), crossed.amax(0)
+        measures = (enter, chord, rest, rest * hit, normal_x, normal_y, hit * normal_y, inside)
+        return torch.stack(measures) * self.units.view(-1, *ones)
 
 
 def endpoints(action: Tensor) -> tuple[Tensor, Tensor]:
     """Start and motion `[..., 2]` metres of normalised pushes `[..., 4]`, as the robot executes them."""
-    starts, motions = [], []
-    for axis, (low, high) in enumerate(zip(REACH_LOW, REACH_HIGH, strict=True)):  # numbers, no tensors, for compilers
-        start = low + (action[..., axis].clamp(-1.0, 1.0) + 1.0) * ((high - low) / 2.0)
-        end = (start + PUSH_UNIT * action[..., 2 + axis].clamp(-1.0, 1.0)).clamp(low, high)
-        starts.append(start)
-        motions.append(end - start)
-    return torch.stack(starts, -1), torch.stack(motions, -1)
+    low, high = _REACH.to(action)
+    action = action.clamp(-1.0, 1.0)
+    start = low + (action[..., :2] + 1.0) * ((high - low) / 2.0)
+    end = torch.add(start, action[..., 2:], alpha=PUSH_UNIT).clamp(low, high)
+    return start, end - start

@@ -109,9 +109,9 @@ def test_every_planner_plans_with_every_optimizer(
         ("cavin", "planner.warm_start=false"),
         ("cavin", "planner.motion_samples=1"),
         # perturbed rollouts are made of plans that reach the goal: here some do
-        ("cavin_without_effects task=clearing planner.horizon=30", "planner.robustness=null"),
+        ("cavin_without_effects task=clearing planner.horizon=30 objects=1", "planner.robustness=null"),
         ("cvae_mpc task=clearing planner.horizon=30", "planner.robustness=null"),
-        ("cavin", "matmul_precision=float32"),
+        ("cavin", "matmul_precision=bfloat16"),
         ("cavin_evolution", "planner.optimizer.generations=1"),
         ("mpc", "planner.stride_limits=[0.01,0.15]"),
         ("mpc", "planner.proposal=heuristic"),

@@ -98,7 +98,8 @@ def next_state(f: ContactDynamics, centers: Numbers, features: Numbers, action: 
     each = [connected("object.1", connected("object.0", one)) for one in inputs]
     moves = [layer("alone", one) for one in each]
     ways = [np.sqrt(max(move @ move, 1e-6)) for move in moves]
-    aims = [move / way for move, way in zip(moves, ways, strict=True)]
+    angles = [np.arctan2(move[1], move[0]) for move in moves]
+    aims = [np.array([np.cos(angle), np.sin(angle)]) for angle in angles]
     new_centers, new_features = [], []
     for i in range(len(centers)):
         relation = np.zeros(len(weights["relation.0.bias"]))

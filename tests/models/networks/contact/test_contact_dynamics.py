@@ -34,10 +34,12 @@ def loud(**sizes: int) -> ContactDynamics:
 
 
 def shipped() -> ContactDynamics:
-    """f of `checkpoint=contact`."""
+    """f of `checkpoint=contact`, with all objects within reach."""
     part, f = "model.dynamics.", ContactDynamics()
     tensors = load_checkpoint(find_checkpoint("contact")).tensors
-    f.load_state_dict({name[len(part) :]: value for name, value in tensors.items() if name.startswith(part)})
+    weights = {name[len(part) :]: value for name, value in tensors.items() if name.startswith(part)}
+    del weights["still_scale"]
+    f.load_state_dict(weights)
     return f.double()
 
 
@@ -59,10 +61,9 @@ def test_it_says_what_loops_over_objects_and_directions_say(seed: int, real: int
         for number, action in enumerate(actions):
             here = [field[number, :real].numpy() for field in (state.centers, state.features)]
             centers, features = by_hand.next_state(f, *here, action.numpy())
-            # Where the tool alone would move an object by less than 0.05 mm, its aim is shorter than 1, and the loops'
-            # angle is that of a direction: micrometres.
-            assert np.allclose(predicted.centers[number, :real], centers, atol=1e-5, rtol=0)
-            assert np.allclose(predicted.features[number, :real], features, atol=1e-7, rtol=0)
+            assert np.allclose(predicted.centers[number, :real], centers, atol=1e-6, rtol=0)
+            # Which side the tool meets is a soft choice among constants that are kept in float32.
+            assert np.allclose(predicted.features[number, :real], features, atol=2e-6, rtol=0)
         state = predicted
 
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.networks.contact.objects import PAIR_MEASURES, pair_contact
+from models.networks.contact.rows import EveryRow
 from models.networks.contact.tool import DISPLACEMENT_UNIT
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
 
@@ -21,11 +22,22 @@ def discs() -> torch.Tensor:
     return outline_values(Outline()(clouds))[..., :PER_OUTLINE].T
 
 
+def measures(place: torch.Tensor, outlines: torch.Tensor, aim: torch.Tensor, carried: torch.Tensor) -> torch.Tensor:
+    """`[PAIR_MEASURES, M, M, ...]` of object i and another j; zeros on the diagonal."""
+    rows = EveryRow(torch.ones(carried.shape, dtype=torch.bool))
+    pairs = rows.pairs(None)
+    assert pairs is not None
+    found = pair_contact(place, outlines, aim, carried, rows, pairs)
+    table = torch.zeros(PAIR_MEASURES, len(carried), *carried.shape)
+    table[:, pairs.first, pairs.second] = found
+    return table
+
+
 def measured(offset: tuple[float, float], aim: float, way: float) -> dict[str, float]:
     """What the second disc, which lies at `offset` from the first, meets if that one is carried `way` along `aim`."""
     place = torch.tensor([[0.0, 0.0], offset]).T
     aims = torch.tensor([[math.cos(aim), math.sin(aim)], [1.0, 0.0]]).T
-    found = pair_contact(place, discs(), aims, torch.tensor([way, 0.0]))
+    found = measures(place, discs(), aims, torch.tensor([way, 0.0]))
     names = ("x", "y", "push_x", "push_y", "meet", "gap", "push", "own_meet", "own_gap", "own_push", "own_way", "way")
     assert found.shape == (PAIR_MEASURES, 2, 2) == (len(names), 2, 2)
     return dict(zip(names, (found[:, 1, 0] * DISPLACEMENT_UNIT).tolist(), strict=True))
@@ -59,7 +71,7 @@ def test_what_an_object_would_push_is_what_the_other_is_pushed_by() -> None:
     torch.manual_seed(0)
     place, aim = 0.06 * torch.randn(2, 3, 4), torch.nn.functional.normalize(torch.randn(2, 3, 4), dim=0)
     outlines = outline_values(Outline()(0.02 * torch.randn(4, 3, 64, 3)))[..., :PER_OUTLINE].movedim((-1, -2), (0, 1))
-    found = pair_contact(place, outlines, aim, 0.08 * torch.rand(3, 4))
+    found = measures(place, outlines, aim, 0.08 * torch.rand(3, 4))
     assert torch.equal(found[4:7], found[7:10].transpose(1, 2))
     assert torch.equal(found[10], found[11].transpose(0, 1))
     assert max(found[6, 0, 1].max(), found[6, 1, 0].max(), found[6, 2, 0].max()) > 0
