@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from models.networks.contact.chosen_rows import ChosenRows
+from models.networks.contact.every_row import EveryRow
 from models.networks.contact.objects import PAIR_MEASURES, pair_contact
 from models.networks.contact.reach import in_reach
-from models.networks.contact.rows import ChosenRows, EveryRow, Pairs, Rows, components_first, near_pairs
+from models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
 from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, ToolContact, endpoints
 from models.networks.dynamics import PushOutcome
 from models.networks.layers import fully_connected, relative_positions

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from models.networks.shapes import shapes_are_fixed
 from planning import CvaeMpcPlanner, PerturbedRollouts
 from planning.backends import chunking
 from planning.backends.compiled import Compiled
@@ -31,6 +32,14 @@ def scaled(pair: Pair, factor: float, power: int) -> tuple[Pair, Tensor]:
 
 def rounded_product(layer: torch.nn.Linear, numbers: Tensor) -> Tensor:
     return layer(numbers)
+
+
+def positive_doubled(numbers: torch.Tensor) -> torch.Tensor:
+    positive = numbers > 0
+    if shapes_are_fixed():
+        return torch.where(positive, 2 * numbers, 0.0)
+    (places,) = positive.nonzero(as_tuple=True)
+    return torch.zeros_like(numbers).index_copy(0, places, 2 * numbers[places])
 
 
 def branching(numbers: Tensor) -> Tensor:
@@ -77,6 +86,13 @@ def test_matrix_products_follow_torchs_precision_and_results_are_float32() -> No
     assert rounded.dtype == torch.float32
     assert torch.equal(rounded, rounded.bfloat16().float())
     torch.testing.assert_close(rounded, exact, rtol=0.02, atol=0.02)
+
+
+@needs_a_compiler
+def test_functions_are_told_that_shapes_must_not_depend_on_values() -> None:
+    numbers = torch.randn(20)
+    torch.testing.assert_close(Compiled()(positive_doubled, numbers), positive_doubled(numbers))
+    assert not shapes_are_fixed()
 
 
 @needs_a_compiler

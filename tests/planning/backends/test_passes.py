@@ -13,6 +13,7 @@ from models.networks.contact.dynamics import ContactDynamics
 from models.networks.encoder import StateEncoder
 from models.networks.layers import relative_positions, unit
 from models.networks.scene_context import SceneContext
+from models.networks.shapes import fixed_shapes
 from models.state import State
 from planning.backends import passes
 from planning.backends.passes import FEW
@@ -146,14 +147,16 @@ def test_a_copy_of_a_part_in_the_same_order_stays() -> None:
     assert calls(changed(passes.write_transposed_copies, lambda x: 2 * x[..., :2].contiguous(), values), "contiguous")
 
 
+@pytest.mark.parametrize("margin", [None, 0.35])
 @pytest.mark.parametrize("objects", [1, 2, 4])
-def test_an_f_that_sees_contact_says_the_same(objects: int) -> None:
+def test_an_f_that_sees_contact_says_the_same(objects: int, margin: float | None) -> None:
     torch.set_float32_matmul_precision("highest")
-    f = ContactDynamics(object_width=16, pair_width=8, shape_width=8).double()
+    f = ContactDynamics(object_width=16, pair_width=8, shape_width=8, reach_margin=margin).double()
     features = torch.cat((0.1 * torch.randn(7, objects, 63), torch.ones(7, objects, 1)), -1)
     state = State(0.1 * torch.randn(7, objects, 3).double(), unit(features).double(), torch.rand(7, objects) < 0.7)
     action = torch.rand(7, 4).double()
-    module = rewritten(lambda action, *fields: f(State(*fields), None, action).centers, action, *state)
+    with fixed_shapes():
+        module = rewritten(lambda action, *fields: f(State(*fields), None, action).centers, action, *state)
     torch.testing.assert_close(module(action, *state), f(state, None, action).centers)
 
 

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.networks.contact.every_row import EveryRow
 from models.networks.contact.objects import PAIR_MEASURES, pair_contact
-from models.networks.contact.rows import EveryRow
 from models.networks.contact.tool import DISPLACEMENT_UNIT
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
 

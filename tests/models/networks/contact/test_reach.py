@@ -8,9 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.networks.contact.chosen_rows import ChosenRows
 from models.networks.contact.dynamics import ContactDynamics
+from models.networks.contact.every_row import EveryRow
 from models.networks.contact.reach import CARRIED, in_reach
-from models.networks.contact.rows import ChosenRows, EveryRow
 from models.networks.contact.tool import TOOL_RADIUS, endpoints
 from models.networks.outline import Outline, mean_extent
 from models.networks.shapes import fixed_shapes
@@ -132,6 +133,8 @@ def test_leading_dimensions_broadcast() -> None:
     assert torch.equal(f(state, None, actions).centers, expected.centers)
     one = State(*(field[:1, 0] for field in state))
     assert torch.equal(f(one, None, actions[0]).features, expected.features[0])
+    bare = f(State(*(field[0] for field in one)), None, actions[0, 2])
+    assert torch.allclose(bare.centers, expected.centers[0, 2], atol=1e-12)
 
 
 @pytest.mark.parametrize(
