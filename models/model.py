@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import ClassVar
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from models.networks.dynamics import Dynamics, PushOutcome
 from models.networks.encoder import StateEncoder
+from models.networks.shapes import fixed_shapes
 from models.program import Program
 from models.state import State, Window
 from models.transitions import generate_transitions, observe_transitions
@@ -78,6 +80,11 @@ class Model(Program):
         self.dynamics.neighbours = self.neighbours
         if isinstance(self.scales, PredictedScales) and not self.dynamics.predicts_scales:
             raise ValueError("scales=predicted needs an f that predicts them: dynamics=contact")
+
+    @staticmethod
+    def fixed_shapes() -> AbstractContextManager[None]:
+        """See `models.networks.shapes`: for planners that compile."""
+        return fixed_shapes()
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""

@@ -7,6 +7,7 @@ of horizon, M objects (padding included).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -40,6 +41,14 @@ class SampledDynamics(Protocol):
 
     def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
         """A sample of f(s'' | s, a): `[...]`, which `uniform: [..., M, 2]` in [0, 1) determines."""
+
+
+@runtime_checkable
+class FixedShapes(Protocol):
+    """A model that computes less where shapes of tensors may depend on values, which native code does not allow."""
+
+    def fixed_shapes(self) -> AbstractContextManager[None]:
+        """Within it shapes follow from the shapes of arguments; results are the same up to rounding."""
 
 
 class EffectModel(DynamicsModel, Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import torch
@@ -23,6 +24,7 @@ from planning.protocol import (
     DistanceToGoal,
     DynamicsModel,
     EpisodicReward,
+    FixedShapes,
     ModelRequirements,
     RewardFunction,
     SampledDynamics,
@@ -69,7 +71,8 @@ class SearchingPlanner:
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward, self.guidance = model, reward, guidance
         self.reward_at, self.stride_limits = reward_at, stride_limits
-        self.backend: Backend = Compiled() if compile else eager
+        tracing = model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext
+        self.backend: Backend = Compiled(tracing=tracing) if compile else eager
         self.reparameterized = warm_start or compile
         if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
             raise ValueError("robustness.outcomes=sampled needs a model that samples f: it has no sampled_next_state")

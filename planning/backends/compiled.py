@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -20,7 +20,6 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from models.networks.shapes import fixed_shapes
 from planning import records
 from planning.backends import passes
 from planning.backends.cache import VARIABLE, CodeCache, UnsafeFolderError, default_folder
@@ -55,8 +54,11 @@ class Compiled:
     Without such a folder, or for constants without a fingerprint, it compiles for this process only.
     """
 
-    def __init__(self, folder: Path | None = None) -> None:
-        """`folder`: keeps the code; None is `planning.backends.cache.default_folder`.
+    def __init__(
+        self, folder: Path | None = None, tracing: Callable[[], AbstractContextManager[None]] = nullcontext
+    ) -> None:
+        """`folder`: keeps the code; None is `planning.backends.cache.default_folder`. `tracing`: opened while functions
+        become graphs, to tell models that shapes must not depend on values (`planning.protocol.FixedShapes`).
 
         Raises ValueError where there is no C++ compiler.
         """
@@ -68,6 +70,7 @@ class Compiled:
             )
         self._versions: dict[Any, _Native] = {}
         self._compiling = Lock()
+        self._tracing = tracing
         self._cache: CodeCache | None = None
         try:
             self._cache = CodeCache(folder or default_folder())
@@ -101,7 +104,7 @@ class Compiled:
             torch.set_num_threads(threads)  # setting it in a worker thread also changes it here
 
     def _first(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
-        with self._compiling, _distributions_unchecked(), fixed_shapes():
+        with self._compiling, _distributions_unchecked(), self._tracing():
             if version not in self._versions:  # another thread may have made it
                 try:
                     self._versions[version] = self._make(version, function, tensors)
