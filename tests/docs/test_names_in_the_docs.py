@@ -41,6 +41,7 @@ def options() -> set[str]:
     found |= set().union(*(keys(compose("plan", f"planner.optimizer={optimizer}")) for optimizer in OPTIMIZERS))
     found |= keys(compose("plan", "task=rearrange"))
     found |= keys(compose("train", "model=single_latent", "guide=single_latent", "objective=iwae"))
+    found |= keys(compose("train", "dynamics=contact"))
     return found | GROUPS
 
 
