@@ -311,6 +311,18 @@ def test_the_published_rates_are_those_of_the_published_episodes(table: str, pag
     )
 
 
+def test_the_published_table_of_todays_planner_is_that_of_its_episodes() -> None:
+    folder = ROOT / "docs" / "measurements"
+    page = (folder / "success.md").read_text(encoding="utf-8")
+    section = page.partition("## Today's planner")[2].partition("### ")[0]
+    lines = [[cell.strip() for cell in line.split("|")] for line in section.splitlines()]
+    published = [cells[2:7] for cells in lines if len(cells) == 12 and cells[2].isdigit()]
+    rows = [line.split("|") for line in run("rates", str(folder / "reach-episodes.parquet")).splitlines()]
+    found = [[cell.strip() for cell in cells[5:10]] for cells in rows if cells[1].startswith(" `today:")]
+    assert published == [[episodes, rate.replace("%", " %"), *ends] for episodes, rate, *ends in found]
+    assert len(published) == 17
+
+
 def test_training_and_planning_are_timed_on_every_device_of_the_machine() -> None:
     first, *lines = [line for line in run("devices", "--quick").splitlines() if line]
     assert first.startswith("torch ")
