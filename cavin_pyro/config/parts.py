@@ -68,13 +68,13 @@ def naming(section: str, config: Config) -> Iterator[None]:
 
 
 def check_sizes(section: str, config: Config) -> None:
-    """Check that every whole number of a section, apart from weights, is at least 1 and no slip.
+    """Check that every whole number of a section, apart from weights and margins, is at least 1 and no slip.
 
     Raises:
         UserError: one is not.
     """
     for name, value in config.items():
-        if type(value) is int and not str(name).endswith("_weight"):
+        if type(value) is int and not str(name).endswith(("_weight", "_margin")):
             at_least(f"{section}.{name!s}", value, 1)
     check_largest(section, config)
 
@@ -119,7 +119,8 @@ def build_model(config: Config) -> Model:
         }
         section = config.get("dynamics") or PAPER_DYNAMICS
         check_sizes("dynamics", section)
-        dynamics = construct(section, feature_dimension=sizes["feature_dimension"], width=sizes["width"])
+        with naming("dynamics", section):
+            dynamics = construct(section, feature_dimension=sizes["feature_dimension"], width=sizes["width"])
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
     scales = construct(config.get("scales") or FIXED_SCALES)

@@ -16,6 +16,7 @@ from cavin_pyro.storage.geometry import check_fit, load_pointnet
 from cavin_pyro.training.factory import build_objective
 from models.likelihoods import PredictedScales
 from models.model import Model
+from models.networks.contact.dynamics import ContactDynamics
 from models.networks.outline import Outline
 from models.networks.pointnet import PointNet
 
@@ -153,3 +154,18 @@ def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> N
         build_model(config)
     contact = {"dynamics": {"_target_": "models.networks.contact.dynamics.ContactDynamics"}}
     assert isinstance(build_model(config | contact).scales, PredictedScales)
+
+
+@pytest.mark.parametrize("margin", [0, 0.0, None])
+def test_the_reach_margin_of_f_may_be_zero_or_none(small: SimpleNamespace, margin: float | None) -> None:
+    contact = {"_target_": "models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
+    dynamics = build_model(small.config() | {"dynamics": contact}).dynamics
+    assert isinstance(dynamics, ContactDynamics)
+    assert dynamics.reach_margin == margin
+
+
+@pytest.mark.parametrize("margin", [-1, -0.01])
+def test_a_negative_reach_margin_is_named_as_users_type_it(small: SimpleNamespace, margin: float) -> None:
+    contact = {"_target_": "models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
+    with pytest.raises(UserError, match=f"^dynamics.reach_margin must be null or at least 0 metres, not {margin}$"):
+        build_model(small.config() | {"dynamics": contact})
