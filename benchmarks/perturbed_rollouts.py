@@ -1,9 +1,10 @@
-"""How to allocate perturbed rollouts: `python benchmarks/perturbed_rollouts.py [--problems 100]`.
+"""How to allocate perturbed rollouts: `python benchmarks/perturbed_rollouts.py [--task crossing] [--problems 100]`.
 
-Plans of whole episodes (crossing, sparse, 5 and 3 objects, seeds from 10000 on) are made with the shipped checkpoint.
-Of some of them the 256 best motions by line 10 get 512 perturbed rollouts each, with the errors of f that
+Plans of whole episodes (sparse, 5 and 3 objects, seeds from 10000 on) are made with the shipped checkpoint.
+Of some of them the 64 best motions by line 10 get 512 perturbed rollouts each, with the errors of f that
 `planner.robustness` assumes. For several allocations it prints how much worse than the best the chosen motion is, and
-how often it fails. That is no success rate: f and its errors stand for the table.
+how often it fails, with noise of each motion's own ("independent") and with the planner's, which all motions share.
+That is no success rate: f and its errors stand for the table.
 Takes five minutes on 2 cores.
 """
 
@@ -13,6 +14,8 @@ import argparse
 import random
 import statistics
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 from unittest import mock
@@ -23,14 +26,51 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.data.observed import observed_state
+from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.factory import make_runner
 from planning.extensions import perturbed_rollouts as extension
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts, sequential_halving
 
-MOTIONS = 256
+MOTIONS = 64
 REPETITIONS = 4
-WAYS = [(128, 16, 1), (128, 8, 1), (128, 32, 1), (128, 2, 3), (128, 4, 2), (128, 4, 3), (256, 2, 3), (256, 4, 2)]
+
+
+class Allocation(NamedTuple):
+    """How rollouts are shared out among motions, and whether each motion has noise of its own."""
+
+    candidates: int
+    rollouts: int
+    rounds: int
+    reduction_factor: int
+    independent: bool = False
+
+    @property
+    def total(self) -> int:
+        return self.candidates * self.rollouts * self.rounds
+
+
+ALLOCATIONS = (
+    Allocation(64, 2, 3, 4, independent=True),
+    Allocation(64, 2, 2, 8, independent=True),
+    Allocation(64, 2, 3, 4),
+    Allocation(64, 2, 2, 4),
+    Allocation(64, 2, 2, 8),
+    Allocation(64, 2, 2, 16),
+    Allocation(32, 4, 2, 8),
+    Allocation(64, 4, 2, 8),
+)
+
+
+@contextmanager
+def noise_of_each_motion(independent: bool, seed: int) -> Iterator[None]:
+    """Within it every rollout has noise of its own if `independent`; else it changes nothing."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def own(noise: Tensor, pushes: Tensor) -> Tensor:
+        return torch.randn(len(noise), pushes.shape[1], *noise.shape[2:], generator=generator)
+
+    with mock.patch.object(extension, "_for_each_motion", own if independent else extension._for_each_motion):
+        yield
 
 
 class PlanningProblem(NamedTuple):
@@ -40,7 +80,7 @@ class PlanningProblem(NamedTuple):
     options: dict[str, Any]
 
 
-def problems(objects: int, episodes: int, pushes: int) -> list[PlanningProblem]:
+def problems(task: str, objects: int, episodes: int, pushes: int) -> list[PlanningProblem]:
     """One per plan of some episodes."""
     asked: list[PlanningProblem] = []
 
@@ -48,13 +88,14 @@ def problems(objects: int, episodes: int, pushes: int) -> list[PlanningProblem]:
         asked.append(PlanningProblem(given, options))
         return sequential_halving(*given, **options)
 
-    one = make_runner(compose("evaluate", "task=crossing", f"objects={objects}", "reward=sparse"))
+    one = make_runner(compose("evaluate", f"task={task}", f"objects={objects}", "reward=sparse"))
     with mock.patch.object(extension, "sequential_halving", recorded):
         for seed in range(10000, 10000 + episodes):
             observation, _ = one.env.reset(seed=seed)
             generator, last = torch.Generator().manual_seed(seed), None
             for _ in range(pushes):
-                last = one.planner.plan(observed_state(observation, one.geometry), [generator], last)
+                seen = observed_state(observation, one.geometry), [generator], last, observed_points(observation)
+                last = one.planner.plan(*seen)
                 observation, _, ended, out_of_time, _ = one.env.step(last.actions[0, 0].numpy())
                 if ended or out_of_time:
                     break
@@ -63,8 +104,8 @@ def problems(objects: int, episodes: int, pushes: int) -> list[PlanningProblem]:
 
 
 def true_costs(problem: PlanningProblem, truth: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The best motions' numbers, mean costs in square metres and shares of failures, each `[256]`."""
-    robustness, model, reward, state, goal, scores, actions, *_ = problem.given
+    """The best motions' numbers, mean costs in square metres and shares of failures, each `[64]`."""
+    robustness, model, reward, state, goal, scores, actions, later, *_ = problem.given
     numbers = scores[0].topk(MOTIONS).indices
     parts = [
         perturbed_rollouts(
@@ -73,7 +114,7 @@ def true_costs(problem: PlanningProblem, truth: int) -> tuple[Tensor, Tensor, Te
         for seed in range(truth // 16)
     ]
     distance, failed = (torch.cat(part, -1)[0].float().mean(-1) for part in zip(*parts, strict=True))
-    return numbers, distance + robustness.failure_cost * failed, failed
+    return numbers, distance + robustness.failure_cost * failed + later[0, numbers], failed
 
 
 def main() -> None:
@@ -84,31 +125,37 @@ def main() -> None:
     parser.add_argument(
         "--truth", type=int, default=512, help="perturbed rollouts of each motion for its true cost, 16 or more"
     )
+    parser.add_argument("--task", default="crossing", help="clearing, insertion or crossing")
     arguments = parser.parse_args()
-    asked = [one for objects in (5, 3) for one in problems(objects, arguments.episodes, arguments.pushes)]
+    asked = [
+        one for objects in (5, 3) for one in problems(arguments.task, objects, arguments.episodes, arguments.pushes)
+    ]
     chosen = random.Random(0).sample(asked, min(arguments.problems, len(asked)))
-    regret: dict[tuple[int, int, int], list[float]] = {way: [] for way in WAYS}
-    failures: dict[tuple[int, int, int], list[float]] = {way: [] for way in WAYS}
+    regret: dict[Allocation, list[float]] = {way: [] for way in ALLOCATIONS}
+    failures: dict[Allocation, list[float]] = {way: [] for way in ALLOCATIONS}
     with torch.inference_mode():
         for problem in chosen:
             numbers, costs, failed = true_costs(problem, arguments.truth)
-            for way in WAYS:
-                candidates, rollouts, rounds = way
-                options: PerturbedRollouts = replace(
-                    problem.given[0], candidates=candidates, rollouts=rollouts, rounds=rounds
-                )
+            for way in ALLOCATIONS:
+                *shares, independent = way
+                fields = dict(zip(way._fields, shares, strict=False))
+                options: PerturbedRollouts = replace(problem.given[0], **fields)
                 for seed in range(REPETITIONS):
                     given = (options, *problem.given[1:-1], [torch.Generator().manual_seed(1000 + seed)])
-                    taken = (numbers == sequential_halving(*given, **problem.options).number).nonzero().item()
-                    regret[way].append(float(costs[taken] - costs.min()))
-                    failures[way].append(float(failed[taken]))
+                    with noise_of_each_motion(independent, seed):
+                        taken = sequential_halving(*given, **problem.options).number
+                    place = (numbers == taken).nonzero().item()
+                    regret[way].append(float(costs[place] - costs.min()))
+                    failures[way].append(float(failed[place]))
     print(f"{len(chosen)} of {len(asked)} plans")
-    print("candidates  rollouts  rounds   total  cost above the best, m2  fails")
-    for way in WAYS:
-        candidates, rollouts, rounds = way
-        cost, share = statistics.mean(regret[way]), statistics.mean(failures[way])
-        total = candidates * rollouts * rounds
-        print(f"{candidates:10d}  {rollouts:8d}  {rounds:6d}  {total:6d}  {cost:23.4f}  {share:5.1%}")
+    print("noise        candidates  rollouts  rounds  factor   total  cost above the best, cm2  fails")
+    for way in ALLOCATIONS:
+        cost, share = 1e4 * statistics.mean(regret[way]), statistics.mean(failures[way])
+        noise = "independent" if way.independent else "shared"
+        print(
+            f"{noise:11s}  {way.candidates:10d}  {way.rollouts:8d}  {way.rounds:6d}  {way.reduction_factor:6d}  "
+            f"{way.total:6d}  {cost:24.1f}  {share:5.1%}"
+        )
 
 
 if __name__ == "__main__":

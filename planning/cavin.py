@@ -30,7 +30,8 @@ from planning.rollouts.segment import Objective, SegmentRollout, actions_of, sel
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
-FEW_CANDIDATES = PerturbedRollouts(candidates=64)  # motions are sampled for one effect, and most bring it about
+# Motions are sampled for one effect, and most bring it about.
+FEW_CANDIDATES = PerturbedRollouts(candidates=64, rounds=2, reduction_factor=8)
 
 
 class CavinPlanner(SearchingPlanner):

@@ -20,7 +20,6 @@ from planning.rollouts.dynamics import predict_states
 from planning.rollouts.sampling import noise_each, uniform_each
 from planning.rollouts.segment import actions_of
 
-QUARTER = 4  # one in four candidates continues in the next round, with four times as many rollouts
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
 # metres, is then worth 200: a failure earns -100 instead of the +100 at the goal.
 RETURN_WEIGHT = 0.0015
@@ -37,12 +36,17 @@ class PerturbedRollouts:
 
     The defaults are those of the baselines; `planning.cavin.FEW_CANDIDATES` are those of `planner=cavin`.
 
-    Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best quarter
-    continues, with four times as many rollouts each.
+    Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best
+    candidates, one in `reduction_factor`, continue with that many times as many rollouts each.
+
+    Two standard reductions of variance make few rollouts tell motions apart: all motions of a round get the same noise
+    (common random numbers), and every other rollout has the noise of another with the opposite sign (antithetic
+    variates); see Law, Simulation Modeling and Analysis, chapter on variance reduction.
 
     candidates: motions with perturbed rollouts, the best by line 10, or by their return in the baselines.
     rollouts: of each candidate in the first round.
     rounds: of equally many rollouts in total, for fewer and fewer candidates; 1 gives every candidate the same number.
+    reduction_factor: how many times fewer candidates a round has than the one before.
     outcomes: `perturbed`, with the two noises below, or `sampled` from f's own predictive distribution, push by push.
         A sampled rollout continues from its own samples, which also give its distance to the subgoal; its pushes start
         unperturbed.
@@ -59,6 +63,7 @@ class PerturbedRollouts:
     candidates: int = 256
     rollouts: int = 2
     rounds: int = 3
+    reduction_factor: int = 4
     outcomes: str = "perturbed"
     start_noise: float = 0.03
     outcome_noise: float = 0.5
@@ -68,6 +73,7 @@ class PerturbedRollouts:
         check_positive("candidates", self.candidates)
         check_positive("rollouts", self.rollouts)
         check_positive("rounds", self.rounds)
+        check_positive("reduction_factor", self.reduction_factor)
         check_choice("outcomes", self.outcomes, OUTCOMES)
         check_weight("start_noise", self.start_noise)
         check_weight("outcome_noise", self.outcome_noise)
@@ -128,10 +134,10 @@ def sequential_halving(
         if number and total.shape[-1] == 1:
             break  # one candidate is left
         if number:
-            going = (total / done).topk(max(1, total.shape[-1] // QUARTER), largest=False).indices
+            going = (total / done).topk(max(1, total.shape[-1] // robustness.reduction_factor), largest=False).indices
             fields = numbers, infinite, total, failures
             numbers, infinite, total, failures = (field.gather(1, going) for field in fields)
-            count = QUARTER * count
+            count = robustness.reduction_factor * count
         distance, failed = perturbed_rollouts(
             robustness,
             model,
@@ -174,18 +180,32 @@ def perturbed_rollouts(
     if goal is not None and goal.batch_shape[-1] > 1:
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
     pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
+    of_objects = (count, pushes.shape[-2], state.objects, 2)
     if robustness.outcomes == "sampled":
-        uniform = uniform_each((*pushes.shape[1:3], state.objects, 2), generators, pushes.device)
+        uniform = _for_each_motion(uniform_each(of_objects, generators, pushes.device), pushes)
         distance, failed = backend(_sampled_costs, model, reward, state, goal, pushes, uniform, feature_weight)
         return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
-    pushes[..., :2] += robustness.start_noise * noise_each(pushes[..., :2].shape[1:], generators, pushes.device)
+    starts = _antithetic_noise((*of_objects[:2], 2), generators, pushes.device)
+    pushes[..., :2] += robustness.start_noise * _for_each_motion(starts, pushes)
     errors = None
     if robustness.outcome_noise:
-        shape = (*pushes.shape[1:3], state.objects, 2)
-        errors = robustness.outcome_noise * noise_each(shape, generators, pushes.device)
+        noise = _antithetic_noise(of_objects, generators, pushes.device)
+        errors = robustness.outcome_noise * _for_each_motion(noise, pushes)
     pushes = pushes.clamp(-1.0, 1.0)
     distance, failed = backend(_rollout_costs, model, reward, state, goal, pushes, errors, feature_weight)
     return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
+
+
+def _antithetic_noise(shape: Sequence[int], generators: Sequence[torch.Generator], device: torch.device) -> Tensor:
+    """Normal noise `[B, n, ...]`, whose second half is the first with the opposite sign: its mean is 0 if n is even."""
+    count, *rest = shape
+    half = noise_each((-(-count // 2), *rest), generators, device)
+    return torch.cat((half, -half), 1)[:, :count]
+
+
+def _for_each_motion(noise: Tensor, pushes: Tensor) -> Tensor:
+    """The same `noise: [B, count, ...]` for the rollouts of every motion: `[B, R count, ...]`, as `pushes`."""
+    return noise.repeat(1, pushes.shape[1] // noise.shape[1], *(noise.dim() - 2) * [1])
 
 
 def _rollout_costs(

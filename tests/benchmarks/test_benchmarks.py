@@ -73,8 +73,9 @@ def test_allocations_of_perturbed_rollouts_are_compared() -> None:
     ).splitlines()
     assert lines[0] == "1 of 2 plans"
     rows = [line.split() for line in lines[2:]]
-    assert all(int(row[0]) * int(row[1]) * int(row[2]) == int(row[3]) for row in rows)
-    assert all(float(row[4]) >= 0.0 and row[5].endswith("%") for row in rows)
+    assert {row[0] for row in rows} == {"independent", "shared"}
+    assert all(int(row[1]) * int(row[2]) * int(row[3]) == int(row[5]) for row in rows)
+    assert all(float(row[6]) >= 0.0 and row[7].endswith("%") for row in rows)
 
 
 def test_collection_reports_where_its_time_goes() -> None:

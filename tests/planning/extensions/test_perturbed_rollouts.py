@@ -191,20 +191,120 @@ def test_the_last_candidate_gets_no_more_rollouts(toy: SimpleNamespace) -> None:
     assert rolled_out == [10, 8]
 
 
-def test_as_many_tries_shared_out_in_rounds_find_better_motions_than_equal_shares(toy: SimpleNamespace) -> None:
+def rollouts_of(options: PerturbedRollouts, model: Any, reward: Any, backend: Callable) -> None:
+    """Two scenes with eight motions each, all the same."""
+    state, actions = scenes(2), torch.zeros(2, 8, 3, 4)
+    goal, nothing = state.map(lambda field: field.unsqueeze(1)), torch.zeros(2, 8)
+    given = (
+        options,
+        model,
+        reward,
+        state,
+        goal,
+        nothing,
+        actions,
+        nothing,
+        [torch.Generator().manual_seed(s) for s in (0, 1)],
+    )
+    sequential_halving(*given, backend=backend)
+
+
+def test_all_motions_of_a_round_get_the_same_noise_and_every_other_rollout_its_opposite(toy: SimpleNamespace) -> None:
+    noises: list[tuple[Tensor, Tensor]] = []
+
+    def noting(function: Callable, *given: Any) -> Any:
+        noises.append((given[4][..., :2], given[5]))  # starts of the pushes, which were 0, and errors of the outcomes
+        return function(*given)
+
+    options = PerturbedRollouts(candidates=8, rollouts=4, rounds=2, start_noise=0.01)
+    rollouts_of(options, toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0)), noting)
+    assert len(noises) == 2
+    for (starts, errors), count in zip(noises, (4, 16), strict=True):
+        for noise in (starts.unflatten(1, (-1, count)), errors.unflatten(1, (-1, count))):  # [B, R, count, ...]
+            assert (noise == noise[:, :1]).all()
+            torch.testing.assert_close(noise.mean(2), torch.zeros_like(noise[:, :, 0]), atol=1e-7, rtol=0.0)
+            assert noise[:, 0, : count // 2].flatten(1).unique().numel() == noise[:, 0, : count // 2].numel()
+    (first, _), (second, _) = noises
+    assert not torch.isin(second, first).any()  # another round has other noise
+    assert noises[0][0].std() == pytest.approx(0.01, rel=0.3) and noises[0][1].std() == pytest.approx(0.5, rel=0.3)
+
+
+def test_an_odd_number_of_rollouts_is_possible(toy: SimpleNamespace) -> None:
+    counted = []
+
+    def counting(function: Callable, *given: Any) -> Any:
+        counted.append(given[4].shape[1])
+        return function(*given)
+
+    options = PerturbedRollouts(candidates=8, rollouts=3, rounds=2, reduction_factor=8)
+    rollouts_of(options, toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0)), counting)
+    assert counted == [24, 24]
+
+
+def test_shared_noise_orders_motions_that_noise_of_their_own_would_confuse(toy: SimpleNamespace) -> None:
     state, model = scenes(40)._replace(features=torch.ones(40, 2, 4)), toy.PointMass()
     goal, generators = state.map(lambda field: field.unsqueeze(1)), toy.generators(*range(40))
     actions = torch.zeros(40, SAMPLES, 1, 4)
-    actions[..., 2] = torch.linspace(0.12, 0.8, SAMPLES)[:, None]  # 20 to 45 % of the rollouts fail
+    actions[..., 2] = torch.linspace(0.0, 0.02, SAMPLES)[:, None]  # 2 mm between the shortest and the longest
+    order = torch.randperm(SAMPLES, generator=torch.Generator().manual_seed(0))
+    given = model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, torch.zeros(40, SAMPLES), actions[:, order]
+    robustness = PerturbedRollouts(candidates=SAMPLES, rounds=1, outcome_noise=0.0, start_noise=0.1)
+    chosen = sequential_halving(robustness, Slipping(), *given[1:], torch.zeros(40, SAMPLES), generators).number
+    assert (order[chosen] == 0).all()
+
+
+class Slipping:
+    """A push moves all objects by 0.1 m of its motion, and by where it starts as well: 1 cm for noise of 0.1."""
+
+    segment_length = 1
+
+    def next_state(self, state: State, action: Tensor) -> State:
+        return moved(state, 0.1 * (action[..., 2:3] + action[..., :1]))
+
+
+class Unlucky(Slipping):
+    """A push goes beyond an edge where its start, times a large number of its own, has a fraction below its motion."""
+
+    def next_state(self, state: State, action: Tensor) -> State:
+        chance = (action[..., :1] * 1e4 * (1.0 + action[..., 3:])).remainder(1.0)
+        beyond = torch.where(chance < action[..., 2:3], -1.0, 0.0)
+        return moved(state, 0.0 * beyond)._replace(
+            centers=state.centers + beyond.unsqueeze(-2) * torch.tensor([0.0, 1.0, 0.0])
+        )
+
+
+def test_as_many_tries_shared_out_in_rounds_find_better_motions_than_equal_shares(toy: SimpleNamespace) -> None:
+    state = scenes(40)
+    goal, generators = state.map(lambda field: field.unsqueeze(1)), toy.generators(*range(40))
+    actions = torch.zeros(40, SAMPLES, 1, 4)
+    actions[..., 2] = torch.linspace(0.05, 0.6, SAMPLES)[:, None]  # 5 to 60 % of the rollouts fail
+    actions[..., 3] = torch.rand(SAMPLES, 1, generator=torch.Generator().manual_seed(0))
     scores = torch.zeros(40, SAMPLES)
     reward = toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=-0.01)
-    distance = []
+    failing = []
     for options in ({"rollouts": 12, "rounds": 1}, {"rollouts": 4, "rounds": 3}):
-        robustness = PerturbedRollouts(candidates=SAMPLES, outcome_noise=1.0, start_noise=0.0, **options)
-        given = model, reward, state, goal, scores, actions, scores, generators
-        chosen = sequential_halving(robustness, *given, feature_weight=0.0).number
-        distance.append(actions[range(40), chosen, 0, 2].mean())
-    assert distance[1] < 0.8 * distance[0]
+        robustness = PerturbedRollouts(candidates=SAMPLES, outcome_noise=0.0, start_noise=0.3, **options)
+        given = Unlucky(), reward, state, goal, scores, actions, scores, generators
+        chosen = sequential_halving(robustness, *given).number
+        failing.append(actions[range(40), chosen, 0, 2].mean())
+    assert failing[1] < 0.8 * failing[0]
+
+
+def test_fewer_candidates_continue_with_a_larger_reduction_factor(toy: SimpleNamespace) -> None:
+    moving = []
+
+    def counting(function: Callable, *given: Any) -> Any:
+        moving.append(len(given[4][0, :, 0, 2].unique()))
+        return function(*given)
+
+    state, scores = scenes(1), torch.zeros(1, SAMPLES)
+    actions = torch.zeros(1, SAMPLES, 1, 4)
+    actions[..., 2] = torch.linspace(0.0, 0.5, SAMPLES)[:, None]
+    options = PerturbedRollouts(candidates=SAMPLES, rounds=3, reduction_factor=8)
+    goal = state.map(lambda field: field.unsqueeze(1))
+    given = options, toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, scores
+    sequential_halving(*given, toy.generators(0), backend=counting)
+    assert moving == [64, 8, 1]
 
 
 def test_a_predicted_failure_costs(toy: SimpleNamespace) -> None:
@@ -296,6 +396,7 @@ def test_motions_that_are_not_finite_never_win(horizon: str, toy: SimpleNamespac
         ({"candidates": 0}, "candidates must be at least 1"),
         ({"rollouts": 0}, "rollouts must be at least 1"),
         ({"rounds": 0}, "rounds must be at least 1"),
+        ({"reduction_factor": 0}, "reduction_factor must be at least 1"),
         ({"outcome_noise": -0.1}, "outcome_noise must be zero or a positive number"),
         ({"start_noise": -0.1}, "start_noise must be zero or a positive number"),
         ({"failure_cost": float("nan")}, "failure_cost must be zero or a positive number"),
