@@ -172,11 +172,22 @@ def amortized_guides(model_name: str) -> list[str]:
     return [name for name, guide in _guide_presets().items() if model_name in guide.fits and guide.amortized]
 
 
+def preset_of(section: str, target: str) -> str:
+    """The choice of an option such as `dynamics=` that has this class; the class itself if none has."""
+    choices = {preset.get("_target_"): name for name, preset in _presets(section).items()}
+    return choices.get(target, target)
+
+
 def _guide_presets() -> dict[str, type[Guide]]:
     """The classes of `guide=`."""
-    guides = {}
-    presets = resources.files("cavin_pyro.config") / "presets" / "guide"
-    for file in sorted(presets.iterdir(), key=lambda entry: entry.name):
-        if file.name.endswith(".yaml"):
-            guides[file.name.removesuffix(".yaml")] = class_of(yaml.safe_load(file.read_text(encoding="utf-8")))
-    return guides
+    return {name: class_of(preset) for name, preset in _presets("guide").items()}
+
+
+def _presets(section: str) -> dict[str, dict[str, Any]]:
+    """The presets of an option, by name."""
+    files = sorted((resources.files("cavin_pyro.config") / "presets" / section).iterdir(), key=lambda file: file.name)
+    return {
+        file.name.removesuffix(".yaml"): yaml.safe_load(file.read_text(encoding="utf-8"))
+        for file in files
+        if file.name.endswith(".yaml")
+    }

@@ -59,7 +59,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     data = data_folders(config.data)
     with user_input():
         objective.check(model, guide)
-    started = start_from(config.initial, model, guide, geometry, config.trained) if config.initial else {}
+    started = start_from(config, model, guide, geometry) if config.initial else {}
     train_only(config.trained, model, guide)
     signs = _mirror_signs(config.trainer.reflect, geometry, guide)
     check_same_run(folder, config, ignore=("data", "output", "device"))

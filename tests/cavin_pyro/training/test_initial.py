@@ -68,9 +68,16 @@ def test_what_a_calibration_has_found_stays_where_f_alone_is_trained(folder: Pat
     ("options", "said"),
     [
         (["trained=[wheels]"], "trained has 'wheels', which is no part of this model: choose from encoder, dynamics, "),
-        (["initial={first}", "model.width=16"], "is of another architecture: model."),
+        (["initial={first}", "model.width=16"], "the configuration that it was trained with: model.width=8"),
+        (
+            ["initial={first}", "dynamics.reach_margin=null", "dynamics.pair_width=8"],
+            "that it was trained with: dynamics.pair_width=4 dynamics.reach_margin=0.015",
+        ),
         (["initial=nothing"], "unknown checkpoint 'nothing': choose from cavin"),
-        (["initial=cavin"], "is of another architecture"),
+        (
+            ["initial=cavin"],
+            "model.width=64 geometry=pointnet dynamics=paper prior=conditional scales=fixed guide.width=64",
+        ),
     ],
 )
 def test_what_cannot_be_trained_on_gives_its_line_and_writes_nothing(folder: Path, options: list, said: str) -> None:
