@@ -33,7 +33,7 @@ from envs.pushing import PushingEnv
 from models.state import State
 from planning import PerturbedRollouts
 from planning import cavin as algorithm
-from planning.extensions.perturbed_rollouts import MostRobust
+from planning.extensions.sequential_halving import MostRobust
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.segment import actions_of
 
@@ -59,7 +59,7 @@ class Oracle:
     def choose(
         self, robustness: object, motions: Candidates, scores: Tensor, later_cost: Tensor, *task: Any
     ) -> MostRobust:
-        """Line 10, in the place of `planning.extensions.perturbed_rollouts.most_robust`."""
+        """Line 10, in the place of `planning.extensions.sequential_halving.most_robust`."""
         subgoal: State = task[2].step(0)  # [1]
         cost = motions.score_state.executed_cost[0]  # of the first segment, by f
         finite = torch.isfinite(cost) & torch.isfinite(scores[0])

@@ -28,8 +28,10 @@ from torch import Tensor
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.factory import make_runner
-from planning.extensions import perturbed_rollouts as extension
-from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts, sequential_halving
+from planning.extensions import perturbed_rollouts as rollouts
+from planning.extensions import sequential_halving as halving
+from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts
+from planning.extensions.sequential_halving import sequential_halving
 
 MOTIONS = 64
 REPETITIONS = 4
@@ -69,7 +71,7 @@ def noise_of_each_motion(independent: bool, seed: int) -> Iterator[None]:
     def own(noise: Tensor, pushes: Tensor) -> Tensor:
         return torch.randn(len(noise), pushes.shape[1], *noise.shape[2:], generator=generator)
 
-    with mock.patch.object(extension, "_for_each_motion", own if independent else extension._for_each_motion):
+    with mock.patch.object(rollouts, "_for_each_motion", own if independent else rollouts._for_each_motion):
         yield
 
 
@@ -89,7 +91,7 @@ def problems(task: str, objects: int, episodes: int, pushes: int) -> list[Planni
         return sequential_halving(*given, **options)
 
     one = make_runner(compose("evaluate", f"task={task}", f"objects={objects}", "reward=sparse"))
-    with mock.patch.object(extension, "sequential_halving", recorded):
+    with mock.patch.object(halving, "sequential_halving", recorded):
         for seed in range(10000, 10000 + episodes):
             observation, _ = one.env.reset(seed=seed)
             generator, last = torch.Generator().manual_seed(seed), None

@@ -15,7 +15,8 @@ from planning.extensions.effect_retries import try_other_effects
 from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
 from planning.extensions.guidance import guided_tracking
 from planning.extensions.nearest_objects import NearestObjects, nearest_objects
-from planning.extensions.perturbed_rollouts import PerturbedRollouts, most_robust
+from planning.extensions.perturbed_rollouts import PerturbedRollouts
+from planning.extensions.sequential_halving import most_robust
 from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer

@@ -9,7 +9,8 @@ import torch
 
 from models.state import State
 from planning.backends.chunking import chunked
-from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
+from planning.extensions.perturbed_rollouts import RETURN_WEIGHT
+from planning.extensions.sequential_halving import sequential_halving
 from planning.extensions.touchdown import ObservedPoints
 from planning.plan import Plan
 from planning.protocol import DynamicsModel, RewardFunction

@@ -11,7 +11,8 @@ from torch import Tensor
 from models.state import State
 from planning.backends.chunking import chunked
 from planning.cavin import EffectSpace
-from planning.extensions.perturbed_rollouts import RETURN_WEIGHT, MostRobust, sequential_halving
+from planning.extensions.perturbed_rollouts import RETURN_WEIGHT
+from planning.extensions.sequential_halving import MostRobust, sequential_halving
 from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import NoFiniteCandidateError
 from planning.plan import Plan

@@ -1,0 +1,96 @@
+"""The motion that is best in perturbed rollouts, by sequential halving."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import records
+from planning.backends.eager import Backend, eager
+from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts
+from planning.protocol import DynamicsModel, RewardFunction
+from planning.rollouts.candidates import Candidates
+from planning.rollouts.segment import actions_of
+
+
+class MostRobust(NamedTuple):
+    """The motion with the lowest cost on average."""
+
+    number: Tensor  # [B] int64, among the candidates
+    failures: Tensor  # [B] share of its rollouts that failed
+
+
+def most_robust(
+    robustness: PerturbedRollouts,
+    motions: Candidates,
+    scores: Tensor,
+    later_cost: Tensor,
+    model: DynamicsModel,
+    reward: RewardFunction,
+    subgoals: State,
+    feature_weight: float,
+) -> MostRobust:
+    """The motion candidate with the lowest cost on average; see `sequential_halving`."""
+    problem, actions, goal = motions.problem, motions.at(0, actions_of), subgoals.step(slice(0, 1))
+    what = problem.state, goal, scores, actions, later_cost, problem.generators
+    return sequential_halving(robustness, model, reward, *what, feature_weight=feature_weight, backend=problem.backend)
+
+
+def sequential_halving(
+    robustness: PerturbedRollouts,
+    model: DynamicsModel,
+    reward: RewardFunction,
+    state: State,
+    goal: State | None,
+    scores: Tensor,
+    actions: Tensor,
+    later: Tensor,
+    generators: Sequence[torch.Generator],
+    *,
+    feature_weight: float = 0.0,
+    backend: Backend = eager,
+) -> MostRobust:
+    """The motion with the lowest cost on average.
+
+    state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
+    without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, T, 4]`, the
+    segment that will be executed. later: `[B, N]` square metres, the cost of the segments after it,
+    and of guidance. A motion whose
+    score or whose cost is not finite loses.
+    """
+    best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
+    numbers, count, done = best.indices, robustness.rollouts, 0
+    infinite = ~torch.isfinite(best.values)
+    total = torch.zeros_like(best.values)  # cost of all rollouts so far
+    failures = torch.zeros_like(best.values)  # how many of them failed
+    for number in range(robustness.rounds):
+        if number and total.shape[-1] == 1:
+            break  # one candidate is left
+        if number:
+            going = (total / done).topk(max(1, total.shape[-1] // robustness.reduction_factor), largest=False).indices
+            fields = numbers, infinite, total, failures
+            numbers, infinite, total, failures = (field.gather(1, going) for field in fields)
+            count = robustness.reduction_factor * count
+        distance, failed = perturbed_rollouts(
+            robustness,
+            model,
+            reward,
+            state,
+            goal if goal is None or goal.batch_shape[-1] == 1 else records.take(goal, numbers),
+            actions.take_along_dim(numbers[..., None, None], dim=1),
+            count,
+            generators,
+            feature_weight=feature_weight,
+            backend=backend,
+        )
+        cost = (distance + robustness.failure_cost * failed).sum(-1)
+        cost = cost + count * later.gather(1, numbers)
+        total = torch.where(infinite | ~torch.isfinite(cost), torch.inf, total + cost)
+        failures = failures + failed.sum(-1)
+        done += count
+    winner = total.argmin(-1, keepdim=True)
+    return MostRobust(numbers.gather(1, winner).squeeze(1), failures.gather(1, winner).squeeze(1) / done)
