@@ -13,9 +13,9 @@ from tests.cavin_pyro.evaluation.test_planner_options import save_untrained
 
 SMALL = ("task=crossing", "objects=2", "planner.samples=8", "planner.horizon=6", "seed=3")
 # Perturbed rollouts: 8 candidates 2 times, the best 2 of them 8 times, the last one 32 times; T pushes each. Of the 4
-# motions that CAVIN samples for an effect: 2 times each, and the best one 8 times.
+# motions that CAVIN samples for an effect: 2 times each, and the best one 16 times.
 PERTURBED = 3 * (8 * 2 + 2 * 8 + 1 * 32)
-PERTURBED_MOTIONS = 3 * (4 * 2 + 1 * 8)
+PERTURBED_MOTIONS = 3 * (4 * 2 + 1 * 16)
 
 
 def count(*overrides: str) -> dict[str, int]:
