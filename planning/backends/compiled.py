@@ -192,7 +192,20 @@ def _graph(function: _FlatFunction, tensors: list[Tensor]) -> torch.fx.GraphModu
     graph.graph.set_codegen(torch.fx.graph.CodeGen())  # inputs and outputs are flat tuples: no pytree handling
     graph.recompile()
     passes.rewrite(graph)
+    _register_constants(graph)
     return graph
+
+
+def _register_constants(graph: torch.fx.GraphModule) -> None:
+    """Make buffers of constants in the code: Inductor's freezing loses other constants that are read twice.
+
+    It deletes such a constant where one of its readers is folded away, and then misses it for the other.
+    """
+    for part in graph.modules():
+        for name, value in list(vars(part).items()):
+            if isinstance(value, Tensor):
+                delattr(part, name)
+                part.register_buffer(name, value)
 
 
 def _shared_library(graph: torch.fx.GraphModule, tensors: list[Tensor], folder: Path) -> bytes:

@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from models.networks.contact.dynamics import ContactDynamics
 from models.networks.shapes import fixed_shapes, shapes_are_fixed
+from models.state import State
 from planning import CvaeMpcPlanner, PerturbedRollouts
 from planning.backends import chunking
 from planning.backends.compiled import Compiled
@@ -39,6 +41,13 @@ def told(numbers: torch.Tensor) -> torch.Tensor:
     return numbers + float(shapes_are_fixed())
 
 
+def after_two_pushes(model: ContactDynamics, centers: Tensor, features: Tensor, pushes: Tensor) -> Tensor:
+    state = State(centers, features, torch.ones(centers.shape[:-1], dtype=torch.bool))
+    for push in pushes.unbind(-2):
+        state = model(state, None, push)
+    return state.centers
+
+
 def branching(numbers: Tensor) -> Tensor:
     return numbers if bool(numbers.any()) else -numbers
 
@@ -59,6 +68,17 @@ def test_code_is_made_once_for_each_constant_and_shape() -> None:
         assert isinstance(pair, Pair)
         assert (pair.right is None) == (right is None)
     assert len(backend._versions) == 3
+
+
+@needs_a_compiler
+def test_two_pushes_by_an_f_that_sees_contact_compile_in_float32() -> None:
+    # Inductor lost constants of f that are read for both pushes, where one reader is computed in advance.
+    torch.manual_seed(0)
+    model = ContactDynamics(object_width=8, pair_width=4, shape_width=8, reach_margin=0.015).requires_grad_(False)
+    given = model, torch.rand(1, 16, 3, 3), torch.rand(1, 16, 3, 64), torch.rand(1, 16, 2, 4)
+    with torch.inference_mode():
+        expected = after_two_pushes(*given)
+        torch.testing.assert_close(Compiled(tracing=fixed_shapes)(after_two_pushes, *given), expected)
 
 
 @needs_a_compiler
