@@ -28,7 +28,7 @@ from torch import Tensor
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.factory import make_runner
-from planning.extensions import perturbed_rollouts as rollouts
+from planning.extensions import perturbed_rollouts as extension
 from planning.extensions import sequential_halving as halving
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts
 from planning.extensions.sequential_halving import sequential_halving
@@ -71,7 +71,7 @@ def noise_of_each_motion(independent: bool, seed: int) -> Iterator[None]:
     def own(noise: Tensor, pushes: Tensor) -> Tensor:
         return torch.randn(len(noise), pushes.shape[1], *noise.shape[2:], generator=generator)
 
-    with mock.patch.object(rollouts, "_for_each_motion", own if independent else rollouts._for_each_motion):
+    with mock.patch.object(extension, "_for_each_motion", own if independent else extension._for_each_motion):
         yield
 
 
@@ -133,30 +133,31 @@ def main() -> None:
         one for objects in (5, 3) for one in problems(arguments.task, objects, arguments.episodes, arguments.pushes)
     ]
     chosen = random.Random(0).sample(asked, min(arguments.problems, len(asked)))
-    regret: dict[Allocation, list[float]] = {way: [] for way in ALLOCATIONS}
-    failures: dict[Allocation, list[float]] = {way: [] for way in ALLOCATIONS}
+    regret: dict[Allocation, list[float]] = {allocation: [] for allocation in ALLOCATIONS}
+    failures: dict[Allocation, list[float]] = {allocation: [] for allocation in ALLOCATIONS}
     with torch.inference_mode():
         for problem in chosen:
             numbers, costs, failed = true_costs(problem, arguments.truth)
-            for way in ALLOCATIONS:
-                *shares, independent = way
-                fields = dict(zip(way._fields, shares, strict=False))
+            for allocation in ALLOCATIONS:
+                fields = allocation._asdict()
+                independent = fields.pop("independent")
                 options: PerturbedRollouts = replace(problem.given[0], **fields)
                 for seed in range(REPETITIONS):
                     given = (options, *problem.given[1:-1], [torch.Generator().manual_seed(1000 + seed)])
                     with noise_of_each_motion(independent, seed):
                         taken = sequential_halving(*given, **problem.options).number
                     place = (numbers == taken).nonzero().item()
-                    regret[way].append(float(costs[place] - costs.min()))
-                    failures[way].append(float(failed[place]))
+                    regret[allocation].append(float(costs[place] - costs.min()))
+                    failures[allocation].append(float(failed[place]))
     print(f"{len(chosen)} of {len(asked)} plans")
     print("noise        candidates  rollouts  rounds  factor   total  cost above the best, cm2  fails")
-    for way in ALLOCATIONS:
-        cost, share = 1e4 * statistics.mean(regret[way]), statistics.mean(failures[way])
-        noise = "independent" if way.independent else "shared"
+    for allocation in ALLOCATIONS:
+        candidates, rollouts, rounds, factor, independent = allocation
+        cost, share = 1e4 * statistics.mean(regret[allocation]), statistics.mean(failures[allocation])
+        noise = "independent" if independent else "shared"
         print(
-            f"{noise:11s}  {way.candidates:10d}  {way.rollouts:8d}  {way.rounds:6d}  {way.reduction_factor:6d}  "
-            f"{way.total:6d}  {cost:24.1f}  {share:5.1%}"
+            f"{noise:11s}  {candidates:10d}  {rollouts:8d}  {rounds:6d}  {factor:6d}  "
+            f"{allocation.total:6d}  {cost:24.1f}  {share:5.1%}"
         )
 
 

@@ -33,11 +33,12 @@ class PerturbedRollouts:
     The defaults are those of the baselines; `planning.cavin.FEW_CANDIDATES` are those of `planner=cavin`.
 
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best
-    candidates, one in `reduction_factor`, continue with that many times as many rollouts each.
+    candidates, one in `reduction_factor`, continue with `reduction_factor` times as many rollouts each.
 
-    Two standard reductions of variance make few rollouts tell motions apart: all motions of a round get the same noise
-    (common random numbers), and every other rollout has the noise of another with the opposite sign (antithetic
-    variates); see Law, Simulation Modeling and Analysis, chapter on variance reduction.
+    Two standard reductions of variance make few rollouts tell motions apart (Law, Simulation Modeling and Analysis,
+    chapter on variance reduction): all motions of a round get the same noise (common random numbers), and half of the
+    rollouts of a motion the noise of the other half with the opposite sign (antithetic variates). Outcomes that are
+    sampled have common numbers only.
 
     candidates: motions with perturbed rollouts, the best by line 10, or by their return in the baselines.
     rollouts: of each candidate in the first round.
