@@ -20,6 +20,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
     from cavin_pyro.visualization.rendering import check_goal, check_viewer, episode_files, render_episode, write_goal
+    from planning.searching import SearchingPlanner
 
     config.device = choose_device(config.device).type
     check_viewer(config.viewer)
@@ -34,7 +35,8 @@ def main(config: DictConfig) -> None:
         if config.save_goal is not None:
             write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
-        write_json(folder / "results.json", {**row, "provenance": provenance()})
+        native = isinstance(runner.planner, SearchingPlanner) and runner.planner.backend.native
+        write_json(folder / "results.json", {**row, "native_code": native, "provenance": provenance()})
         print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
         for said in (plan_summary_of_episode(row, config), sentence_of_episode(row, runner.probability)):
             print(said, end="\n" * bool(said))

@@ -34,6 +34,7 @@ from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
 from planning.rollouts.segment import Objective, SearchSpace
 
 ROBUSTNESS = PerturbedRollouts()
+AUTO = "auto"  # value of `compile`: native code that is kept already, and makes none
 
 
 class SearchingPlanner:
@@ -60,7 +61,7 @@ class SearchingPlanner:
         idle_distance: float = IDLE_DISTANCE,
         touchdown_distance: float = TOUCHDOWN_DISTANCE,
         guidance: str = "none",
-        compile: bool = False,
+        compile: bool | str = False,
     ) -> None:
         """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names, no compiler."""
         check_positive("samples", samples)
@@ -71,9 +72,11 @@ class SearchingPlanner:
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward, self.guidance = model, reward, guidance
         self.reward_at, self.stride_limits = reward_at, stride_limits
+        if not isinstance(compile, bool) and compile != AUTO:
+            raise ValueError(f"compile must be true, false or {AUTO}, not {compile}")
         tracing = model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext
-        self.backend: Backend = Compiled(tracing=tracing) if compile else eager
-        self.reparameterized = warm_start or compile
+        self.backend: Backend = Compiled(tracing=tracing, make=compile is True) if compile else eager
+        self.reparameterized = warm_start or bool(compile)
         if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
             raise ValueError("robustness.outcomes=sampled needs a model that samples f: it has no sampled_next_state")
         _ = self.cumulative_reward(), self.distance_to_goal  # refuse bad options now, not in the first plan

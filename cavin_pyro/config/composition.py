@@ -26,6 +26,10 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import check_options, kind, shown, types
 from cavin_pyro.config.registration import register
 
+# Commands that load native code by themselves. The others make results of many episodes, which must not depend on what
+# one machine has in its cache: there `planner.compile=auto` is false.
+KEEPING = ("plan",)
+
 register()
 
 
@@ -47,7 +51,10 @@ def completed(name: str, config: DictConfig) -> DictConfig:
     from cavin_pyro.config.output import with_output
 
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    return with_output(name, resolved(own), config.hydra)
+    whole = with_output(name, resolved(own), config.hydra)
+    if name not in KEEPING and OmegaConf.select(whole, "planner.compile") == "auto":
+        whole.planner.compile = False
+    return whole
 
 
 def resolved(config: DictConfig) -> DictConfig:

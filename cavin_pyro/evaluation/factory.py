@@ -20,19 +20,19 @@ from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.parts import check_largest, class_of, construct, naming
 from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
+from cavin_pyro.evaluation.native_code import argument_compile, check_native_code
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.evaluation.success.probability import NO_PROBABILITY, Probability, probability_for
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.models import model_of
-from envs.layouts import GENERATED, RANDOM
+from envs.layouts import GENERATED
 from envs.objects.sampling import NoRoomError
 from envs.pushing import PushingEnv
 from envs.tasks import GeneratedLayouts, Task
 from envs.workspace import OBJECT_SLOTS
 from models.model import Model
 from models.networks.geometry import Geometry
-from models.priors.flow import FlowPrior
 from planning import Planner
 from planning.inputs import NoFiniteCandidateError, OptimizerError
 from planning.optimizers import OPTIMIZERS, Shooting
@@ -88,11 +88,7 @@ def check_options(config: DictConfig, device: torch.device) -> None:
     """
     check_world(config.env)
     check_largest("planner", config.planner)
-    if device.type != "cpu" and config.planner.get("compile"):
-        raise UserError(
-            f"planner.compile=true makes native code for the CPU, and device={config.device} plans on {device.type}: "
-            "choose planner.compile=false or device=cpu"
-        )
+    check_native_code(config, device)
     if device.type != "cpu" and config.get("launcher") == "ray":
         raise UserError(
             f"launcher=ray runs episodes on processors, and device={config.device} plans on {device.type}: "
@@ -103,17 +99,6 @@ def check_options(config: DictConfig, device: torch.device) -> None:
         raise UserError(
             f"generated.{unread[0]}={config.generated[unread[0]]} is an option of layout=generated, and "
             f"layout={config.layout}: give layout=generated, or leave it out"
-        )
-    changing = config.layout == RANDOM or (config.layout == GENERATED and config.generated.seed is None)
-    if changing and config.planner.get("compile"):
-        raise UserError(
-            f"planner.compile=true compiles for one layout, and layout={config.layout} samples another in every "
-            "episode: choose planner.compile=false"
-        )
-    if config.planner.get("compile") and task_of(config)[0].goal_varies:
-        raise UserError(
-            "planner.compile=true compiles for one goal, and this task has another in every episode: "
-            "choose planner.compile=false"
         )
 
 
@@ -200,6 +185,8 @@ def make_planner(
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = model_of(checkpoint, path).to(device)
     _check_planner(options, model, path)
+    if "compile" in options:
+        options["compile"] = argument_compile(config, device, model, path)
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
     with naming("planner", config.planner):
@@ -264,7 +251,7 @@ def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
     """Make sure that the model has what the planner asks for, and no code that the planner would not choose.
 
     Raises:
-        UserError: it has not; the model that has is named. Or it is to be compiled, and cannot.
+        UserError: it has not; the model that has is named.
     """
     planner = class_of(options)
     violation = (
@@ -279,9 +266,4 @@ def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
         raise UserError(
             f"{planner.__name__} needs a checkpoint of model={wanted}, but {path} holds {type(model).__name__}, "
             f"which {violation}: {choice}planner=random, which takes any"
-        )
-    if options.get("compile") and any(isinstance(part, FlowPrior) for part in model.modules()):
-        raise UserError(
-            f"planner.compile=true, but the priors in {path} are flows, which cannot be compiled: "
-            "choose planner.compile=false"
         )

@@ -52,31 +52,46 @@ class Compiled:
     tensors of bfloat16, so their results are rounded as well; with "highest" everything is float32.
 
     Without such a folder, or for constants without a fingerprint, it compiles for this process only.
+
+    With `make=False` it only loads what the folder has, and runs all other functions directly.
     """
 
     def __init__(
-        self, folder: Path | None = None, tracing: Callable[[], AbstractContextManager[None]] = nullcontext
+        self,
+        folder: Path | None = None,
+        tracing: Callable[[], AbstractContextManager[None]] = nullcontext,
+        *,
+        make: bool = True,
     ) -> None:
         """`folder`: keeps the code; None is `planning.backends.cache.default_folder`. `tracing`: opened while functions
         become graphs, to tell models that shapes must not depend on values (`planning.protocol.FixedShapes`).
 
-        Raises ValueError where there is no C++ compiler.
+        Raises ValueError where code is to be made and there is no C++ compiler.
         """
         compiler = os.environ.get("CXX", "g++")
-        if shutil.which(compiler) is None:
+        if make and shutil.which(compiler) is None:
             raise ValueError(
                 f"compile=true needs a C++ compiler, and '{compiler}' was not found: install it, name another one in "
                 "the environment variable CXX, or choose compile=false"
             )
-        self._versions: dict[Any, _Native] = {}
+        self._versions: dict[Any, _Native | None] = {}  # None runs directly
         self._compiling = Lock()
         self._tracing = tracing
+        self._makes = make
         self._cache: CodeCache | None = None
         try:
-            self._cache = CodeCache(folder or default_folder())
+            folder = folder or default_folder()
+            if make or folder.exists():
+                self._cache = CodeCache(folder)
         except OSError as error:
             why = error if isinstance(error, UnsafeFolderError) else f"{error.filename}: {error.strerror}"
-            _say(f"native code is made for this process only: {why} ({VARIABLE}=DIR names another folder)")
+            what = "is made for this process only" if make else "is not loaded"
+            _say(f"native code {what}: {why} ({VARIABLE}=DIR names another folder)")
+
+    @property
+    def native(self) -> bool:
+        """See `Backend`."""
+        return bool(self._versions) and None not in self._versions.values()
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Backend`. Raises ValueError for tensors elsewhere than on the CPU, and for a function that cannot be
@@ -87,10 +102,10 @@ class Compiled:
         signature: list[Any] = [function, rounded]
         _flatten(arguments, tensors, signature)
         version = tuple(signature)
-        native = self._versions.get(version)
-        if native is None:
-            native = self._first(version, _FlatFunction(function, rounded, arguments), tensors)
-        return native(tensors)
+        if version not in self._versions:
+            self._first(version, _FlatFunction(function, rounded, arguments), tensors)
+        native = self._versions[version]
+        return function(*arguments) if native is None else native(tensors)
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """See `Backend`: one thread per item, as many at once as torch has threads."""
@@ -103,7 +118,7 @@ class Compiled:
         finally:
             torch.set_num_threads(threads)  # setting it in a worker thread also changes it here
 
-    def _first(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
+    def _first(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> None:
         with self._compiling, _distributions_unchecked(), self._tracing():
             if version not in self._versions:  # another thread may have made it
                 try:
@@ -111,15 +126,20 @@ class Compiled:
                 except RuntimeError as error:  # the base class of torch's errors of compilation
                     what = str(error).splitlines()[0]
                     raise ValueError(f"compile=true: {function.name} cannot be compiled: {what}") from error
-            return self._versions[version]
 
-    def _make(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native:
+    def _make(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native | None:
         if elsewhere := [tensor.device.type for tensor in tensors if tensor.device.type != "cpu"]:
             raise ValueError(
                 f"compile=true makes native code for the CPU, and {function.name} got tensors on {elsewhere[0]}: "
                 "choose compile=false, or plan on the CPU"
             )
         library = self._library(version, function, tensors)
+        if library is None and not self._makes:
+            _say(
+                "planning directly: there is no native code for these options yet. planner.compile=true makes it, "
+                "once, in one to three minutes; planner.compile=false looks for none"
+            )
+            return None
         if library is None:
             _announce("is made for this process only")
             code = torch._inductor.compile(_graph(function, tensors), [*tensors], options=COMPILING)
@@ -128,14 +148,16 @@ class Compiled:
         return _Native(library, function.form())
 
     def _library(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> Library | None:
-        """Loaded from the cache, or compiled and stored there; None without a cache or if it cannot store it."""
+        """Loaded from the cache, or compiled and stored there; None without a cache, if it cannot store it, or if it is
+        to make none.
+        """
         if self._cache is None:
             return None
         try:
             key = fingerprint([*_circumstances(), *version], [__name__])
         except UnknownValueError:
             return None
-        if (library := self._cache.load(key)) is not None:
+        if (library := self._cache.load(key)) is not None or not self._makes:
             return library
         try:
             with self._cache.building(key) as folder:

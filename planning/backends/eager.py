@@ -16,6 +16,10 @@ Result = TypeVar("Result")
 class Backend(Protocol):
     """Runs functions: `eager`, or `planning.backends.compiled.Compiled`."""
 
+    @property
+    def native(self) -> bool:
+        """Whether all functions so far ran as native code."""
+
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(*arguments)`."""
 
@@ -25,6 +29,8 @@ class Backend(Protocol):
 
 class Eager:
     """Eager execution, one operation of torch at a time."""
+
+    native = False
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Backend`."""

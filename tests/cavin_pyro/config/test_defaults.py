@@ -35,6 +35,7 @@ PAPER = {  # Algorithm 1 as it is printed
     "planner.touchdown_distance": 0.0,
     "planner.nearest_objects": None,
     "planner.optimizer._target_": "planning.optimizers.Shooting",
+    "planner.compile": False,
     "pushes_per_plan": None,
     "margin": 0.0,
     "matmul_precision": "float32",
@@ -49,7 +50,7 @@ def plain(config: Any) -> dict[str, Any]:
 
 def test_a_planner_without_options_is_that_of_the_command(small: SimpleNamespace) -> None:
     model, reward = build_model(small.config()), object()
-    section = plain(compose("plan").planner)
+    section = plain(compose("evaluate").planner)  # `plan` alone loads native code by itself
     del section["model_free"], section["default_checkpoint"]
     ours, theirs = CavinPlanner(model, reward), construct(section, model=model, reward=reward)
     assert {**vars(ours), "optimizer": None} == {**vars(theirs), "optimizer": None}

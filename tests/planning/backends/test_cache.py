@@ -17,7 +17,8 @@ from tests.compiler import needs_a_compiler
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs owners of files as POSIX has them")
 
-# Prints results bit by bit, and whether torch's compiler was loaded; the argument scales the weights.
+# Prints results bit by bit, whether they are of native code, and whether torch's compiler was loaded. The first
+# argument scales the weights, the second says whether code that is not kept is to be made.
 SCRIPT = """
 import sys, torch
 from planning.backends.compiled import Compiled
@@ -28,19 +29,20 @@ layer = torch.nn.Linear(4, 4).requires_grad_(False)
 layer.weight *= float(sys.argv[1])
 numbers = torch.linspace(-1, 2, 12).reshape(3, 4)
 with torch.inference_mode():
-    (found, nothing), positive = Compiled()(product, layer, 3, numbers)
+    backend = Compiled(make=sys.argv[2] == "make")
+    (found, nothing), positive = backend(product, layer, 3, numbers)
     expected = product(layer, 3, numbers)
     torch.testing.assert_close(found, expected[0][0])
     assert nothing is None and torch.equal(positive, expected[1])
-print(found.tolist(), "torch._inductor.compile_fx" in sys.modules)
+print(found.tolist(), backend.native, "torch._inductor.compile_fx" in sys.modules)
 """
 
 
-def start(folder: Path, factor: float = 1.0, **surroundings: str) -> subprocess.Popen[str]:
+def start(folder: Path, factor: float = 1.0, what: str = "make", **surroundings: str) -> subprocess.Popen[str]:
     script = folder / "script.py"  # a function without a source has no key
     script.write_text(SCRIPT)
     return subprocess.Popen(
-        [sys.executable, str(script), str(factor)],
+        [sys.executable, str(script), str(factor), what],
         env={**os.environ, "CAVIN_PYRO_CACHE": str(folder), "PYTHONPATH": os.getcwd(), **surroundings},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -62,7 +64,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     assert sorted((told + also_told).splitlines()) == [
         f"compiling for the first plan, which takes one or two minutes; native code is kept in {folder / 'native'}"
     ]
-    results = {text.rpartition(" ")[0] for text in (one, other)}
+    results = {text.rpartition(" ")[0] for text in (one, other)}  # without whether the compiler was loaded
     assert len(results) == 1
     return folder, results.pop()
 
@@ -80,6 +82,30 @@ def test_a_later_process_compiles_nothing(made: tuple[Path, str]) -> None:
     printed, complaints = finish(start(folder))
     assert printed == f"{results} False\n" and complaints == ""
     assert (library_in(folder).stat().st_ino, library.read_bytes()) == before
+
+
+@needs_a_compiler
+def test_code_that_is_kept_is_loaded_without_a_compiler(made: tuple[Path, str]) -> None:
+    folder, results = made
+    printed, complaints = finish(start(folder, what="load", PATH=str(folder / "empty")))
+    assert printed == f"{results} False\n" and " True " in printed and complaints == ""
+
+
+def test_what_is_not_kept_is_computed_directly_and_said_once(tmp_path: Path) -> None:
+    printed, complaints = finish(start(tmp_path, what="load", PATH=str(tmp_path / "empty")))
+    assert printed.endswith(" False False\n") and not (tmp_path / "native").exists()
+    (line,) = complaints.splitlines()
+    assert line.startswith("planning directly: there is no native code for these options yet. planner.compile=true")
+
+
+@needs_a_compiler
+def test_a_function_that_is_not_kept_runs_beside_one_that_is(tmp_path: Path) -> None:
+    numbers = torch.arange(3.0)
+    assert torch.equal(Compiled(tmp_path)(torch.neg, numbers), -numbers)
+    backend = Compiled(tmp_path, make=False)
+    assert not backend.native  # nothing has run yet
+    assert torch.equal(backend(torch.neg, numbers), -numbers) and backend.native
+    assert torch.equal(backend(torch.exp, numbers), numbers.exp()) and not backend.native
 
 
 @needs_a_compiler
@@ -178,6 +204,17 @@ def test_a_refused_folder_is_one_line_and_code_is_made_for_the_process(
     )
     assert torch.equal(backend(torch.neg, torch.arange(3.0)), -torch.arange(3.0))
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_refused_folder_is_one_line_where_code_would_only_be_loaded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tmp_path.chmod(0o777)
+    Compiled(tmp_path, make=False)
+    assert capsys.readouterr().err == (
+        f"native code is not loaded: {tmp_path} can be written by other users "
+        "(CAVIN_PYRO_CACHE=DIR names another folder)\n"
+    )
 
 
 def test_the_folder_is_the_platforms_unless_one_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,0 +1,60 @@
+"""Whether a planner runs native code: the option `planner.compile`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.world import task_of
+from envs.layouts import GENERATED, RANDOM
+from models.model import Model
+from models.priors.flow import FlowPrior
+from planning.searching import AUTO
+
+
+def check_native_code(config: DictConfig, device: torch.device) -> None:
+    """Refuse `planner.compile=true` with options that keep plans from being compiled.
+
+    Raises:
+        UserError: it has such options; the first one is named.
+    """
+    if config.planner.get("compile") is True and (why := _obstacle(config, device)):
+        other = "" if device.type == "cpu" else " or device=cpu"
+        raise UserError(f"planner.compile=true {why}: choose planner.compile=false{other}")
+
+
+def argument_compile(config: DictConfig, device: torch.device, model: Model, path: Path) -> bool | str:
+    """The planner's argument `compile`: the option's value, but false where `auto` could give other plans or nothing.
+
+    Native code in float32 makes the plans that are made directly, up to rounding, if both sample noise rather than
+    codes, as they do for warm starts. With products of bfloat16 it rounds at other places.
+
+    Args:
+        path: of the model's checkpoint.
+
+    Raises:
+        UserError: the model is to be compiled, and cannot.
+    """
+    chosen: bool | str = config.planner.compile
+    flows = any(isinstance(part, FlowPrior) for part in model.modules())
+    if chosen is True and flows:
+        raise UserError(
+            f"planner.compile=true, but the priors in {path} are flows, which cannot be compiled: "
+            "choose planner.compile=false"
+        )
+    equal = config.matmul_precision == "float32" and config.planner.get("warm_start") is True
+    return chosen if chosen != AUTO or (equal and not flows and _obstacle(config, device) is None) else False
+
+
+def _obstacle(config: DictConfig, device: torch.device) -> str | None:
+    """What in the options keeps plans from being compiled, to follow `planner.compile=true`; None if nothing does."""
+    if device.type != "cpu":
+        return f"makes native code for the CPU, and device={config.device} plans on {device.type}"
+    if config.layout == RANDOM or (config.layout == GENERATED and config.generated.seed is None):
+        return f"compiles for one layout, and layout={config.layout} samples another in every episode"
+    if task_of(config)[0].goal_varies:
+        return "compiles for one goal, and this task has another in every episode"
+    return None
