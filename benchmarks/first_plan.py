@@ -72,12 +72,12 @@ def main() -> None:
         first_plan(arguments.began, arguments.options)
         return
     options = arguments.options or ["task=clearing"]
-    compiled = [*options, "planner.compile=true"]
+    compiled, direct = [*options, "planner.compile=true"], [*options, "planner.compile=false"]
     print("seconds: to the first plan, of it alone, of processors until then, of an episode; the plan; the episode")
     with tempfile.TemporaryDirectory() as temporary:
         cache = arguments.cache or Path(temporary)
         ways = [] if arguments.no_cold else [("cold", compiled)]
-        ways += [way for _ in range(arguments.starts) for way in (("warm", compiled), ("direct", options))]
+        ways += [way for _ in range(arguments.starts) for way in (("warm", compiled), ("direct", direct))]
         for name, what in ways:
             print(f"{name:7s}{start(what, cache)}", flush=True)
 

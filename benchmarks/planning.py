@@ -7,7 +7,8 @@ Wall time, all in turn, medians and the fastest; crossing, sparse, horizon 30, T
 planned one after another or all at once: how long a search goes on depends on the scene. "Algorithm 1" is compiled
 planning without the perturbed rollouts of `planner.robustness`, which are not in the paper. Set OMP_NUM_THREADS for the
 number of threads. Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The
-public planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out.
+public planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out. Options
+of `evaluate` come last, such as `matmul_precision=bfloat16`.
 """
 
 from __future__ import annotations
@@ -100,11 +101,11 @@ def operations(action: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def planners(objects: int, samples: int, ways: list[str]) -> tuple[dict[str, Any], State]:
+def planners(objects: int, samples: int, ways: list[str], options: list[str]) -> tuple[dict[str, Any], State]:
     """A planner for each of the `ways`, and the scenes that they plan for."""
     found: dict[str, Any] = {}
     for way in ways:
-        one = runner(objects, samples, f"planner.compile={str(way == 'compiled').lower()}")
+        one = runner(objects, samples, f"planner.compile={str(way == 'compiled').lower()}", *options)
         found[way], state = one.planner, scenes(one, SCENES)
         one.env.close()
     if "compiled" in found:
@@ -113,15 +114,17 @@ def planners(objects: int, samples: int, ways: list[str]) -> tuple[dict[str, Any
     return found, state
 
 
-def grid(samples: list[int], objects: list[int], repetitions: int, ways: list[str], *, size: int) -> None:
-    """`size`: of the matrices whose product tells this machine's rate."""
+def grid(
+    samples: list[int], objects: list[int], repetitions: int, ways: list[str], *, size: int, options: list[str]
+) -> None:
+    """`size`: of the matrices whose product tells this machine's rate. `options`: of `evaluate`."""
     plain = ["Algorithm 1"] if "compiled" in ways else []
     print(f"{torch.get_num_threads()} thread(s); ms per plan, median (fastest), and what share of the matrix rate")
     titles = [*(f"{way:>15}  share" for way in ways), *(f"{way:>15}" for way in plain)]
     print("  ".join(["samples  objects  batch  GFLOP  matrix GFLOP/s", *titles]))
     for count in samples:
         for number in objects:
-            found, state = planners(number, count, ways)
+            found, state = planners(number, count, ways, options)
             work = operations(planning(found["eager"], state, 1)) / SCENES
             for batch in (1, SCENES):
                 rate = matrix_rate(size)  # anew each time: where cores are shared, it changes by the minute
@@ -217,12 +220,14 @@ def cem_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
     return lambda: planner(start.clone())
 
 
-def flat(samples: list[int], repetitions: int, ways: list[str]) -> None:
+def flat(samples: list[int], repetitions: int, ways: list[str], options: list[str]) -> None:
     print("the flat problem, 3 objects: ms per plan; all call the same f, eager or compiled by our backend")
     for count in samples:
         runners = {
             # No margin: all maximise the task's own reward.
-            way: runner(3, count, "planner=mpc", "margin=0", f"planner.compile={str(way == 'compiled').lower()}")
+            way: runner(
+                3, count, "planner=mpc", "margin=0", f"planner.compile={str(way == 'compiled').lower()}", *options
+            )
             for way in ways
         }
         ours, theirs = {}, {}
@@ -249,14 +254,15 @@ def main() -> None:
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
     parser.add_argument("--samples", type=int, nargs="+", help="numbers of samples (256, 1024 and 8192 by default)")
     parser.add_argument("--objects", type=int, nargs="+", help="numbers of objects (1, 3 and 5 by default)")
-    arguments = parser.parse_args()
+    parser.add_argument("options", nargs="*", metavar="OPTION=VALUE", help="of evaluate")
+    arguments = parser.parse_intermixed_args()
     ways = ["eager"] if arguments.no_compile else ["eager", "compiled"]
     samples, objects, repetitions = ([32], [2], 2) if arguments.quick else ([256, 1024, 8192], [1, 3, 5], 4)
     samples, objects = arguments.samples or samples, arguments.objects or objects
     if not arguments.no_grid:
-        grid(samples, objects, repetitions, ways, size=512 if arguments.quick else 2048)
+        grid(samples, objects, repetitions, ways, size=512 if arguments.quick else 2048, options=arguments.options)
     if not arguments.no_flat:
-        flat([32] if arguments.quick else [1024, 8192], 2 * repetitions, ways)
+        flat([32] if arguments.quick else [1024, 8192], 2 * repetitions, ways, arguments.options)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ TABLE_THICKNESS = 0.1  # metres
 REACH_LOW = (0.30, -0.55)  # metres; the planar box that the tool's tip may touch
 REACH_HIGH = (0.80, 0.55)  # metres
 MAXIMUM_MOTION = 0.1  # metres per push, on each axis
+PUSH_DECIMALS = 3  # of a planned push's numbers: 0.1 mm of its motion, 0.25 and 0.55 mm of its start
 
 TILE_SIDE = 0.15  # metres
 TILE_ORIGIN = (0.295, -0.485)  # metres; the centre of tile (0, 0)
@@ -56,6 +57,21 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
     start = low + (action[..., :2] + 1.0) / 2.0 * (high - low)
     end = np.clip(start + MAXIMUM_MOTION * action[..., 2:], low, high)
     return start, end
+
+
+def rounded_push(action: NDArray[np.floating]) -> NDArray[np.float32]:
+    """The push that a robot is told to make: clipped to [-1, 1], and rounded to about what an arm repeats.
+
+    Without rounding, an error of 1e-7 in a plan, of another processor or of native code, moves an object by less than
+    anybody sees, but changes single pixels of the next image, and so the plans after it.
+
+    Args:
+        action: [..., 4] (x, y, dx, dy), normalised.
+
+    Returns:
+        [..., 4] with `PUSH_DECIMALS` decimals.
+    """
+    return np.round(np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0), PUSH_DECIMALS).astype(np.float32)
 
 
 def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.success.predictors import PredictorValues, success_predictors
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
+from envs.workspace import rounded_push
 from models.networks.geometry import Geometry
 from planning import Plan, Planner
 from planning.protocol import SeeingPlanner
@@ -58,7 +59,8 @@ class Transition:
     """One executed push.
 
     Attributes:
-        step: number of the push, from 1. action: [4] normalised. reward, success, ..., ineffective: of the environment.
+        step: number of the push, from 1. action: [4] normalised, rounded as `envs.workspace.rounded_push` does.
+        reward, success, ..., ineffective: of the environment.
         centers: [M, 3] metres, as observed after the push.
         subgoal_distance: metres, the mean over objects from their centres to the plan's first subgoal; NaN before a
             segment's last push and for planners without subgoals.
@@ -145,6 +147,8 @@ def rollout(
 ) -> Episode:
     """Run one episode from depth images, which the environment segments.
 
+    Planned pushes are rounded (`envs.workspace.rounded_push`), so that episodes do not depend on how a machine rounds.
+
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11).
@@ -191,7 +195,7 @@ def rollout(
             callback.on_plan(record)
         actions = plan.actions[0].numpy()
         for number, action in enumerate(actions[:pushes_per_plan]):
-            action = np.clip(action, -1.0, 1.0).astype(np.float32)
+            action = rounded_push(action)
             observation, reward, terminated, truncated, info = env.step(action)
             last = number == len(actions) - 1
             transition = Transition(

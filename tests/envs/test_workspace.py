@@ -18,6 +18,7 @@ from envs.workspace import (
     TILE_SIDE,
     normalised_push,
     push_endpoints,
+    rounded_push,
     tile_center,
 )
 
@@ -44,6 +45,23 @@ def test_the_corners_of_the_action_are_the_corners_of_the_reach() -> None:
     start, end = push_endpoints(np.array([[-1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 0.5, -1.0]]))
     np.testing.assert_allclose(start, [REACH_LOW, REACH_HIGH, (0.55, 0.0)])
     np.testing.assert_allclose(end, [REACH_LOW, REACH_HIGH, (0.60, -0.1)])  # the first two are clipped to the box
+
+
+@settings(deadline=None)
+@given(ACTIONS)
+def test_a_rounded_push_differs_by_less_than_a_third_of_a_millimetre(actions: np.ndarray) -> None:
+    rounded = rounded_push(actions)
+    assert rounded.dtype == np.float32 and (np.abs(rounded) <= 1.0).all()
+    np.testing.assert_array_equal(rounded_push(rounded), rounded)
+    for exact, made in zip(push_endpoints(actions), push_endpoints(rounded), strict=True):
+        assert (np.abs(exact - made) < 0.00033).all()  # half of 0.55 mm of the start and of 0.1 mm of the motion
+
+
+def test_errors_of_rounding_make_no_other_push() -> None:
+    push = np.array([0.1234, -0.5678, 0.9, -1.0])
+    for error in (1e-7, -1e-7, 1e-5, -1e-5):
+        np.testing.assert_array_equal(rounded_push(push + error), rounded_push(push))
+    assert not np.array_equal(rounded_push(push + 1e-3), rounded_push(push))
 
 
 @settings(deadline=None)
