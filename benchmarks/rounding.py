@@ -1,7 +1,7 @@
 """Do episodes depend on how a machine rounds? `python benchmarks/rounding.py [--episodes 24] [OPTION=VALUE ...]`.
 
 The same scenes by processes that round otherwise: with instructions of older processors, with two threads, and with
-native code (minutes to compile, once; `--no-compile` leaves it out). Prints how many episodes have the pushes of the
+native code (minutes to compile, once); `--ways` chooses among them. Prints how many episodes have the pushes of the
 first process, with pushes rounded as usual (`envs.workspace.rounded_push`) and as planned, and how many first plans do.
 Options of `evaluate` come last, by default `task=clearing`. Tuning scenes.
 """
@@ -71,7 +71,7 @@ def same(one: Pushes, other: Pushes) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=24)
-    parser.add_argument("--no-compile", action="store_true", help="leave native code out")
+    parser.add_argument("--ways", nargs="+", default=[*WAYS][1:], choices=[*WAYS][1:], help="how the others round")
     parser.add_argument("--play", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("options", nargs="*", metavar="OPTION=VALUE", help="of evaluate; by default task=clearing")
     arguments = parser.parse_intermixed_args()
@@ -81,9 +81,7 @@ def main() -> None:
         return
     first = start("first", options, arguments.episodes)
     print(f"{' '.join(options)}: episodes, first pushes the same, episodes the same, of {arguments.episodes}")
-    for way in WAYS:
-        if way == "first" or (arguments.no_compile and way == "native code"):
-            continue
+    for way in arguments.ways:
         found = start(way, options, arguments.episodes)
         for name, episodes in found.items():
             pairs = list(zip(first[name], episodes, strict=True))

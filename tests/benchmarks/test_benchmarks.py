@@ -58,6 +58,13 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
     assert all(float(line.split()[5]) > 0.0 for line in (alone, together))
 
 
+def test_episodes_of_two_processes_have_the_same_pushes() -> None:
+    tiny = ("task=clearing", "objects=1", "planner.samples=8", "planner.horizon=6", "maximum_steps=2")
+    title, rounded, planned = run("rounding", *tiny, "--episodes", "2", "--ways", "again").splitlines()
+    assert title.endswith("episodes, first pushes the same, episodes the same, of 2")
+    assert rounded.split() == ["again", "rounded", "2", "2"] and planned.split() == ["again", "as", "planned", "2", "2"]
+
+
 @pytest.mark.soak
 def test_training_from_a_file_makes_the_weights_of_training_from_memory() -> None:
     small, large, steps = run("streaming", "--files", "1", "--turns", "1", "--steps", "2").splitlines()
