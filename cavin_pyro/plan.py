@@ -26,7 +26,7 @@ def main(config: DictConfig) -> None:
     check_viewer(config.viewer)
     check_goal(config.save_goal)
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "video", "viewer", "save_goal"))
+        check_same_run(folder, config, ignore=("output", "video", "viewer", "save_goal", "planner.compile"))
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
         announce_waiting(config)
