@@ -1,9 +1,9 @@
 """Do episodes depend on how a machine rounds? `python benchmarks/rounding.py [--episodes 24] [OPTION=VALUE ...]`.
 
 The same scenes by processes that round otherwise: with instructions of older processors, with two threads, and with
-native code (minutes to compile, once); `--ways` chooses among them. Prints how many episodes have the pushes of the
-first process, with pushes rounded as usual (`envs.workspace.rounded_push`) and as planned, and how many first plans do.
-Options of `evaluate` come last, by default `task=clearing`. Tuning scenes.
+native code (minutes to compile, once); `--ways` chooses among them. Prints how many first pushes and how many whole
+episodes are those of the first process, with pushes rounded as usual (`push_decimals=3`) and executed as planned.
+Options of `evaluate` are written before the others, by default `task=clearing`. Tuning scenes.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pathlib import Path
 sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # `planning.py` is not `planning`
 
 import numpy as np
-from numpy.typing import NDArray
 
 ROOT = Path(__file__).parents[1]
 SCENES = 10000  # the first seed
-SAME = 1e-3  # of a normalised push: the last decimal of a rounded one
+SAME = 5e-4  # of a normalised push: half of the last decimal of a rounded one, so that those must be equal
+ROUNDING = {"rounded": "push_decimals=3", "as planned": "push_decimals=null"}
 OLDER = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
 WAYS: dict[str, tuple[dict[str, str], str]] = {  # environment and option
     "first": ({"OMP_NUM_THREADS": "1"}, "planner.compile=false"),
@@ -34,33 +34,24 @@ WAYS: dict[str, tuple[dict[str, str], str]] = {  # environment and option
 Pushes = list[list[float]]
 
 
-def play(options: list[str], episodes: int) -> dict[str, list[Pushes]]:
-    """The pushes of all episodes, rounded and as planned."""
+def play(options: list[str], episodes: int) -> list[Pushes]:
+    """The pushes of all episodes."""
     from cavin_pyro.config.composition import compose
-    from cavin_pyro.evaluation import rollout
     from cavin_pyro.evaluation.factory import make_runner
 
     runner = make_runner(compose("evaluate", *options, "output=-"))
-    found: dict[str, list[Pushes]] = {}
-    for name, rounding in (("rounded", rollout.rounded_push), ("as planned", as_planned)):
-        rollout.rounded_push = rounding
-        ended = [runner.rollout(SCENES + number) for number in range(episodes)]
-        found[name] = [[push.action.tolist() for push in episode.transitions] for episode in ended]
+    ended = [runner.rollout(SCENES + number) for number in range(episodes)]
     runner.env.close()
-    return found
+    return [[push.action.tolist() for push in episode.transitions] for episode in ended]
 
 
-def as_planned(action: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.clip(action, -1.0, 1.0).astype(np.float32)
-
-
-def start(way: str, options: list[str], episodes: int) -> dict[str, list[Pushes]]:
+def start(way: str, rounding: str, options: list[str], episodes: int) -> list[Pushes]:
     """`play` in a process of its own, because torch reads the environment once."""
     environment, option = WAYS[way]
-    command = [sys.executable, __file__, "--play", f"--episodes={episodes}", *options, option]
+    command = [sys.executable, __file__, *options, option, rounding, "--play", f"--episodes={episodes}"]
     variables = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
     ended = subprocess.run(command, cwd=ROOT, env=variables, check=True, stdout=subprocess.PIPE, text=True)
-    found: dict[str, list[Pushes]] = json.loads(ended.stdout.splitlines()[-1])
+    found: list[Pushes] = json.loads(ended.stdout.splitlines()[-1])
     return found
 
 
@@ -79,12 +70,11 @@ def main() -> None:
     if arguments.play:
         print(json.dumps(play(options, arguments.episodes)))
         return
-    first = start("first", options, arguments.episodes)
-    print(f"{' '.join(options)}: episodes, first pushes the same, episodes the same, of {arguments.episodes}")
-    for way in arguments.ways:
-        found = start(way, options, arguments.episodes)
-        for name, episodes in found.items():
-            pairs = list(zip(first[name], episodes, strict=True))
+    print(f"{' '.join(options)}, {arguments.episodes} episodes: the same first pushes, the same episodes")
+    for name, rounding in ROUNDING.items():
+        first = start("first", rounding, options, arguments.episodes)
+        for way in arguments.ways:
+            pairs = list(zip(first, start(way, rounding, options, arguments.episodes), strict=True))
             begun = sum(same(one[:1], other[:1]) for one, other in pairs)
             print(f"{way:12} {name:11} {begun:4d} {sum(same(*pair) for pair in pairs):4d}", flush=True)
 

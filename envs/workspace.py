@@ -59,19 +59,17 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
     return start, end
 
 
-def rounded_push(action: NDArray[np.floating]) -> NDArray[np.float32]:
+def executed_push(action: NDArray[np.floating], decimals: int | None = PUSH_DECIMALS) -> NDArray[np.float32]:
     """The push that a robot is told to make: clipped to [-1, 1], and rounded to about what an arm repeats.
 
     Without rounding, an error of 1e-7 in a plan, of another processor or of native code, moves an object by less than
     anybody sees, but changes single pixels of the next image, and so the plans after it.
 
     Args:
-        action: [..., 4] (x, y, dx, dy), normalised.
-
-    Returns:
-        [..., 4] with `PUSH_DECIMALS` decimals.
+        action: [..., 4] (x, y, dx, dy), normalised. decimals: of the result [..., 4]; None does not round.
     """
-    return np.round(np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0), PUSH_DECIMALS).astype(np.float32)
+    clipped = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+    return (clipped if decimals is None else np.round(clipped, decimals)).astype(np.float32)
 
 
 def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.float64]:

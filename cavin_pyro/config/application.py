@@ -241,11 +241,12 @@ def _run_by_hydra(name: str, body: Body) -> None:
     """Let Hydra's application read the command line: for sweeps and for its own flags and options."""
 
     def job(config: DictConfig) -> None:
-        from cavin_pyro.config.composition import finished
+        from cavin_pyro.config.composition import resolved
+        from cavin_pyro.config.output import with_output
         from cavin_pyro.config.registration import register
 
         register()  # a launcher's job is a process of its own, with no plugins but those that Hydra finds
-        guarded(lambda: body(finished(name, config, HydraConfig.get())))
+        guarded(lambda: body(with_output(name, resolved(config), HydraConfig.get())))
 
     hydra.main(version_base="1.3", config_path=None, config_name=name)(job)()
 

@@ -26,10 +26,6 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import check_options, kind, shown, types
 from cavin_pyro.config.registration import register
 
-# Commands that load native code by themselves. The others make results of many episodes, which must not depend on what
-# one machine has in its cache: there `planner.compile=auto` is false.
-KEEPING = ("plan",)
-
 register()
 
 
@@ -48,25 +44,10 @@ def completed(name: str, config: DictConfig) -> DictConfig:
     Raises:
         UserError: an option has no value.
     """
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    return finished(name, own, config.hydra)
-
-
-def finished(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
-    """A configuration resolved, with an output folder, and with `auto` of `planner.compile` as the command takes it.
-
-    Args:
-        hydra_config: Hydra's own section of the same composition.
-
-    Raises:
-        UserError: an option has no value.
-    """
     from cavin_pyro.config.output import with_output
 
-    whole = with_output(name, resolved(config), hydra_config)
-    if name not in KEEPING and OmegaConf.select(whole, "planner.compile") == "auto":
-        whole.planner.compile = False
-    return whole
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    return with_output(name, resolved(own), config.hydra)
 
 
 def resolved(config: DictConfig) -> DictConfig:

@@ -20,7 +20,7 @@ from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.parts import check_largest, class_of, construct, naming
 from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
-from cavin_pyro.evaluation.native_code import argument_compile, check_native_code
+from cavin_pyro.evaluation.native_code import argument_compile, check_native_code, searches
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.evaluation.success.probability import NO_PROBABILITY, Probability, probability_for
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
@@ -30,14 +30,14 @@ from envs.layouts import GENERATED
 from envs.objects.sampling import NoRoomError
 from envs.pushing import PushingEnv
 from envs.tasks import GeneratedLayouts, Task
-from envs.workspace import OBJECT_SLOTS
+from envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
 from models.model import Model
 from models.networks.geometry import Geometry
 from planning import Planner
 from planning.inputs import NoFiniteCandidateError, OptimizerError
 from planning.optimizers import OPTIMIZERS, Shooting
 from planning.protocol import RewardFunction
-from planning.searching import SearchingPlanner
+from planning.searching import AUTO, SearchingPlanner
 
 CPU = torch.device("cpu")
 FAST_OPTIMIZER = "shooting"  # the only one of ours that never refines candidates
@@ -56,6 +56,7 @@ class EpisodeRunner:
     pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
     probability: Probability = NO_PROBABILITY  # of success, which each plan is given
+    push_decimals: int | None = PUSH_DECIMALS  # as of `cavin_pyro.evaluation.rollout.rollout`
 
     @property
     def task(self) -> Task:
@@ -70,7 +71,12 @@ class EpisodeRunner:
                 finite, or the scene of this seed has no room for its objects.
         """
         parts = self.env, self.planner, self.geometry
-        usual = {"pushes_per_plan": self.pushes_per_plan, "device": self.device, "probability": self.probability}
+        usual = {
+            "pushes_per_plan": self.pushes_per_plan,
+            "push_decimals": self.push_decimals,
+            "device": self.device,
+            "probability": self.probability,
+        }
         options = usual | options
         try:
             return rollout(*parts, seed=seed, **options)
@@ -179,6 +185,8 @@ def make_planner(
     geometry = geometry_of(checkpoint, path)
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
+    if options.get("compile") == AUTO and not searches(config.planner):
+        del options["compile"]  # which only planners that search know
     if options.pop("model_free"):
         with naming("planner", options):
             return construct(options), geometry
@@ -221,7 +229,9 @@ def make_runner(
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan, device, probability)
+    return EpisodeRunner(
+        env, planner, geometry, config.pushes_per_plan, device, probability, config.get("push_decimals")
+    )
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

@@ -8,20 +8,25 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import shown
+from cavin_pyro.config.parts import class_of
 from cavin_pyro.config.world import task_of
 from envs.layouts import GENERATED, RANDOM
 from models.model import Model
 from models.priors.flow import FlowPrior
-from planning.searching import AUTO
+from planning.searching import AUTO, SearchingPlanner
 
 
 def check_native_code(config: DictConfig, device: torch.device) -> None:
-    """Refuse `planner.compile=true` with options that keep plans from being compiled.
+    """Refuse unknown values of `planner.compile`, and true with options that keep plans from being compiled.
 
     Raises:
-        UserError: it has such options; the first one is named.
+        UserError: it is one; the choices, or the first such option, are named.
     """
-    if config.planner.get("compile") is True and (why := _obstacle(config, device)):
+    chosen = config.planner.get("compile", False)
+    if not isinstance(chosen, bool) and chosen != AUTO:
+        raise UserError(f"planner.compile must be true, false or {AUTO}, not {shown(chosen)}")
+    if chosen is True and (why := _obstacle(config, device)):
         other = "" if device.type == "cpu" else " or device=cpu"
         raise UserError(f"planner.compile=true {why}: choose planner.compile=false{other}")
 
@@ -47,6 +52,12 @@ def argument_compile(config: DictConfig, device: torch.device, model: Model, pat
         )
     equal = config.matmul_precision == "float32" and config.planner.get("warm_start") is True
     return chosen if chosen != AUTO or (equal and not flows and _obstacle(config, device) is None) else False
+
+
+def searches(planner: DictConfig) -> bool:
+    """Whether a planner has inner functions to compile."""
+    found = class_of(planner)
+    return isinstance(found, type) and issubclass(found, SearchingPlanner)
 
 
 def _obstacle(config: DictConfig, device: torch.device) -> str | None:

@@ -16,7 +16,7 @@ from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.evaluation.success.predictors import PredictorValues, success_predictors
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
-from envs.workspace import rounded_push
+from envs.workspace import PUSH_DECIMALS, executed_push
 from models.networks.geometry import Geometry
 from planning import Plan, Planner
 from planning.protocol import SeeingPlanner
@@ -59,7 +59,7 @@ class Transition:
     """One executed push.
 
     Attributes:
-        step: number of the push, from 1. action: [4] normalised, rounded as `envs.workspace.rounded_push` does.
+        step: number of the push, from 1. action: [4] normalised, as executed.
         reward, success, ..., ineffective: of the environment.
         centers: [M, 3] metres, as observed after the push.
         subgoal_distance: metres, the mean over objects from their centres to the plan's first subgoal; NaN before a
@@ -140,6 +140,7 @@ def rollout(
     *,
     seed: int,
     pushes_per_plan: int | None = None,
+    push_decimals: int | None = PUSH_DECIMALS,
     photograph: bool = False,
     probability: Callable[[Sequence[PredictorValues]], float | None] | None = None,
     callbacks: Sequence[EpisodeCallback] = (),
@@ -147,11 +148,11 @@ def rollout(
 ) -> Episode:
     """Run one episode from depth images, which the environment segments.
 
-    Planned pushes are rounded (`envs.workspace.rounded_push`), so that episodes do not depend on how a machine rounds.
-
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11).
+        push_decimals: to which planned pushes are rounded (`envs.workspace.executed_push`), so that an episode does not
+            depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
         probability: of success, from what the episode's plans have told so far; None leaves it out.
         callbacks: called in this order; without any, no frame is computed.
@@ -195,7 +196,7 @@ def rollout(
             callback.on_plan(record)
         actions = plan.actions[0].numpy()
         for number, action in enumerate(actions[:pushes_per_plan]):
-            action = rounded_push(action)
+            action = executed_push(action, push_decimals)
             observation, reward, terminated, truncated, info = env.step(action)
             last = number == len(actions) - 1
             transition = Transition(

@@ -11,6 +11,7 @@ WITHOUT_ADDITIONS = (
     "planner.idle_distance=0.0",
     "planner.touchdown_distance=0.0",
     "pushes_per_plan=null",
+    "push_decimals=null",
     "margin=0",
     "matmul_precision=float32",
 )

@@ -63,6 +63,7 @@ def stored_options(path: Path) -> dict[str, Any]:
     if "reward" in options:
         options.setdefault("criterion", "strict")  # older versions knew no other
         options.setdefault("device", "cpu")
+        options.setdefault("push_decimals", None)  # older versions did not round
         for name, default in asdict(GeneratedLayouts()).items():
             options.setdefault(f"generated.{name}", default)
     if "planner.horizon" in options:

@@ -44,7 +44,7 @@ COUNTS = {"num_logical_cores", "num_physical_cores", "num_sockets"}
 class Compiled:
     """Native code, which torch's AOTInductor writes when a function is first called with its constants and shapes.
 
-    This takes one or two minutes for the four or five functions of a planner. The code is kept in a folder of the
+    This takes one to three minutes for the four or five functions of a planner. The code is kept in a folder of the
     user's (`planning.backends.cache`), where later processes find it by a key of everything that determines it. Weights
     become part of the code: they must not change afterwards.
 
@@ -79,6 +79,7 @@ class Compiled:
         self._tracing = tracing
         self._makes = make
         self._cache: CodeCache | None = None
+        self._refused = False  # the folder, which was said
         try:
             folder = folder or default_folder()
             if make or folder.exists():
@@ -86,6 +87,7 @@ class Compiled:
         except OSError as error:
             why = error if isinstance(error, UnsafeFolderError) else f"{error.filename}: {error.strerror}"
             what = "is made for this process only" if make else "is not loaded"
+            self._refused = True
             _say(f"native code {what}: {why} ({VARIABLE}=DIR names another folder)")
 
     @property
@@ -94,8 +96,8 @@ class Compiled:
         return bool(self._versions) and None not in self._versions.values()
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """See `Backend`. Raises ValueError for tensors elsewhere than on the CPU, and for a function that cannot be
-        compiled, saying why.
+        """See `Backend`. Raises ValueError where code is to be made, for tensors elsewhere than on the CPU, and for a
+        function that cannot be compiled, saying why.
         """
         rounded = torch.get_float32_matmul_precision() != "highest"
         tensors: list[Tensor] = []
@@ -124,21 +126,26 @@ class Compiled:
                 try:
                     self._versions[version] = self._make(version, function, tensors)
                 except RuntimeError as error:  # the base class of torch's errors of compilation
+                    if not self._makes:
+                        raise
                     what = str(error).splitlines()[0]
                     raise ValueError(f"compile=true: {function.name} cannot be compiled: {what}") from error
 
     def _make(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> _Native | None:
         if elsewhere := [tensor.device.type for tensor in tensors if tensor.device.type != "cpu"]:
+            if not self._makes:
+                return None
             raise ValueError(
                 f"compile=true makes native code for the CPU, and {function.name} got tensors on {elsewhere[0]}: "
                 "choose compile=false, or plan on the CPU"
             )
         library = self._library(version, function, tensors)
         if library is None and not self._makes:
-            _say(
-                "planning directly: there is no native code for these options yet. planner.compile=true makes it, "
-                "once, in one to three minutes; planner.compile=false looks for none"
-            )
+            if not self._refused:
+                _say(
+                    "planning directly what has no native code yet: planner.compile=true makes it, once, in one to "
+                    "three minutes; planner.compile=false looks for none"
+                )
             return None
         if library is None:
             _announce("is made for this process only")
@@ -186,7 +193,7 @@ class _Native:
 
 
 def _announce(where: str) -> None:
-    _say(f"compiling for the first plan, which takes one or two minutes; native code {where}")
+    _say(f"compiling for the first plan, which takes one to three minutes; native code {where}")
 
 
 @cache

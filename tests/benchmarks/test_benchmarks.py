@@ -61,7 +61,7 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
 def test_episodes_of_two_processes_have_the_same_pushes() -> None:
     tiny = ("task=clearing", "objects=1", "planner.samples=8", "planner.horizon=6", "maximum_steps=2")
     title, rounded, planned = run("rounding", *tiny, "--episodes", "2", "--ways", "again").splitlines()
-    assert title.endswith("episodes, first pushes the same, episodes the same, of 2")
+    assert title.endswith("2 episodes: the same first pushes, the same episodes")
     assert rounded.split() == ["again", "rounded", "2", "2"] and planned.split() == ["again", "as", "planned", "2", "2"]
 
 

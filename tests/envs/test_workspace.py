@@ -16,9 +16,9 @@ from envs.workspace import (
     TABLE_LOW,
     TILE_COUNT,
     TILE_SIDE,
+    executed_push,
     normalised_push,
     push_endpoints,
-    rounded_push,
     tile_center,
 )
 
@@ -49,10 +49,10 @@ def test_the_corners_of_the_action_are_the_corners_of_the_reach() -> None:
 
 @settings(deadline=None)
 @given(ACTIONS)
-def test_a_rounded_push_differs_by_less_than_a_third_of_a_millimetre(actions: np.ndarray) -> None:
-    rounded = rounded_push(actions)
+def test_an_executed_push_differs_by_less_than_a_third_of_a_millimetre(actions: np.ndarray) -> None:
+    rounded = executed_push(actions)
     assert rounded.dtype == np.float32 and (np.abs(rounded) <= 1.0).all()
-    np.testing.assert_array_equal(rounded_push(rounded), rounded)
+    np.testing.assert_array_equal(executed_push(rounded), rounded)
     for exact, made in zip(push_endpoints(actions), push_endpoints(rounded), strict=True):
         assert (np.abs(exact - made) < 0.00033).all()  # half of 0.55 mm of the start and of 0.1 mm of the motion
 
@@ -60,8 +60,9 @@ def test_a_rounded_push_differs_by_less_than_a_third_of_a_millimetre(actions: np
 def test_errors_of_rounding_make_no_other_push() -> None:
     push = np.array([0.1234, -0.5678, 0.9, -1.0])
     for error in (1e-7, -1e-7, 1e-5, -1e-5):
-        np.testing.assert_array_equal(rounded_push(push + error), rounded_push(push))
-    assert not np.array_equal(rounded_push(push + 1e-3), rounded_push(push))
+        np.testing.assert_array_equal(executed_push(push + error), executed_push(push))
+    assert not np.array_equal(executed_push(push + 1e-3), executed_push(push))
+    assert not np.array_equal(executed_push(push + 1e-5, None), executed_push(push, None))
 
 
 @settings(deadline=None)

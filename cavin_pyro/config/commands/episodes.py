@@ -10,7 +10,7 @@ from cavin_pyro.config.commands.launching import LaunchOptions
 from cavin_pyro.config.commands.world import ENVIRONMENT, WorldConfig
 from cavin_pyro.config.options import MAXIMUM_SEED, option, seed_option
 from envs.tasks.generated import ANY_SHAPE, FEWEST, MOST, OBSTACLES, SHAPES, GeneratedLayouts
-from envs.workspace import MAXIMUM_OBJECTS, TILE_SIDE
+from envs.workspace import MAXIMUM_OBJECTS, PUSH_DECIMALS, TILE_SIDE
 
 CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
     "cavin": ("cascaded", "cascaded"),
@@ -97,6 +97,14 @@ class EpisodeConfig(DeviceOptions):
     pushes_per_plan: int | None = option(
         1, "executed pushes per plan; null executes all T (paper, Algorithm 1, line 11)", group="planning"
     )
+    push_decimals: int | None = option(
+        PUSH_DECIMALS,
+        "to how many decimals planned pushes are rounded, so that an episode does not depend on how a machine rounds; "
+        "null executes them as planned",
+        minimum=1,
+        limit=6,
+        group="planning",
+    )
     margin: float = option(
         0.02,
         "safety margin of the planner's reward, at most half a tile; predictions err by about this much",
@@ -132,6 +140,7 @@ class EpisodeConfig(DeviceOptions):
 class PlanConfig(EpisodeConfig):
     """Options of `python -m cavin_pyro.plan`."""
 
+    defaults: list[Any] = field(default_factory=lambda: [*DEFAULTS, "kept_native_code"])
     output: str | None = option(None, "folder for the results; by default a separate one in runs/plan", group="run")
     video: bool = option(True, "write a video of the episode", group="run")
     save_goal: str | None = option(

@@ -14,10 +14,10 @@ from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.run_directory import flat_options
 
 RANGED = ("objects", "maximum_steps", "generated.tiles")  # options of a scene with a range
-FREE = (  # options that change neither plans nor scenes
+FREE = (  # options that change neither plans nor scenes, but for rounding
     *("seed", "output", "episodes", "workers", "launcher", "address", "compare", "shard", "merge", "trust", "tasks"),
     *("video", "viewer", "save_goal", "success_probability"),
-    *("device", "generated.seed", "planner.compile", "planner.default_checkpoint"),
+    *("device", "generated.seed", "planner.compile", "planner.default_checkpoint", "push_decimals"),
 )
 
 

@@ -211,6 +211,8 @@ BAD_OPTIONS = [
     ("plan", "planner.idle_distance=-1", "planner.idle_distance must be zero or a positive number, not -1"),
     ("plan", "planner.warm_start=3", "planner.warm_start must be true or false, not 3"),
     ("plan", "planner.compile=3", "planner.compile must be true, false or auto, not 3"),
+    ("evaluate", "planner.compile=null", "planner.compile must be true, false or auto, not null"),
+    ("plan", "push_decimals=0", "push_decimals must be at least 1, not 0"),
     ("evaluate", "planner.compile=kept", "planner.compile must be true, false or auto, not kept"),
     (
         "plan",

@@ -35,8 +35,8 @@ PAPER = {  # Algorithm 1 as it is printed
     "planner.touchdown_distance": 0.0,
     "planner.nearest_objects": None,
     "planner.optimizer._target_": "planning.optimizers.Shooting",
-    "planner.compile": False,
     "pushes_per_plan": None,
+    "push_decimals": None,
     "margin": 0.0,
     "matmul_precision": "float32",
 }

@@ -62,7 +62,9 @@ def test_auto_without_a_gpu_says_what_it_took_and_plans_as_the_cpu_does(shell: S
     usual = shell.run_command("plan", *options, "output=cpu", folder=tmp_path)
     assert automatic.status == usual.status == 0
     device, code = automatic.errors.splitlines()
-    assert device.startswith("device=auto takes cpu: torch ") and code.startswith("planning directly: ")
+    assert device.startswith("device=auto takes cpu: torch ") and code.startswith(
+        "planning directly what has no native code yet: "
+    )
     assert usual.errors.splitlines() == [code]
     assert "device: cpu\n" in (tmp_path / "auto" / "config.yaml").read_text()
     assert pushes(tmp_path / "auto") == pushes(tmp_path / "cpu")

@@ -24,7 +24,7 @@ from cavin_pyro.evaluation.rollout import (
 )
 from cavin_pyro.storage.checkpoint import save_checkpoint
 from envs.pushing import PushingEnv
-from envs.workspace import rounded_push
+from envs.workspace import executed_push
 from models.networks.pointnet import PointNet
 from planning import CavinPlanner, Plan, RandomPlanner
 
@@ -135,7 +135,7 @@ def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) 
     for transition in episode.transitions:
         record = episode.plan_records[(transition.step - 1) // 3]
         planned = record.plan.actions[0, (transition.step - 1) % 3].numpy()
-        np.testing.assert_array_equal(transition.action, rounded_push(planned))
+        np.testing.assert_array_equal(transition.action, executed_push(planned))
     assert episode.outcome in OUTCOMES
     assert episode.total_reward == sum(transition.reward for transition in episode.transitions)
 
@@ -146,6 +146,10 @@ def test_an_episode_does_not_depend_on_how_a_machine_rounds(env: PushingEnv) -> 
     one, same, different = (happened(rollout(env, planner, PointNet(), seed=3)) for planner in (exact, rounded, other))
     assert one == same
     assert one != different
+    exact_pushes, rounded_otherwise = (
+        happened(rollout(env, planner, PointNet(), seed=3, push_decimals=None)) for planner in (exact, rounded)
+    )
+    assert exact_pushes != rounded_otherwise
 
 
 @pytest.mark.parametrize(("pushes_per_plan", "steps"), [(None, [0, 3]), (3, [0, 3]), (2, [0, 2]), (1, [0, 1, 2, 3])])
@@ -157,7 +161,7 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
     assert len(episode.transitions) == 4
     for record, end in zip(episode.plan_records, [*steps[1:], 4], strict=True):
         made = episode.transitions[record.step : end]
-        planned = rounded_push(record.plan.actions[0, : len(made)].numpy())
+        planned = executed_push(record.plan.actions[0, : len(made)].numpy())
         np.testing.assert_array_equal([transition.action for transition in made], planned)
         np.testing.assert_array_equal(episode.reached(record), [transition.centers for transition in made])
 

@@ -1,36 +1,37 @@
-"""`planner.compile=auto`, the default: who loads native code that is kept, and where it could give other plans."""
+"""`planner.compile=auto`, the default of `plan` alone, is false where native code could give other plans."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torch import nn
 
-from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.composition import compose
-from cavin_pyro.evaluation.native_code import argument_compile
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.factory import make_runner
+from cavin_pyro.evaluation.native_code import argument_compile, searches
+from cavin_pyro.storage.run_directory import check_same_run, write_config
 from models.priors.flow import FlowPrior
+from planning import CavinPlanner, RandomPlanner
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
+PLANNERS = ("cavin", "cavin_evolution", "cavin_without_effects", "paper", "sectar", "cvae_mpc", "mpc")
 
 
-@pytest.mark.parametrize("command", ["plan", "evaluate", "demo"])
-def test_only_plan_loads_native_code_by_itself(command: str) -> None:
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_plan_alone_loads_native_code_by_itself(planner: str) -> None:
     """Results of many episodes must not depend on what lies in one machine's cache."""
-    assert command in COMMANDS
-    assert compose(command).planner.compile == ("auto" if command == "plan" else False)
-    assert compose(command, "planner.compile=true").planner.compile is True
-    assert compose(command, "planner.compile=auto").planner.compile == ("auto" if command == "plan" else False)
-    assert compose(command, "planner=paper").planner.compile is False
-    assert "compile" not in compose(command, "planner=random").planner
+    for command, usual in (("plan", "auto"), ("evaluate", False), ("demo", False)):
+        assert compose(command, f"planner={planner}").planner.compile == usual
+        assert compose(command, f"planner={planner}", "planner.compile=true").planner.compile is True
 
 
-def test_an_evaluation_has_the_same_folder_as_before_there_was_a_choice() -> None:
-    assert compose("evaluate").output == compose("evaluate", "planner.compile=auto").output
-    assert "clearing-sparse-3-cavin-0" in compose("evaluate", "task=clearing").output
+def test_evaluations_have_the_folders_that_they_had() -> None:
+    assert compose("evaluate").output == compose("evaluate", "planner.compile=false").output
+    assert compose("evaluate").output != compose("evaluate", "planner.compile=true").output
 
 
 @pytest.mark.parametrize(
@@ -39,7 +40,6 @@ def test_an_evaluation_has_the_same_folder_as_before_there_was_a_choice() -> Non
         ("", CPU, "auto"),
         ("layout=1", CPU, "auto"),
         ("layout=generated generated.seed=3", CPU, "auto"),
-        ("planner.optimizer=cem", CPU, "auto"),
         ("planner.compile=true", CPU, True),
         ("planner.compile=false", CPU, False),
         ("", GPU, False),
@@ -48,6 +48,7 @@ def test_an_evaluation_has_the_same_folder_as_before_there_was_a_choice() -> Non
         ("task=rearrange", CPU, False),
         ("matmul_precision=bfloat16", CPU, False),  # it would round at other places
         ("planner.warm_start=false", CPU, False),  # direct plans sample codes then, not noise
+        ("planner=paper", CPU, False),
         ("planner.warm_start=false planner.compile=true", CPU, True),
     ],
 )
@@ -58,6 +59,25 @@ def test_auto_is_false_where_native_code_would_change_plans(
     assert argument_compile(config, device, nn.Module(), Path("a.safetensors")) == chosen  # type: ignore[arg-type]
 
 
-def test_auto_is_false_with_flows(small: SimpleNamespace) -> None:
+def test_auto_is_false_with_flows() -> None:
     model = nn.ModuleList([FlowPrior(dimension=2, feature_dimension=4)])
     assert argument_compile(compose("plan"), CPU, model, Path("a.safetensors")) is False  # type: ignore[arg-type]
+
+
+def test_planners_that_do_not_search_are_not_asked_to_compile() -> None:
+    runner = make_runner(compose("plan", "planner=random", "objects=1", "output=unused"))
+    runner.env.close()
+    assert isinstance(runner.planner, RandomPlanner)
+    assert not searches(compose("plan", "planner=random").planner) and searches(compose("plan").planner)
+    assert searches(OmegaConf.create({"_target_": f"{CavinPlanner.__module__}.{CavinPlanner.__qualname__}"}))
+
+
+def test_a_run_that_did_not_round_pushes_is_not_resumed_with_rounding(tmp_path: Path) -> None:
+    config = compose("evaluate", f"output={tmp_path}")
+    before = config.copy()
+    del before["push_decimals"]  # of versions that knew no such option
+    write_config(tmp_path, before)
+    (tmp_path / "episodes.jsonl").write_text("{}\n")
+    with pytest.raises(UserError, match=r"holds a run with push_decimals=None, not 3: resume with the same options"):
+        check_same_run(tmp_path, config, ignore=("output",))
+    check_same_run(tmp_path, compose("evaluate", f"output={tmp_path}", "push_decimals=null"), ignore=("output",))
