@@ -21,7 +21,7 @@ from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.evaluation.factory import make_runner
 from planning.backends.compiled import Compiled
 from tests.cavin_pyro.devices.conftest import broken_after, episode, tensors, trained
-from tests.cavin_pyro.shell import ENVIRONMENT, ROOT
+from tests.cavin_pyro.shell import ENVIRONMENT, NO_NATIVE_CODE, ROOT
 
 GPU = torch.cuda.is_available()
 needs_gpu = pytest.mark.skipif(not GPU, reason="needs a GPU that torch can use by CUDA, and there is none")
@@ -62,9 +62,7 @@ def test_auto_without_a_gpu_says_what_it_took_and_plans_as_the_cpu_does(shell: S
     usual = shell.run_command("plan", *options, "output=cpu", folder=tmp_path)
     assert automatic.status == usual.status == 0
     device, code = automatic.errors.splitlines()
-    assert device.startswith("device=auto takes cpu: torch ") and code.startswith(
-        "planning directly what has no native code yet: "
-    )
+    assert device.startswith("device=auto takes cpu: torch ") and code.startswith(NO_NATIVE_CODE)
     assert usual.errors.splitlines() == [code]
     assert "device: cpu\n" in (tmp_path / "auto" / "config.yaml").read_text()
     assert pushes(tmp_path / "auto") == pushes(tmp_path / "cpu")

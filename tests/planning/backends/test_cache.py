@@ -13,6 +13,7 @@ import torch
 
 from planning.backends.cache import MOST, CodeCache, UnsafeFolderError, default_folder
 from planning.backends.compiled import Compiled
+from tests.cavin_pyro.shell import NO_NATIVE_CODE
 from tests.compiler import needs_a_compiler
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs owners of files as POSIX has them")
@@ -95,7 +96,7 @@ def test_what_is_not_kept_is_computed_directly_and_said_once(tmp_path: Path) -> 
     printed, complaints = finish(start(tmp_path, what="load", PATH=str(tmp_path / "empty")))
     assert printed.endswith(" False False\n") and not (tmp_path / "native").exists()
     (line,) = complaints.splitlines()
-    assert line.startswith("planning directly what has no native code yet: planner.compile=true makes it")
+    assert line.startswith(NO_NATIVE_CODE)
 
 
 @needs_a_compiler
@@ -136,7 +137,7 @@ def test_damaged_code_is_never_loaded_and_made_anew(made: tuple[Path, str], tmp_
         copy.write_bytes(content)
         assert cache.load(key) is None
     printed, complaints = finish(start(tmp_path, what="load"))
-    assert " False " in printed and complaints.startswith("planning directly what has no native code yet")
+    assert " False " in printed and complaints.startswith(NO_NATIVE_CODE)
     copy.rename(tmp_path / "native" / ("0" * 64 + ".so"))
     (tmp_path / "native" / ("0" * 64 + ".so")).write_bytes(whole)
     assert cache.load("0" * 64) is None  # of another key
