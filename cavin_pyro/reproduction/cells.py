@@ -61,12 +61,14 @@ def cells(scale: Scale, methods: Sequence[str], planners: Sequence[str] = PLANNE
     for planner in planners:
         for task in scale.tasks:
             if planner == "variants":
-                yield from (Cell(*one, task, "sparse", TOP_ROW_OBJECTS) for one in VARIANTS if one[0] in methods)
+                chosen = [one for one in VARIANTS if one[0] in methods and "sparse" in scale.rewards]
+                yield from (Cell(*one, task, "sparse", TOP_ROW_OBJECTS) for one in chosen)
                 continue
             for method in methods:
-                yield Cell(method, planner, task, "dense", TOP_ROW_OBJECTS)
-                for objects in scale.object_counts:
-                    yield Cell(method, planner, task, "sparse", objects)
+                if "dense" in scale.rewards:
+                    yield Cell(method, planner, task, "dense", TOP_ROW_OBJECTS)
+                if "sparse" in scale.rewards:
+                    yield from (Cell(method, planner, task, "sparse", objects) for objects in scale.object_counts)
 
 
 def evaluations(scale: Scale, methods: Sequence[str], planners: Sequence[str] = PLANNERS) -> Iterator[Evaluation]:

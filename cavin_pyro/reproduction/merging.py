@@ -15,7 +15,7 @@ from cavin_pyro.reproduction.table import TABLE, episode_key, read_table, row_ke
 from cavin_pyro.storage.run_directory import check_same_run
 
 # Options that may change when a run goes on.
-EXTENDED = ("planners", "tasks", "objects", "episodes", "bottom_episodes", "extends")
+EXTENDED = ("planners", "tasks", "objects", "rewards", "episodes", "bottom_episodes", "extends")
 IGNORED = ("output", "workers", "shard", "merge", "pictures", *EXTENDED)
 
 

@@ -70,16 +70,17 @@ def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> list[Ro
 
 
 def chosen_scale(config: DictConfig) -> Scale:
-    """The scale by its name, with the numbers of episodes, and the tasks and numbers of objects, that are given.
+    """The scale by its name, with the given episodes, scenes, tasks, rewards and numbers of objects.
 
     Raises:
         UserError: more episodes than there are scenes, or no task or number of objects that the scale has.
     """
     scale = SCALES[config.scale]
-    given = {name: config[name] for name in ("episodes", "bottom_episodes") if config[name] is not None}
+    names = ("episodes", "bottom_episodes", "first_scene")
+    given = {name: config[name] for name in names if config[name] is not None}
     most = SCENES_PER_TRAINING * len(scale.training_seeds)
     for name, value in given.items():
-        if value > most:
+        if name != "first_scene" and value > most:
             raise UserError(f"{name} must be at most {most} with scale={config.scale}, not {value}")
     if odd := [one for one in config.objects if one not in OBJECT_COUNTS]:
         raise UserError(f"objects has {odd[0]}: choose from {', '.join(map(str, OBJECT_COUNTS))}")
@@ -88,7 +89,7 @@ def chosen_scale(config: DictConfig) -> Scale:
             raise UserError(f"{name} has none of scale={config.scale}: choose from {', '.join(map(str, own))}")
     tasks = tuple(one for one in scale.tasks if one in config.tasks)
     counts = tuple(one for one in scale.object_counts if one in config.objects)
-    return replace(scale, **given, tasks=tasks, object_counts=counts)
+    return replace(scale, **given, tasks=tasks, object_counts=counts, rewards=tuple(config.rewards))
 
 
 def check_inputs(config: DictConfig) -> None:
@@ -98,16 +99,19 @@ def check_inputs(config: DictConfig) -> None:
         UserError: an option that cannot be used, a model or a table that is missing.
     """
     scale = chosen_scale(config)
-    for name in ("methods", "planners"):
+    for name in ("methods", "planners", "rewards"):
         if not config[name]:
             raise UserError(f"{name}=[] leaves nothing to run: choose some, or leave the option out")
     of_shard(trainings(scale, Path(), config.methods), config.shard)
-    _models(config, Path(), list(evaluations(scale, config.methods, config.planners)))
+    wanted = list(evaluations(scale, config.methods, config.planners))
+    if not wanted:
+        raise UserError("no cell has these methods, planners and rewards: choose others (variants have sparse rewards)")
+    _models(config, Path(), wanted)
     _known(config, scale)
 
 
 def chosen_rows(rows: Sequence[Row], config: DictConfig) -> list[Row]:
-    """The rows of a table that the options `methods`, `planners`, `tasks` and `objects` choose.
+    """The rows of a table that the options `methods`, `planners`, `tasks`, `objects` and `rewards` choose.
 
     Raises:
         UserError: there is none.
@@ -120,10 +124,12 @@ def chosen_rows(rows: Sequence[Row], config: DictConfig) -> list[Row]:
         and kinds[row["planner"]] in config.planners
         and row["task"] in config.tasks
         and row["objects"] in config.objects
+        and row["reward"] in config.rewards
     ]
     if not chosen:
         raise UserError(
-            f"table={config.table} has no episode of the chosen methods, planners, tasks and objects: choose others"
+            f"table={config.table} has no episode of the chosen methods, planners, tasks, objects and rewards: choose "
+            "others"
         )
     return chosen
 
@@ -132,7 +138,8 @@ def as_typed(config: DictConfig) -> str:
     """The command that makes the same table, for the page of results."""
     default = ReproduceConfig()
     words = [f"table={config.table}" if config.table else f"scale={config.scale}"]
-    for name in ("methods", "planners", "tasks", "objects", "episodes", "bottom_episodes", "models", "extends"):
+    chosen = ("methods", "planners", "tasks", "objects", "rewards", "episodes", "bottom_episodes", "first_scene")
+    for name in (*chosen, "models", "extends"):
         if config[name] != getattr(default, name):
             value = config[name]
             words.append(f"{name}={value if isinstance(value, int | str) else '[' + ','.join(map(str, value)) + ']'}")
@@ -166,7 +173,7 @@ def _known(config: DictConfig, scale: Scale) -> dict[tuple[Any, ...], Row]:
     if not config.extends:
         return {}
     rows = read_table(Path(config.extends))
-    whole = replace(SCALES[config.scale], episodes=1, bottom_episodes=1)
+    whole = replace(SCALES[config.scale], episodes=1, bottom_episodes=1, first_scene=scale.first_scene)
     own = {episode_key(one, one.seed)[:-1]: one.seed for one in evaluations(whole, list(METHODS))}
     for row in rows:
         first = own.get(row_key(row)[:-1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 TASKS = ("clearing", "insertion", "crossing")
+REWARDS = ("dense", "sparse")
 OBJECT_COUNTS = (1, 2, 3, 4, 5)
 TOP_ROW_OBJECTS = 3  # objects in the top row of the paper's figure, dense and sparse
 
@@ -33,6 +34,7 @@ class Scale:
     training_seconds: float
     tasks: tuple[str, ...] = TASKS
     object_counts: tuple[int, ...] = OBJECT_COUNTS
+    rewards: tuple[str, ...] = REWARDS
     collection: tuple[str, ...] = ()
     pretraining: tuple[str, ...] = ()
     training: tuple[str, ...] = ()

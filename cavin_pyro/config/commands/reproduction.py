@@ -43,6 +43,9 @@ class ReproduceConfig(DeviceOptions):
     objects: list[int] = option(
         [1, 2, 3, 4, 5], "numbers of objects to evaluate with sparse rewards, at most those of the scale", group="run"
     )
+    rewards: list[str] = option(
+        ["dense", "sparse"], "rewards to evaluate", choices="cavin_pyro.reproduction.scales.REWARDS", group="run"
+    )
     episodes: int | None = option(
         None,
         "per cell of the top row; by default the scale's. A finished run goes on to more",
@@ -56,6 +59,13 @@ class ReproduceConfig(DeviceOptions):
         minimum=1,
         group="run",
         limit=10**6,
+    )
+    first_scene: int | None = option(
+        None,
+        "seed of the first scene; the training seed at place i begins 1000 i later. By default the scale's",
+        minimum=0,
+        group="run",
+        limit=10**9,
     )
     models: str | None = option(
         None,

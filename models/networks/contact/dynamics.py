@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from models.networks.contact.chosen_rows import ChosenRows
 from models.networks.contact.every_row import EveryRow
+from models.networks.contact.moments import turned_moments
 from models.networks.contact.objects import PAIR_MEASURES, pair_contact
 from models.networks.contact.reach import in_reach
 from models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
@@ -33,7 +34,8 @@ from models.networks.shapes import shapes_are_fixed
 from models.state import State
 
 MAXIMUM_DISPLACEMENT = 0.2  # metres, by one push, along each axis
-INPUTS = 4 + (OUTLINES * PER_OUTLINE + HEIGHTS) + 5 + MEASURES
+PLACE = 4  # numbers that say where on the table an object lies, and where a push points to
+INPUTS = 5 + (OUTLINES * PER_OUTLINE + HEIGHTS) + MEASURES + PLACE
 
 
 class ContactDynamics(PushOutcome):
@@ -41,7 +43,7 @@ class ContactDynamics(PushOutcome):
 
     In the frame of the push, whose origin is its start and whose x axis is its direction:
     contact_i  = where the tool would meet outline i, and how (`models.networks.contact.tool.ToolContact`)
-    object_i   = FC(FC(centre, outline, heights, contact; direction and place on the table))
+    object_i   = FC(FC(centre, outline, heights, contact; height of the centre, direction and place on the table))
     alone_i    = linear of object_i: its motion, were the other objects not there
     relation_i = sum over other real objects j of FC(FC(the same of i, the same of j, pair_ij)); pair_ij says where one
                  would push the other, moving as if alone (`models.networks.contact.objects.pair_contact`)
@@ -74,10 +76,12 @@ class ContactDynamics(PushOutcome):
         pair_width: int = 48,
         shape_width: int = 64,
         reach_margin: float | None = None,
+        equivariant: bool = False,
     ) -> None:
         """Widths of the layers for an object, a pair and an object's shape; `width`, of the state encoder, is not read.
 
         `reach_margin`: metres, by which a push may pass an object that it can move; None, and all are within reach.
+        `equivariant`: to turns and shifts of the table.
         Raises `ValueError` for features that are no outlines and for a negative margin.
         """
         if feature_dimension != FEATURES:
@@ -85,16 +89,17 @@ class ContactDynamics(PushOutcome):
         if reach_margin is not None and not reach_margin >= 0:
             raise ValueError(f"reach_margin must be null or at least 0 metres, not {reach_margin}")
         super().__init__()
-        self.reach_margin = reach_margin
+        self.reach_margin, self.equivariant = reach_margin, equivariant
+        inputs = INPUTS - PLACE if equivariant else INPUTS
         self.contact = ToolContact()
-        self.object = nn.Sequential(fully_connected(INPUTS, object_width), fully_connected(object_width, object_width))
+        self.object = nn.Sequential(fully_connected(inputs, object_width), fully_connected(object_width, object_width))
         self.alone = nn.Linear(object_width, 2)
-        self.own, self.other = nn.Linear(INPUTS, pair_width), nn.Linear(INPUTS, pair_width, bias=False)
+        self.own, self.other = nn.Linear(inputs, pair_width), nn.Linear(inputs, pair_width, bias=False)
         self.pair = nn.Linear(PAIR_MEASURES, pair_width, bias=False)
         self.relation = fully_connected(pair_width, pair_width)
         self.second = fully_connected(object_width + pair_width, object_width)
         self.head = nn.Linear(object_width, 4)
-        self.shape = nn.Sequential(fully_connected(INPUTS, shape_width), fully_connected(shape_width, shape_width))
+        self.shape = nn.Sequential(fully_connected(inputs, shape_width), fully_connected(shape_width, shape_width))
         self.shape_head = nn.Linear(shape_width, OUTLINES * PER_OUTLINE + HEIGHTS + 1)
         nn.init.zeros_(self.head.bias)
         nn.init.zeros_(self.shape_head.bias)
@@ -141,9 +146,13 @@ class ContactDynamics(PushOutcome):
         contact = self.contact(*place, outline, length.squeeze(0))
         table = relative_positions(centers.movedim(0, -1)).movedim(-1, 0)
         where = (along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT)
-        parts = (*where, shape.flatten(0, 1), heights, direction, table, contact)
+        if self.equivariant:
+            heights, on_table = turned_moments(heights, cosines[1], sines[1]), (table[2:],)
+        else:
+            on_table = (direction, table)
+        parts = (*where, shape.flatten(0, 1), heights, *on_table, contact)
         each = torch.cat([part.expand(-1, *rows.shape) for part in parts])
-        each = each.flatten(1).T  # [R ..., INPUTS]
+        each = each.flatten(1).T  # [R ..., inputs]
 
         move, scale = self._motion(each, place, outline, rows, rows.pairs(near)).split((3, 1))
         change = _unflat(self.shape_head(self.shape(each)), rows.shape)
@@ -152,6 +161,8 @@ class ContactDynamics(PushOutcome):
         cosine, sine = direction
         moved = torch.stack((*_in_axes(forward, sideways, cosine, -sine), up))
         shape_change = turned(shape_change.unflatten(0, (OUTLINES, PER_OUTLINE)), cosines, -sines).flatten(0, 1)
+        if self.equivariant:
+            heights_change = turned_moments(heights_change, cosines[1], -sines[1], differences=True)
         changed = standard_features(values + torch.cat((shape_change, heights_change)))
         new_centers = rows.write(state.centers, centers + moved)
         mask = state.mask.expand(new_centers.shape[:-1])
@@ -170,7 +181,7 @@ class ContactDynamics(PushOutcome):
     def _motion(self, each: Tensor, place: Tensor, outline: Tensor, rows: Rows, pairs: Pairs | None) -> Tensor:
         """Motion in units of `DISPLACEMENT_UNIT` and the logarithm of its scale, `[4, R, ...]`.
 
-        each: `[R ..., INPUTS]`. place: `[2, R, ...]`. outline: `[2 K + 1, R, ...]`.
+        each: `[R ..., inputs]`. place: `[2, R, ...]`. outline: `[2 K + 1, R, ...]`.
         """
         alone = self.object(each)
         motion = _unflat(self.alone(alone), rows.shape)

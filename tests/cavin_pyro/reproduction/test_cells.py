@@ -11,7 +11,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import FIGURES, VARIANTS, cells, evaluations, in_order
 from cavin_pyro.reproduction.methods import METHODS, PAPER_METHODS
-from cavin_pyro.reproduction.pipeline import SHARED, chosen_scale
+from cavin_pyro.reproduction.pipeline import SHARED, check_inputs, chosen_scale
 from cavin_pyro.reproduction.scales import SCALES
 from cavin_pyro.reproduction.stages import preparation, trainings
 from tests.cavin_pyro.conftest import ROOT
@@ -105,6 +105,16 @@ def test_rows_have_one_order_whatever_was_run_first() -> None:
 def test_more_episodes_than_scenes_are_refused() -> None:
     with pytest.raises(UserError, match="episodes must be at most 3000 with scale=medium, not 3001"):
         chosen_scale(compose("reproduce", "scale=medium", "episodes=3001", "output=-"))
+
+
+def test_one_reward_and_other_scenes_can_be_chosen() -> None:
+    options = ("scale=medium", "rewards=[sparse]", "first_scene=7000", "output=-")
+    scale = chosen_scale(compose("reproduce", *options))
+    found = list(evaluations(scale, ["cavin"]))
+    assert {one.cell.reward for one in found} == {"sparse"}
+    assert {one.seed for one in found} == {7000, 8000, 9000}
+    with pytest.raises(UserError, match="no cell has these methods, planners and rewards"):
+        check_inputs(compose("reproduce", "planners=[variants]", "rewards=[dense]", "output=-"))
 
 
 def test_some_tasks_and_numbers_of_objects_can_be_chosen() -> None:

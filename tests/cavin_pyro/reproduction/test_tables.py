@@ -112,11 +112,20 @@ def test_without_scenes_of_three_objects_there_is_no_picture_of_failures(tmp_pat
     assert names == {"results.md", "statistics.json", *(f"figure-paper-{one}.png" for one in ("strict", "published"))}
 
 
+def test_one_reward_alone_has_its_figures(tmp_path: Path) -> None:
+    names = {
+        path.name for path in write_results(tmp_path, chosen_rows(played(), config(rewards="[sparse]")), "command")
+    }
+    assert {"figure-paper-strict.png", "failures-paper-strict.png"} <= names
+    assert "dense" not in (tmp_path / "results.md").read_text().partition("## The paper's claims")[0]
+
+
 def test_a_table_is_drawn_as_far_as_the_options_choose() -> None:
     rows = played()
     assert chosen_rows(rows, config()) == rows
     assert {row["method"] for row in chosen_rows(rows, config(methods="[mpc]"))} == {"mpc"}
-    with pytest.raises(UserError, match="has no episode of the chosen methods, planners, tasks and objects"):
+    assert {row["reward"] for row in chosen_rows(rows, config(rewards="[sparse]"))} == {"sparse"}
+    with pytest.raises(UserError, match="has no episode of the chosen methods, planners, tasks, objects and rewards"):
         chosen_rows(rows, config(table="some.parquet", tasks="[crossing]"))
 
 

@@ -71,10 +71,12 @@ def test_code_is_made_once_for_each_constant_and_shape() -> None:
 
 
 @needs_a_compiler
-def test_two_pushes_by_an_f_that_sees_contact_compile_in_float32() -> None:
+@pytest.mark.parametrize("equivariant", [False, pytest.param(True, marks=pytest.mark.soak)])
+def test_two_pushes_by_an_f_that_sees_contact_compile_in_float32(equivariant: bool) -> None:
     # Inductor lost constants of f that are read for both pushes, where one reader is computed in advance.
     torch.manual_seed(0)
-    model = ContactDynamics(object_width=8, pair_width=4, shape_width=8, reach_margin=0.015).requires_grad_(False)
+    sizes = {"object_width": 8, "pair_width": 4, "shape_width": 8}
+    model = ContactDynamics(**sizes, reach_margin=0.015, equivariant=equivariant).requires_grad_(False)
     given = model, torch.rand(1, 16, 3, 3), torch.rand(1, 16, 3, 64), torch.rand(1, 16, 2, 4)
     with torch.inference_mode():
         expected = after_two_pushes(*given)

@@ -147,11 +147,12 @@ def test_a_copy_of_a_part_in_the_same_order_stays() -> None:
     assert calls(changed(passes.write_transposed_copies, lambda x: 2 * x[..., :2].contiguous(), values), "contiguous")
 
 
-@pytest.mark.parametrize("margin", [None, 0.35])
+@pytest.mark.parametrize(("margin", "equivariant"), [(None, False), (0.35, False), (None, True)])
 @pytest.mark.parametrize("objects", [1, 2, 4])
-def test_an_f_that_sees_contact_says_the_same(objects: int, margin: float | None) -> None:
+def test_an_f_that_sees_contact_says_the_same(objects: int, margin: float | None, equivariant: bool) -> None:
     torch.set_float32_matmul_precision("highest")
-    f = ContactDynamics(object_width=16, pair_width=8, shape_width=8, reach_margin=margin).double()
+    sizes = {"object_width": 16, "pair_width": 8, "shape_width": 8}
+    f = ContactDynamics(**sizes, reach_margin=margin, equivariant=equivariant).double()
     features = torch.cat((0.1 * torch.randn(7, objects, 63), torch.ones(7, objects, 1)), -1)
     state = State(0.1 * torch.randn(7, objects, 3).double(), unit(features).double(), torch.rand(7, objects) < 0.7)
     action = torch.rand(7, 4).double()

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
 from models.networks.contact.tool import CORNER, DISPLACEMENT_UNIT, PUSH_UNIT, REACH_HIGH, REACH_LOW, TOOL_RADIUS
 from models.networks.layers import POSITION_UNIT, TABLE_CENTER
-from models.networks.outline import DIRECTIONS, OUTLINE_UNIT, OUTLINES, PER_OUTLINE, SPREAD, STANDARD_UNIT, TYPICAL
+from models.networks.outline import (
+    DIRECTIONS,
+    HEIGHT_MEANS,
+    HEIGHT_SPREADS,
+    HEIGHTS,
+    OUTLINE_UNIT,
+    OUTLINES,
+    PER_OUTLINE,
+    PRODUCT,
+    SPREAD,
+    STANDARD_UNIT,
+    TYPICAL,
+)
 
 Numbers = NDArray[np.float64]
 SHAPE = OUTLINES * PER_OUTLINE
@@ -31,6 +45,17 @@ def turn(shape: Numbers, angle: float) -> Numbers:
         new = (real + 1j * imaginary) * np.exp(1j * ORDERS * angle)
         found.append(np.concatenate((outline[:1], new.real, new.imag)))
     return np.concatenate(found)
+
+
+def turn_moments(heights: Numbers, angle: float, means: Sequence[float]) -> Numbers:
+    """Heights `[12]` with their second moments in axes that are turned by an angle."""
+    means, spreads = np.array(means), np.array(HEIGHT_SPREADS)
+    xx, yy, xy = (means + spreads * heights)[PRODUCT - 2 : PRODUCT + 1]
+    axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    (xx, xy), (_, yy) = axes @ np.array([[xx, xy], [xy, yy]]) @ axes.T
+    found = means + spreads * heights
+    found[PRODUCT - 2 : PRODUCT + 1] = xx, yy, xy
+    return (found - means) / spreads
 
 
 def tool_contact(along: float, across: float, outline: Numbers, length: float) -> Numbers:
@@ -94,7 +119,9 @@ def next_state(f: ContactDynamics, centers: Numbers, features: Numbers, action: 
         place = along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT
         table = (center - np.array(TABLE_CENTER)) / POSITION_UNIT
         contact = tool_contact(along, across, outlines[-1], length)
-        inputs.append(np.concatenate((place, shape, value[SHAPE:], direction, table, contact)))
+        heights = turn_moments(value[SHAPE:], phi, HEIGHT_MEANS) if f.equivariant else value[SHAPE:]
+        on_table = table[2:] if f.equivariant else np.concatenate((direction, table))
+        inputs.append(np.concatenate((place, shape, heights, on_table, contact)))
     each = [connected("object.1", connected("object.0", one)) for one in inputs]
     moves = [layer("alone", one) for one in each]
     ways = [np.sqrt(max(move @ move, 1e-6)) for move in moves]
@@ -118,7 +145,8 @@ def next_state(f: ContactDynamics, centers: Numbers, features: Numbers, action: 
         moved = MAXIMUM_DISPLACEMENT * np.tanh(move * DISPLACEMENT_UNIT / MAXIMUM_DISPLACEMENT)
         new_centers.append(centers[i] + np.array([*(moved[:2] @ axes), moved[2]]))
         change = layer("shape_head", connected("shape.1", connected("shape.0", inputs[i])))[:-1]
-        changed = values[i] + np.concatenate((turn(change[:SHAPE], -phi), change[SHAPE:]))
+        heights = turn_moments(change[SHAPE:], -phi, HEIGHTS * [0.0]) if f.equivariant else change[SHAPE:]
+        changed = values[i] + np.concatenate((turn(change[:SHAPE], -phi), heights))
         feature = np.array([*(STANDARD_UNIT * changed), 1.0])
         new_features.append(feature / np.sqrt(feature @ feature))
     return np.array(new_centers), np.array(new_features)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -7,10 +8,12 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
-from models.networks.outline import Outline, standard_features
+from models.networks.contact.tool import PUSH_UNIT, REACH_HIGH, REACH_LOW
+from models.networks.outline import DIRECTIONS, Outline, standard_features
 from models.state import State
 from tests.models.networks.contact import by_hand
 
@@ -43,16 +46,26 @@ def shipped() -> ContactDynamics:
     return f.double()
 
 
+def settled(**options: bool) -> ContactDynamics:
+    """Untrained, with motions and changes of shape as small as trained ones."""
+    torch.manual_seed(0)
+    f = ContactDynamics(object_width=16, pair_width=8, **options).double()
+    torch.nn.init.normal_(f.shape_head.weight, std=0.1)
+    return f
+
+
 def doubled(state: State) -> State:
     return State(state.centers.double(), state.features.double(), state.mask)
 
 
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 10_000), real=st.integers(1, 5), padding=st.integers(0, 2))
-@example(seed=968, real=4, padding=2)
-def test_it_says_what_loops_over_objects_and_directions_say(seed: int, real: int, padding: int) -> None:
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), real=st.integers(1, 5), padding=st.integers(0, 2), equivariant=st.booleans())
+@example(seed=968, real=4, padding=2, equivariant=False)
+def test_it_says_what_loops_over_objects_and_directions_say(
+    seed: int, real: int, padding: int, equivariant: bool
+) -> None:
+    f = settled(equivariant=True) if equivariant else shipped()
     torch.manual_seed(seed)
-    f = shipped()
     state = doubled(scene(4, objects=real + padding, real=real))
     for _ in range(2):  # the second push is from where the first leads
         actions = 2.4 * torch.rand(4, 4).double() - 1.2
@@ -86,6 +99,32 @@ def test_padding_neither_changes_nor_affects_real_objects() -> None:
     alone = f(State(*(field[:, :2] for field in state)), None, action)
     assert torch.allclose(predicted.centers[:, :2], alone.centers, atol=1e-10)
     assert (alone.centers - state.centers[:, :2]).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("equivariant", [True, False])
+def test_an_equivariant_f_turns_and_shifts_with_the_table_and_no_other_does(equivariant: bool) -> None:
+    # Extents are sampled in so many directions: only turns by multiples of their angle turn the series exactly.
+    f, angle, shift = loud(equivariant=equivariant), 10 * math.pi / DIRECTIONS, torch.tensor([-0.03, 0.05]).double()
+    clouds = (torch.rand(4, 3, 64, 3).double() - 0.5) * torch.tensor([0.08, 0.05, 0.03]).double()
+    places = 0.08 * torch.rand(4, 3, 3).double()
+    starts, motions = 0.05 * torch.rand(4, 2).double(), 0.08 * (torch.rand(4, 2).double() - 0.5)
+    turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]).double()
+    full = torch.block_diag(turn, torch.ones(1, 1).double())
+    origin = torch.tensor([0.5, 0.0]).double()
+
+    def outcome(turn: Tensor, full: Tensor, shift: Tensor) -> State:
+        low, high = torch.tensor((REACH_LOW, REACH_HIGH)).double()
+        centers = places @ full + torch.cat((origin + shift, shift.new_zeros(1)))
+        start = (2 * (starts @ turn + origin + shift - low) / (high - low)) - 1
+        outline = Outline().double()
+        action = torch.cat((start, motions @ turn / PUSH_UNIT), -1)
+        predicted = f(State(centers, outline(clouds @ full), torch.ones(4, 3, dtype=torch.bool)), None, action)
+        return predicted._replace(centers=predicted.centers - centers)
+
+    eye = torch.eye(3).double()
+    here, there = outcome(eye[:2, :2], eye, 0 * shift), outcome(turn, full, shift)
+    assert torch.allclose(here.centers @ full, there.centers, atol=1e-6) == equivariant
+    assert here.centers.abs().max() > 0.01
 
 
 def test_other_objects_matter() -> None:
