@@ -147,9 +147,9 @@ class ContactDynamics(PushOutcome):
         table = relative_positions(centers.movedim(0, -1)).movedim(-1, 0)
         where = (along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT)
         if self.equivariant:
-            heights, on_table = turned_moments(heights, cosines[1], sines[1]), (table[2:],)
+            heights, on_table = turned_moments(heights, cosines[1], sines[1]), [table[2:]]
         else:
-            on_table = (direction, table)
+            on_table = [direction, table]
         parts = (*where, shape.flatten(0, 1), heights, *on_table, contact)
         each = torch.cat([part.expand(-1, *rows.shape) for part in parts])
         each = each.flatten(1).T  # [R ..., inputs]
