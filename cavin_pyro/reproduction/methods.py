@@ -85,7 +85,8 @@ METHODS: dict[str, Method] = {
             "#CC79A7",
             (
                 *("model=cascaded", "guide=cascaded", "prior=mixture"),
-                *("geometry=outline", "dynamics=contact", "scales=predicted", "objective=rollout"),
+                *("geometry=outline", "dynamics=contact", "dynamics.equivariant=true", "scales=predicted"),
+                "objective=rollout",
                 *("trainer.reflect=true", "trainer.learning_rate=2e-3", "trainer.clip_norm=10000"),
             ),
             {"paper": ("planner=paper",), "ours": ("planner=cavin",)},
