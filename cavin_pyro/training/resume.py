@@ -17,6 +17,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import atomic_write
 
+ENTRIES = {"adam": ("exp_avg", "exp_avg_sq"), "muon": ("momentum_buffer",)}  # as large as a weight, of each optimizer
+
 
 def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
     """Write tensors of any device, and a state that JSON can hold, atomically; the file knows no device."""
@@ -49,32 +51,32 @@ def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         ) from error
 
 
-def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Adam's moments, by names."""
+def optimizer_tensors(optimizer: torch.optim.Optimizer, part: str = "adam") -> dict[str, Tensor]:
+    """An optimizer's moments, by names that begin with `part`."""
     return {
-        f"adam.{number}.{name}": value
+        f"{part}.{number}.{name}": value
         for number, entry in optimizer.state_dict()["state"].items()
         for name, value in entry.items()
     }
 
 
-def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], part: str = "adam") -> None:
     """Take over the moments that `optimizer_tensors` gave.
 
     Raises:
         ValueError: some lack, or are of another shape.
     """
     moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in section(tensors, "adam").items():
+    for name, value in section(tensors, part).items():
         place, _, entry = name.partition(".")
         moments.setdefault(int(place), {})[entry] = value
     parameters: list[nn.Parameter] = [one for group in optimizer.param_groups for one in group["params"]]
     for number, parameter in enumerate(parameters):
-        for entry in ("exp_avg", "exp_avg_sq"):
+        for entry in ENTRIES[part]:
             if number in moments and moments[number][entry].shape != parameter.shape:
-                raise ValueError(f"adam.{number}.{entry} is of another shape")
+                raise ValueError(f"{part}.{number}.{entry} is of another shape")
     if max(moments, default=0) >= len(parameters):
-        raise ValueError(f"adam.{max(moments)} belongs to no weight")
+        raise ValueError(f"{part}.{max(moments)} belongs to no weight")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 

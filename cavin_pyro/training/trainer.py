@@ -1,7 +1,7 @@
 """Stochastic variational inference: the loop, its validation, its checkpoints, and exact resuming.
 
-One `torch.optim.Adam` over the ELBO as a module, because Pyro's own optimizers keep one per parameter and take more
-time than these small networks.
+One optimizer of torch over the ELBO as a module (`cavin_pyro.training.optimizers`), because Pyro's own keep one per
+parameter and take more time than these small networks.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import ScalarLog, progress_bar
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
 from cavin_pyro.training.objectives import Objective
+from cavin_pyro.training.optimizers import make_optimizers
 from cavin_pyro.training.randomness import forked, random_state, set_random_state, stored_states, take_over
 from cavin_pyro.training.reflection import reflect
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
@@ -68,7 +69,7 @@ class Trainer:
         self._objective, self._loss = objective, objective.bind(model, guide)
         self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
         trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
-        self._optimizer = torch.optim.Adam(trained, lr=config.learning_rate, fused=True)
+        self._optimizers = make_optimizers(config.optimizer, trained, config.learning_rate)
         self._batches = torch.Generator().manual_seed(seed)
         set_matmul_precision(config.matmul_precision)
         torch.manual_seed(seed)
@@ -122,9 +123,10 @@ class Trainer:
         if self._mirror_signs is not None:
             mirrored = torch.rand(len(numbers), generator=self._batches) < 0.5
             window = reflect(window, send(mirrored, self.windows.device), self._mirror_signs)
-        for group in self._optimizer.param_groups:
-            group["lr"] = config.rate(self.step)
-        self._optimizer.zero_grad(set_to_none=True)
+        for optimizer in self._optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] = config.rate(self.step)
+            optimizer.zero_grad(set_to_none=True)
         loss = self._loss(window, self.step) / len(numbers)
         if not math.isfinite(loss.item()):
             self._stop_at(first_nonfinite(elbo_terms(self.model, self.guide, window)) or "loss")
@@ -132,7 +134,8 @@ class Trainer:
         norm = nn.utils.clip_grad_norm_(self._loss.parameters(), config.clip_norm)
         if not math.isfinite(norm.item()):
             self._stop_at("gradient")
-        self._optimizer.step()
+        for optimizer in self._optimizers.values():
+            optimizer.step()
         return loss.item()
 
     def _stop_at(self, term: str) -> None:
@@ -197,7 +200,9 @@ class Trainer:
         }
         for part, module in (("model", self.model), ("guide", self.guide)):
             tensors |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
-        write_resume(self.resume_path, {**tensors, **optimizer_tensors(self._optimizer)}, {})
+        for part, optimizer in self._optimizers.items():
+            tensors |= optimizer_tensors(optimizer, part)
+        write_resume(self.resume_path, tensors, {})
 
     def resume(self) -> None:
         """Take over the state in the resume file, if there is one.
@@ -210,7 +215,8 @@ class Trainer:
         with resuming(self.resume_path) as (tensors, _):
             for part, module in (("model", self.model), ("guide", self.guide)):
                 module.load_state_dict(section(tensors, part))
-            load_optimizer(self._optimizer, tensors)
+            for part, optimizer in self._optimizers.items():
+                load_optimizer(optimizer, tensors, part)
             step, best, best_step, stale = tensors["counters"].tolist()
             if not (math.isfinite(best) and 1 <= best_step <= step and stale >= 0):
                 raise ValueError("its counters contradict one another")

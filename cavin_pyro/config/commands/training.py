@@ -21,7 +21,13 @@ class TrainerConfig:
 
     steps: int = option(1_000_000, "gradient steps, at most", minimum=1, group="trainer", limit=10**9)
     batch_size: int = option(64, "windows per step", minimum=1, group="trainer", limit=65_536)
-    learning_rate: float = option(1e-4, "Adam's", above=0, group="trainer")
+    optimizer: str = option(
+        "adam",
+        "muon for matrices of weights and Adam for the rest takes fewer steps",
+        choices="cavin_pyro.training.optimizers.OPTIMIZERS",
+        group="trainer",
+    )
+    learning_rate: float = option(1e-4, "the optimizer's", above=0, group="trainer")
     schedule: str = option(
         "constant", "of the learning rate; cosine ends at a hundredth of it", choices=SCHEDULES, group="trainer"
     )

@@ -95,7 +95,7 @@ def test_the_optimizer_follows_the_schedule(small: SimpleNamespace, tmp_path: Pa
     config = TrainerConfig(**{**vars(SHORT), "schedule": "cosine"})
     run = trainer(small, tmp_path / "run", config)
     run.run()
-    (group,) = run._optimizer.param_groups
+    (group,) = run._optimizers["adam"].param_groups
     assert group["lr"] == config.rate(7)
     assert [row["learning_rate"] for row in run.rows] == [config.rate(step) for step in (2, 4, 6, 8)]
 
@@ -171,21 +171,23 @@ def test_training_stops_when_patience_is_lost(small: SimpleNamespace, tmp_path: 
     assert run.step == 2 * (1 + 3)
 
 
-@pytest.mark.parametrize("broken_after", [2, 4, 6])
+@pytest.mark.parametrize(("broken_after", "optimizer"), [(2, "adam"), (4, "adam"), (6, "adam"), (4, "muon")])
 def test_an_interrupted_run_resumes_as_if_it_had_not_been_interrupted(
-    broken_after: int, small: SimpleNamespace, tmp_path: Path
+    broken_after: int, optimizer: str, small: SimpleNamespace, tmp_path: Path
 ) -> None:
+    config = TrainerConfig(**{**vars(SHORT), "optimizer": optimizer})
+
     def stop(run: Trainer, step: int) -> None:
         if step == broken_after:
             raise KeyboardInterrupt
 
-    whole = trainer(small, tmp_path / "whole")
+    whole = trainer(small, tmp_path / "whole", config)
     whole.run()
     assert [row["step"] for row in whole.rows] == [2, 4, 6, 8]
     with pytest.raises(KeyboardInterrupt):
-        trainer(small, tmp_path / "broken", hook=stop).run()
+        trainer(small, tmp_path / "broken", config, hook=stop).run()
     assert not (tmp_path / "broken" / "metrics.csv").exists() or broken_after > 2
-    resumed = trainer(small, tmp_path / "broken")
+    resumed = trainer(small, tmp_path / "broken", config)
     resumed.run()
     assert torch.equal(weights(resumed), weights(whole))
     assert without_speed(resumed.rows) == without_speed(whole.rows)
