@@ -72,6 +72,9 @@ def stored_options(path: Path) -> dict[str, Any]:
         options.setdefault("device", "cpu")
     if "trainer.schedule" in options:
         options.setdefault("trainer.reflect", False)
+        options.setdefault("trainer.optimizer", "adam")
+        if "dynamics.reach_margin" in options:
+            options.setdefault("dynamics.equivariant", False)
         options.setdefault("trained", [])
     return options
 

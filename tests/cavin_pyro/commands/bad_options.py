@@ -73,6 +73,7 @@ BAD_OPTIONS = [
         "unknown objective 'nonsense': choose from consistent, counterfactual, iwae, mean_field_elbo, renyi, "
         "rollout, trace_elbo, trace_enum_elbo, trace_graph_elbo",
     ),
+    ("train", "trainer.optimizer=sgd", "unknown trainer.optimizer 'sgd': choose from adam, muon"),
     ("train", "trainer.schedule=linear", "unknown trainer.schedule 'linear': choose from constant, cosine"),
     ("evaluate", "task=juggling", f"choose from {', '.join(TASKS)}"),
     ("check", "sections=[consistency,bliss]", "unknown section 'bliss': choose from "),

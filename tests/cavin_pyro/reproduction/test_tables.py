@@ -134,6 +134,8 @@ def test_a_table_is_drawn_as_far_as_the_options_choose() -> None:
     [
         ("planners=[]", "planners=[] leaves nothing to run"),
         ("methods=[]", "methods=[] leaves nothing to run"),
+        ("rewards=[]", "rewards=[] leaves nothing to run"),
+        ("rewards=[shaped]", "unknown rewards 'shaped': choose from dense, sparse"),
         ("tasks=[]", "tasks has none of scale=minimal"),
         ("models=nowhere", "models=nowhere holds no cavin-0.safetensors"),
         ("extends=nowhere", "nowhere is no table of episodes"),
