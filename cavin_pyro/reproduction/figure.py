@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cavin_pyro.reproduction.methods import METHODS, Method
-from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS
+from cavin_pyro.reproduction.scales import REWARDS, TOP_ROW_OBJECTS
 from cavin_pyro.storage.files import atomic_write
 
 DOTS_PER_INCH = 120
@@ -48,20 +48,19 @@ def draw_figure(path: Path, rates: Rates, *, planner: str, criterion: str) -> No
 
 def _draw_rewards(axes: Axes, rates: Rates) -> None:
     """Dense and sparse rewards, three objects."""
-    kinds = ("dense", "sparse")
     shown = _shown(rates)
     width = GROUP_WIDTH / max(1, len(shown))
     for number, (name, method) in enumerate(shown.items()):
         chosen = [rate for rate in rates if rate["method"] == name and rate["objects"] == TOP_ROW_OBJECTS]
-        for place, kind in enumerate(kinds):
+        for place, kind in enumerate(REWARDS):
             for rate in chosen:
                 if rate["reward"] == kind:
                     x = place + (number - (len(shown) - 1) / 2) * width
                     axes.bar(x, 100 * rate["rate"], 0.9 * width, color=method.color)
                     axes.errorbar(x, 100 * rate["rate"], _whiskers([rate]), color="black", capsize=2, linewidth=0.8)
-    axes.set_xticks(range(len(kinds)), [f"{kind} reward" for kind in kinds])
+    axes.set_xticks(range(len(REWARDS)), [f"{kind} reward" for kind in REWARDS])
     axes.set_xlabel(_episodes([rate for rate in rates if rate["objects"] == TOP_ROW_OBJECTS]), fontsize=8)
-    axes.set_xlim(-0.5, len(kinds) - 0.5)
+    axes.set_xlim(-0.5, len(REWARDS) - 0.5)
     axes.set_ylim(0, 104)
 
 
