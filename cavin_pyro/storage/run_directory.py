@@ -73,8 +73,6 @@ def stored_options(path: Path) -> dict[str, Any]:
     if "trainer.schedule" in options:
         options.setdefault("trainer.reflect", False)
         options.setdefault("trainer.optimizer", "adam")
-        if "dynamics.reach_margin" in options:
-            options.setdefault("dynamics.equivariant", False)
         options.setdefault("trained", [])
     return options
 

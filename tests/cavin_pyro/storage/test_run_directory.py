@@ -121,13 +121,10 @@ def test_an_evaluation_belongs_to_a_device_which_is_the_cpu_where_it_does_not_sa
 
 
 def test_a_training_of_an_older_version_mirrored_nothing_and_trained_all_parts_with_adam(tmp_path: Path) -> None:
-    write_config(tmp_path, config(trainer={"schedule": "cosine"}, dynamics={"reach_margin": 0.015}))
+    write_config(tmp_path, config(trainer={"schedule": "cosine"}))
     (tmp_path / "metrics.csv").touch()
     now = {"schedule": "cosine", "reflect": False, "optimizer": "adam"}
-    dynamics = {"reach_margin": 0.015, "equivariant": False}
-    check_same_run(tmp_path, config(trainer=now, dynamics=dynamics, trained=[], initial=None), ignore=())
+    check_same_run(tmp_path, config(trainer=now, trained=[], initial=None), ignore=())
     for name, other in (("reflect", True), ("optimizer", "muon")):
         with pytest.raises(UserError, match=f"a run with trainer.{name}={now[name]}, not {other}"):
-            check_same_run(tmp_path, config(trainer={**now, name: other}, dynamics=dynamics, trained=[]), ignore=())
-    with pytest.raises(UserError, match="a run with dynamics.equivariant=False, not True"):
-        check_same_run(tmp_path, config(trainer=now, dynamics={**dynamics, "equivariant": True}, trained=[]), ignore=())
+            check_same_run(tmp_path, config(trainer={**now, name: other}, trained=[]), ignore=())
