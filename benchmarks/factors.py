@@ -32,13 +32,21 @@ from cavin_pyro.storage.files import atomic_write
 
 FACTORS = ("networks", "data", "planner")
 COLUMNS = {"networks": "method", "data": "data", "planner": "planner"}
-SUCCESSES = Mapping[tuple[int, int], bool]  # by training seed and scene
+Solved = Mapping[tuple[int, int], bool]  # whether, by training seed and scene
 
 
 def collected(pairs: Sequence[str]) -> list[Row]:
     """Rows of two folders of `reproduce`, with the name of their data."""
     named = [pair.partition("=")[::2] for pair in pairs]
     return [{**row, "data": name} for name, folder in named for row in read_table(Path(folder) / TABLE)]
+
+
+def stored(path: Path) -> list[Row]:
+    """Rows of a table that `--collect` wrote. Exits if it is none."""
+    try:
+        return parquet.read_table(path, columns=[*SCHEMA.names, "data"]).to_pylist()
+    except (OSError, pyarrow.ArrowException) as error:
+        sys.exit(f"error: {path} is no table of --collect ({str(error).splitlines()[0]}): write it from two runs")
 
 
 def ways(rows: Sequence[Row], criterion: str) -> dict[tuple[Any, ...], dict[tuple[int, int], bool]]:
@@ -51,7 +59,7 @@ def ways(rows: Sequence[Row], criterion: str) -> dict[tuple[Any, ...], dict[tupl
     return found
 
 
-def levels(found: Mapping[tuple[Any, ...], SUCCESSES], place: int) -> list[Any]:
+def levels(found: Mapping[tuple[Any, ...], Solved], place: int) -> list[Any]:
     """The two levels of a factor, in the order of the table. Exits if there are not two, or a way is missing."""
     values = list(dict.fromkeys(way[place] for way in found))
     if len(values) != 2 or len(found) != 8 or len({frozenset(scenes) for scenes in found.values()}) != 1:
@@ -59,7 +67,7 @@ def levels(found: Mapping[tuple[Any, ...], SUCCESSES], place: int) -> list[Any]:
     return values
 
 
-def pairs(found: Mapping[tuple[Any, ...], SUCCESSES], place: int) -> Iterator[tuple[SUCCESSES, SUCCESSES]]:
+def pairs(found: Mapping[tuple[Any, ...], Solved], place: int) -> Iterator[tuple[Solved, Solved]]:
     """The four pairs of ways that differ in one factor alone."""
     one, other = levels(found, place)
     rest = [levels(found, number) for number in range(3) if number != place]
@@ -68,7 +76,7 @@ def pairs(found: Mapping[tuple[Any, ...], SUCCESSES], place: int) -> Iterator[tu
         yield found[first], found[second]
 
 
-def effect(compared: Sequence[tuple[SUCCESSES, SUCCESSES]], seed: int = 0) -> tuple[float, float, float]:
+def effect(compared: Sequence[tuple[Solved, Solved]], seed: int = 0) -> tuple[float, float, float]:
     """The mean difference of rates, other minus one, over all pairs, and its interval, in points.
 
     Resampled are training seeds, then the scenes of each; a scene brings the outcomes of all pairs along.
@@ -86,7 +94,7 @@ def effect(compared: Sequence[tuple[SUCCESSES, SUCCESSES]], seed: int = 0) -> tu
     return float(np.mean([group.mean() for group in groups])), float(low), float(high)
 
 
-def alone(one: SUCCESSES, other: SUCCESSES) -> tuple[int, int]:
+def alone(one: Solved, other: Solved) -> tuple[int, int]:
     """Scenes that only the one, and only the other way solves."""
     return sum(one[s] and not other[s] for s in one), sum(other[s] and not one[s] for s in one)
 
@@ -124,7 +132,7 @@ def main() -> None:
         schema = SCHEMA.append(pyarrow.field("data", pyarrow.string()))
         with atomic_write(arguments.table) as temporary:
             parquet.write_table(pyarrow.Table.from_pylist(collected(arguments.collect), schema=schema), temporary)
-    rows = parquet.read_table(arguments.table).to_pylist()
+    rows = stored(arguments.table)
     for criterion in CRITERIA:
         print("\n".join((*lines(rows, criterion), "")))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import subprocess
@@ -19,6 +18,7 @@ from cavin_pyro.evaluation.factory import make_environment
 from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
 from cavin_pyro.reproduction.stages import preparation
 from envs.workspace import push_endpoints
+from tests.benchmarks.loading import load
 from tests.cavin_pyro.conftest import run_script
 from tests.cavin_pyro.evaluation.success.made_up import evaluation
 from tests.cavin_pyro.shell import ENVIRONMENT
@@ -213,12 +213,8 @@ def test_pushes_at_the_start_of_a_scene_are_counted() -> None:
     assert sum(int(line.split()[0]) for line in lines[3:]) == 2
 
 
-def test_the_oracle_foretells_pushes_without_touching_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")  # as for a script; it takes it off
-    specification = importlib.util.spec_from_file_location("oracle", ROOT / "benchmarks" / "oracle.py")
-    assert specification is not None and specification.loader is not None
-    oracle = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(oracle)
+def test_the_oracle_foretells_pushes_without_touching_the_episode() -> None:
+    oracle = load("oracle")
     config = compose("evaluate", "planner=paper", "objects=3")
     env, alone = make_environment(config), make_environment(config)
     mirror = oracle.Oracle(config, env, 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 from pyarrow import parquet
 
 from cavin_pyro.reproduction.table import SCHEMA, TABLE, write_table
+from tests.benchmarks.loading import load
 from tests.cavin_pyro.conftest import run_script
 
 ROOT = Path(__file__).parents[2]
@@ -20,11 +20,7 @@ FILE = ROOT / "benchmarks" / "factors.py"
 
 @pytest.fixture(scope="module")
 def factors() -> Any:
-    spec = importlib.util.spec_from_file_location("factors", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load("factors")
 
 
 def row(method: str, planner: str, objects: int, training_seed: int, scene: int, solved: bool) -> dict[str, Any]:
@@ -82,3 +78,10 @@ def test_a_way_without_all_scenes_is_refused(table: Path, tmp_path: Path) -> Non
     parquet.write_table(pyarrow.Table.from_pylist(rows[1:], schema=schema), tmp_path / "short.parquet")
     ended = run_script(FILE, str(tmp_path / "short.parquet"), folder=ROOT)
     assert ended.status != 0 and "must have eight ways" in ended.errors
+
+
+def test_what_is_no_table_is_named_in_one_line(tmp_path: Path) -> None:
+    write_table(tmp_path / TABLE, episodes("few"))  # without a name of its data
+    for path in (tmp_path / TABLE, tmp_path / "nowhere.parquet"):
+        ended = run_script(FILE, str(path), folder=ROOT)
+        assert ended.status != 0 and ended.errors.count("\n") == 1 and "is no table of --collect" in ended.errors

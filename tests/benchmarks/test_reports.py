@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "reports.py"
+from tests.benchmarks.loading import load
+
 Report = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def reports() -> Any:
-    spec = importlib.util.spec_from_file_location("reports", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load("reports")
 
 
 def interval(mean: float) -> dict[str, float]:

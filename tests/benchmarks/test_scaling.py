@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+
+from tests.benchmarks.loading import load
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def scaling() -> Iterator[ModuleType]:
-    spec = importlib.util.spec_from_file_location("scaling", ROOT / "benchmarks" / "scaling.py")
-    assert spec is not None and spec.loader is not None
-    module = sys.modules["scaling"] = importlib.util.module_from_spec(spec)  # where dataclasses look for its names
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["scaling"]
+def scaling() -> Any:
+    return load("scaling")
 
 
 @pytest.mark.parametrize(
@@ -38,7 +33,7 @@ def scaling() -> Iterator[ModuleType]:
     ],
 )
 def test_a_run_takes_what_one_can_tell_beforehand(
-    scaling: ModuleType, seconds: list[float], workers: int, costs: dict, makespan: float, limit: str
+    scaling: Any, seconds: list[float], workers: int, costs: dict, makespan: float, limit: str
 ) -> None:
     made = scaling.simulate(seconds, workers, **costs)
     assert made.makespan == pytest.approx(makespan)
@@ -46,7 +41,7 @@ def test_a_run_takes_what_one_can_tell_beforehand(
         assert made.limit == limit
 
 
-def test_shares_of_the_workers_time_are_all_of_it_and_no_run_beats_its_bounds(scaling: ModuleType) -> None:
+def test_shares_of_the_workers_time_are_all_of_it_and_no_run_beats_its_bounds(scaling: Any) -> None:
     seconds = list(np.random.default_rng(0).gamma(2.0, 3.0, 300))
     for workers in (1, 7, 400):
         made = scaling.simulate(seconds, workers, start=5.0, main=0.02)
@@ -56,7 +51,7 @@ def test_shares_of_the_workers_time_are_all_of_it_and_no_run_beats_its_bounds(sc
     assert scaling.simulate(seconds, 400, start=5.0, main=0.02).ended > 0.5
 
 
-def test_lengths_are_pushes_of_real_episodes_by_seed(scaling: ModuleType) -> None:
+def test_lengths_are_pushes_of_real_episodes_by_seed(scaling: Any) -> None:
     table = ROOT / "docs" / "measurements" / "reproduction" / "episodes.parquet"
     made = scaling.lengths(table, "paper", 0.5, 50, seed=1)
     assert made == scaling.lengths(table, "paper", 0.5, 50, seed=1)
