@@ -24,14 +24,12 @@ other objects in each relation, and once with the nearest 9.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -197,7 +195,7 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
             kinds = [kind(push.before, push.action, slot) for push in pushes]
             best = min(kinds, key=("hit", "graze", "miss").index)
             begun = all(push.begun for push in pushes)
-            groups = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
+            groups: tuple[str, ...] = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
             groups += ("all pushes begun",) if begun else ()
             before, seen = first.before.centers[slot], last.after.centers[slot]
             for floor, again in (("hidden", first.replayed), ("place", first.displaced)):
@@ -248,8 +246,8 @@ def predictions(
                 window = Window(
                     stack_steps(between), actions, torch.ones(1, T, dtype=torch.bool), torch.ones(1, dtype=torch.bool)
                 )
-                code = poutine.trace(guide).get_trace(window).nodes["effect_code"]["fn"].mean
-                inferred.append(model.subgoal(first, code).centers[0].numpy())
+                site: Any = poutine.trace(guide).get_trace(window).nodes["effect_code"]
+                inferred.append(model.subgoal(first, site["fn"].mean).centers[0].numpy())
         found[ahead] = {f"{name}: f": rolled, **({f"{name}: h": inferred} if inferred else {})}
     return found
 

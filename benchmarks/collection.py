@@ -12,6 +12,7 @@ import csv
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def measure(arguments: argparse.Namespace) -> None:
     wall, cpu = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         while made < arguments.transitions:
-            episodes = []
+            episodes: list[dict[str, Any]] = []
             while len(episodes) < config.episodes_per_shard and made < arguments.transitions:
                 episodes.append(collect_episode(scene, config, episode))
                 made, episode = made + int(episodes[-1]["length"]), episode + 1

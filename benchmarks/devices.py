@@ -12,13 +12,10 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # `planning.py` is not `planning`
 
 import pyro
 import torch

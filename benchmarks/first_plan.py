@@ -19,8 +19,6 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # `planning.py` is not `planning`
-
 ROOT = Path(__file__).parents[1]
 
 
@@ -48,7 +46,7 @@ def start(options: list[str], cache: Path) -> str:
     surroundings = {**os.environ, "PYTHONPATH": str(ROOT), "CAVIN_PYRO_CACHE": str(cache)}
     command = [sys.executable, __file__, "--began", str(time.time()), *options]
     printed = subprocess.run(command, cwd=ROOT, env=surroundings, check=True, stdout=subprocess.PIPE, text=True).stdout
-    *seconds, digest = printed.split()
+    *parts, digest = printed.split()
     with tempfile.TemporaryDirectory() as output:
         episode = [sys.executable, "-m", "cavin_pyro.plan", *options, f"output={output}/episode"]
         began = time.time()
@@ -56,7 +54,7 @@ def start(options: list[str], cache: Path) -> str:
             episode, cwd=ROOT, env=surroundings, check=True, stdout=subprocess.PIPE, text=True
         ).stdout
         took = time.time() - began
-    numbers = " ".join(f"{float(number):8.2f}" for number in (*seconds, took))
+    numbers = " ".join(f"{number:8.2f}" for number in (*map(float, parts), took))
     return f"{numbers}  {digest}  {printed.splitlines()[0]}"
 
 

@@ -8,11 +8,8 @@ own: those of t tiles have the seeds from `--seed` + 100 t on. A stopped run res
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
 
 import numpy as np
 from matplotlib.figure import Figure

@@ -11,13 +11,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
 
 import numpy as np
 from scipy.stats import theilslopes

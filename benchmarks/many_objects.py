@@ -15,10 +15,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import time
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
 
 import torch
 

@@ -7,10 +7,7 @@ for every method and planner of the paper's figure. The reward is dense, so that
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.model_evaluations import count_evaluations

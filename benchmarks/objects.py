@@ -15,7 +15,7 @@ from cavin_pyro.data.collection import CollectionConfig
 from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import WHOLE_TABLE
 from envs.policy import HeuristicPushingPolicy
-from envs.robots import PUSH_STEPS
+from envs.robots.robot import PUSH_STEPS
 from envs.scene import Scene
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 

@@ -12,11 +12,8 @@ Overrides of `evaluate` may follow, for example planner.motion_horizon=first_seg
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 from unittest import mock
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
 
 import numpy as np
 import torch

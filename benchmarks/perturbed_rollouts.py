@@ -13,14 +13,11 @@ from __future__ import annotations
 import argparse
 import random
 import statistics
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 from unittest import mock
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
 
 import torch
 from torch import Tensor
@@ -31,7 +28,7 @@ from cavin_pyro.evaluation.factory import make_runner
 from planning.extensions import perturbed_rollouts as extension
 from planning.extensions import sequential_halving as halving
 from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts
-from planning.extensions.sequential_halving import sequential_halving
+from planning.extensions.sequential_halving import MostRobust, sequential_halving
 
 MOTIONS = 64
 REPETITIONS = 4
@@ -86,11 +83,11 @@ def problems(task: str, objects: int, episodes: int, pushes: int) -> list[Planni
     """One per plan of some episodes."""
     asked: list[PlanningProblem] = []
 
-    def recorded(*given: Any, **options: Any) -> Tensor:
+    def recorded(*given: Any, **options: Any) -> MostRobust:
         asked.append(PlanningProblem(given, options))
         return sequential_halving(*given, **options)
 
-    one = make_runner(compose("evaluate", f"task={task}", f"objects={objects}", "reward=sparse"))
+    one: Any = make_runner(compose("evaluate", f"task={task}", f"objects={objects}", "reward=sparse"))
     with mock.patch.object(halving, "sequential_halving", recorded):
         for seed in range(10000, 10000 + episodes):
             observation, _ = one.env.reset(seed=seed)
@@ -146,7 +143,7 @@ def main() -> None:
                     given = (options, *problem.given[1:-1], [torch.Generator().manual_seed(1000 + seed)])
                     with noise_of_each_motion(independent, seed):
                         taken = sequential_halving(*given, **problem.options).number
-                    place = (numbers == taken).nonzero().item()
+                    place = int((numbers == taken).nonzero())
                     regret[allocation].append(float(costs[place] - costs.min()))
                     failures[allocation].append(float(failed[place]))
     print(f"{len(chosen)} of {len(asked)} plans")

@@ -11,11 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import sys
 from collections import Counter, defaultdict
 from pathlib import Path
-
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
 
 from omegaconf import OmegaConf
 

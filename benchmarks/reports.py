@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.verdicts.verdict import RENAMED

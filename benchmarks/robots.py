@@ -79,12 +79,14 @@ def pushes(
     robot: str, assets: Path | None, count: int, heavy: bool, script: list[Any] | None, aside: float = 0.0
 ) -> dict[str, Any]:
     """Make pushes; without a script the policy chooses them, with one they are taken from it, `aside` metres left."""
-    scene, seconds = Scene(robot=robot, assets=assets), defaultdict(float)
+    scene = Scene(robot=robot, assets=assets)
+    seconds: dict[str, float] = defaultdict(float)
     found: dict[str, Any] = {"script": [], "names": [], "after": [], "ended": [], "line": [], "end": []}
     for number, (objects, points) in enumerate(scenes(-(-count // PUSHES_PER_SCENE), heavy, seed=5)):
         observation = scene.reset(objects, points)
         policy = HeuristicPushingPolicy(np.random.default_rng(number))
-        scene.robot = watched = Watched(scene.robot, scene, seconds)  # type: ignore[assignment]
+        watched = Watched(scene.robot, scene, seconds)
+        scene.robot = watched
         for turn in range(PUSHES_PER_SCENE):
             if script is None:
                 before, action = scene.ground_truth(), policy.act(observation)

@@ -15,8 +15,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # `planning.py` is not `planning`
-
 import numpy as np
 
 ROOT = Path(__file__).parents[1]

@@ -13,15 +13,11 @@ machine disturbs them little.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
-
-# A file there would hide `planning`. Workers run this line again, with the path that is left.
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]
 
 import numpy as np
 import torch

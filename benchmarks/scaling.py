@@ -22,8 +22,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]  # a file there hides `planning`
-
 import numpy as np
 import pyarrow.parquet as parquet
 from omegaconf import OmegaConf

@@ -10,11 +10,8 @@ such pushes.
 from __future__ import annotations
 
 import argparse
-import sys
 from itertools import pairwise
 from typing import NamedTuple
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
 
 import numpy as np
 import torch

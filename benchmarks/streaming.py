@@ -63,7 +63,7 @@ def write_random(folder: Path, files: int, pointnet: PointNet) -> Path:
     beside.mkdir(parents=True)
     generator, states = np.random.default_rng(0), (EPISODES, STEPS + 1, OBJECTS)
     for number in range(files):
-        arrays = {
+        arrays: dict[str, np.ndarray] = {
             "centers": np.cumsum(generator.normal(scale=0.01, size=(*states, 3)), axis=1).astype(np.float32),
             "clouds": np.zeros((*states, 1, 3), np.float16),
             "visible": np.ones(states, np.bool_),

@@ -19,8 +19,6 @@ from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # a file there hides `planning`
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -61,10 +59,10 @@ class Cell(NamedTuple):
 
 def cells() -> dict[str, Cell]:
     """All cells by the names of their folders. A cell's place in the table fixes its seeds."""
-    found = {}
+    found: dict[str, Cell] = {}
     for task, three, five in (("crossing", 8, 10), ("insertion", 5, 8), ("clearing", 4, 4)):
         for objects, count in ((3, three), (5, five)):
-            options = (f"task={task}", f"objects={objects}")
+            options: tuple[str, ...] = (f"task={task}", f"objects={objects}")
             found[f"{task}-{objects}"] = Cell("paper's tasks", "default", options, count)
     kinds = {"bridge": "crossing", "slot": "insertion", "region": "clearing"}
     plain = (("bridge", ((4, 3), (6, 6), (9, 5), (12, 2))), ("slot", ((5, 4), (8, 6))), ("region", ((9, 3),)))

@@ -11,6 +11,8 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import pyro
 import torch
@@ -67,7 +69,7 @@ def hand_written_loss(model: CascadedModel, guide: CascadedGuide, window: Window
     return sequence.where(window.sequence_mask, 0.0).sum() + transitions.sum()
 
 
-def moments(network: nn.Module, arguments: tuple) -> tuple[Tensor, Tensor]:
+def moments(network: Any, arguments: tuple) -> tuple[Tensor, Tensor]:
     """Mean and scale of an inference network, without the distribution that it returns around them."""
     kept: list[Tensor] = []
     head = network.code.head
@@ -85,7 +87,7 @@ def kl(mean: Tensor, scale: Tensor, value: Tensor) -> Tensor:
     return (0.5 * value.square() - 0.5 * ((value - mean) / scale).square() - scale.log()).sum(-1)
 
 
-def state_loss(mean: State, observed: State, real: Tensor, center: float, feature: float) -> Tensor:
+def state_loss(mean: State, observed: State, real: Tensor, center: Any, feature: Any) -> Tensor:
     """Negative log density of each object's center and feature: [..., M]."""
     loss = 0.5 / center**2 * (observed.centers - mean.centers).square().sum(-1)
     loss = loss + 0.5 / feature**2 * (observed.features - mean.features).square().sum(-1)
@@ -125,10 +127,8 @@ def main() -> None:
         theirs = hand_written_loss(model, guide, window).item()
         assert math.isclose(ours, theirs, rel_tol=1e-5), (ours, theirs)
         parameters = list(bound.parameters())
-        pyro_step = stepper(lambda bound=bound, window=window: bound(window, 0), parameters, count)
-        torch_step = stepper(
-            lambda model=model, guide=guide, window=window: hand_written_loss(model, guide, window), parameters, count
-        )
+        pyro_step = stepper(partial(bound, window, 0), parameters, count)
+        torch_step = stepper(partial(hand_written_loss, model, guide, window), parameters, count)
         with unchecked_programs():
             for _ in range(5):
                 pyro_step(), torch_step()

@@ -9,13 +9,9 @@ Finished parts are not done again.
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
-
-# A file there would hide `planning`. Workers run this line again, with the path that is left.
-sys.path[:] = [place for place in sys.path if not place.endswith("benchmarks")]
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of

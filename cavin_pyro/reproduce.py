@@ -18,6 +18,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.reproduction.episodes.picture import draw_chosen_episodes
     from cavin_pyro.reproduction.merging import IGNORED, check_shards, merge_tables
+    from cavin_pyro.reproduction.methods import chosen_methods
     from cavin_pyro.reproduction.pipeline import as_typed, check_inputs, chosen_rows, run_pipeline
     from cavin_pyro.reproduction.results import write_results
     from cavin_pyro.reproduction.table import read_table
@@ -26,6 +27,8 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
     device = choose_device(config.device).type  # `auto` chooses once, for all stages
+    typed = as_typed(config)
+    config.methods = list(chosen_methods(config))
     with output_folder(config.output) as home:
         check_same_run(home, config, ignore=IGNORED)
         rows = chosen_rows(read_table(Path(config.table)), config) if config.table else []
@@ -39,7 +42,7 @@ def main(config: DictConfig) -> None:
             rows = merge_tables(config, home, [Path(folder) for folder in config.merge])
         elif not config.table:
             rows = run_pipeline(config, home, device)
-        for path in write_results(home, rows, as_typed(config)):
+        for path in write_results(home, rows, typed):
             print(path)
         if config.pictures is not None:
             folders = [Path(folder) for folder in config.merge] or [home]

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.reproduction.cells import evaluations
+from cavin_pyro.reproduction.methods import chosen_methods
 from cavin_pyro.reproduction.pipeline import chosen_scale
 from cavin_pyro.reproduction.table import TABLE, episode_key, read_table, row_key, write_table
 from cavin_pyro.storage.run_directory import check_same_run
@@ -43,7 +44,7 @@ def merge_tables(config: DictConfig, home: Path, folders: Sequence[Path]) -> lis
             rows[row_key(row)] = row
     wanted = [
         episode_key(one, seed)
-        for one in evaluations(chosen_scale(config), config.methods, config.planners)
+        for one in evaluations(chosen_scale(config), chosen_methods(config), config.planners)
         for seed in range(one.seed, one.seed + one.episodes)
     ]
     missing = [key for key in wanted if key not in rows]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from omegaconf import DictConfig
 
 # The paper's way of planning, for the baselines as `planner=paper` has it for CAVIN.
 WITHOUT_ADDITIONS = (
@@ -95,3 +98,9 @@ METHODS: dict[str, Method] = {
     )
 }
 PAPER_METHODS = [one.name for one in METHODS.values() if one.in_paper]
+
+
+def chosen_methods(config: DictConfig) -> Sequence[str]:
+    """The option `methods`; by default the paper's, and all there are where a table is drawn."""
+    default = list(METHODS) if config.table else PAPER_METHODS
+    return default if config.methods is None else list(config.methods)

@@ -19,7 +19,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of
 from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.reproduction.cells import FIGURES, SCENES_PER_TRAINING, Evaluation, evaluations, in_order
-from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.methods import METHODS, chosen_methods
 from cavin_pyro.reproduction.scales import OBJECT_COUNTS, SCALES, Scale
 from cavin_pyro.reproduction.stages import Stage, preparation, run_stages, training_folder, trainings
 from cavin_pyro.reproduction.table import TABLE, Row, episode_key, episode_row, read_table, row_key, write_table
@@ -47,11 +47,11 @@ def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> list[Ro
     """
     scale = chosen_scale(config)
     first = preparation(scale, home, workers=config.workers, device=device)
-    learning = of_shard(trainings(scale, home, config.methods, device=device), config.shard)
+    learning = of_shard(trainings(scale, home, chosen_methods(config), device=device), config.shard)
     folders = {stage.folder for stage in learning}
     own = [
         one
-        for one in evaluations(scale, config.methods, config.planners)
+        for one in evaluations(scale, chosen_methods(config), config.planners)
         if training_folder(home, one.cell.method, one.training_seed) in folders
     ]
     # Each group needs the one before it.
@@ -100,10 +100,10 @@ def check_inputs(config: DictConfig) -> None:
     """
     scale = chosen_scale(config)
     for name in ("methods", "planners", "rewards"):
-        if not config[name]:
+        if config[name] is not None and not config[name]:
             raise UserError(f"{name}=[] leaves nothing to run: choose some, or leave the option out")
-    of_shard(trainings(scale, Path(), config.methods), config.shard)
-    wanted = list(evaluations(scale, config.methods, config.planners))
+    of_shard(trainings(scale, Path(), chosen_methods(config)), config.shard)
+    wanted = list(evaluations(scale, chosen_methods(config), config.planners))
     if not wanted:
         raise UserError("no cell has these methods, planners and rewards: choose others (variants have sparse rewards)")
     _models(config, Path(), wanted)
@@ -117,10 +117,11 @@ def chosen_rows(rows: Sequence[Row], config: DictConfig) -> list[Row]:
         UserError: there is none.
     """
     kinds = {planner: "variants" if planner not in FIGURES else planner for planner in {row["planner"] for row in rows}}
+    methods = chosen_methods(config)
     chosen = [
         row
         for row in rows
-        if row["method"] in config.methods
+        if row["method"] in methods
         and kinds[row["planner"]] in config.planners
         and row["task"] in config.tasks
         and row["objects"] in config.objects

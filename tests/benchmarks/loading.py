@@ -13,10 +13,7 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
 def load(name: str) -> Any:
-    """Import the file `benchmarks/NAME.py`, which takes its folder off the path as it does when it runs as a script.
-
-    It gets another name: `planning` is a package.
-    """
+    """Import the file `benchmarks/NAME.py`, beside the files of its folder as when it runs as a script."""
     spec = importlib.util.spec_from_file_location(f"benchmark_{name}", FOLDER / f"{name}.py")
     assert spec is not None and spec.loader is not None
     with pytest.MonkeyPatch.context() as patch:

@@ -51,7 +51,7 @@ def test_training_by_hand_has_the_same_loss_and_is_timed_against_pyro() -> None:
 
 
 def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
-    *_, alone, together = run("planning", "--quick", "--no-flat", "--no-compile").splitlines()
+    *_, alone, together = run("plans", "--quick", "--no-flat", "--no-compile").splitlines()
     # samples, objects, batch, GFLOP per plan, matrix GFLOP/s, ms per plan (the fastest), share of the matrix rate
     assert alone.split()[:3] == ["32", "2", "1"] and together.split()[:3] == ["32", "2", "16"]
     assert float(alone.split()[3]) == float(together.split()[3]) > 0.0

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "long_runs.py"
+from tests.benchmarks.loading import FOLDER, load
+
+FILE = FOLDER / "long_runs.py"
 
 
 @pytest.fixture(scope="module")
-def long_runs() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("long_runs", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["long_runs"] = module  # where dataclasses look up their module
-    spec.loader.exec_module(module)
-    return module
+def long_runs() -> Any:
+    return load("long_runs")
 
 
 @pytest.mark.parametrize("rising", [None, "memory_mb", "files", "clients", "turn_ms"])
-def test_a_quantity_that_rises_is_told_from_noise(rising: str | None, long_runs: ModuleType) -> None:
+def test_a_quantity_that_rises_is_told_from_noise(rising: str | None, long_runs: Any) -> None:
     noise = np.random.default_rng(0)
     measured = []
     for number in range(1, 81):
@@ -41,7 +37,7 @@ def test_a_quantity_that_rises_is_told_from_noise(rising: str | None, long_runs:
     assert [one.name for one in long_runs.slopes(measured) if one.rises] == ([rising] if rising else [])
 
 
-def test_turns_stay_flat_and_leaks_on_purpose_do_not(long_runs: ModuleType) -> None:
+def test_turns_stay_flat_and_leaks_on_purpose_do_not(long_runs: Any) -> None:
     """In so few turns only large slopes can be told: a leak is of 8 MB, a file and a simulation a turn."""
     flat = long_runs.slopes(list(long_runs.measure(16, 1)), memory_limit=3000.0, time_limit=2.0)
     assert not [str(one) for one in flat if one.rises]

@@ -22,9 +22,10 @@ class ReproduceConfig(DeviceOptions):
         choices="cavin_pyro.reproduction.scales.SCALES",
         group="run",
     )
-    methods: list[str] = option(
-        ["cavin", "sectar", "cvae_mpc", "mpc"],
-        "methods to train and evaluate: the paper's four by default; contact is CAVIN with networks that see contact",
+    methods: list[str] | None = option(
+        None,
+        "methods to train and evaluate, by default the paper's four, and with table= all that it has; contact is CAVIN "
+        "with networks that see contact",
         choices="cavin_pyro.reproduction.methods.METHODS",
         group="run",
     )

@@ -123,6 +123,11 @@ def test_one_reward_alone_has_its_figures(tmp_path: Path) -> None:
 def test_a_table_is_drawn_as_far_as_the_options_choose() -> None:
     rows = played()
     assert chosen_rows(rows, config()) == rows
+    ours = [*rows, {**rows[0], "method": "contact"}]
+    assert (
+        chosen_rows(ours, config(table="some.parquet", methods="null")) == ours
+    )  # a table's own; `contact` runs where it is named
+    assert chosen_rows(ours, config(methods="null")) == rows
     assert {row["method"] for row in chosen_rows(rows, config(methods="[mpc]"))} == {"mpc"}
     assert {row["reward"] for row in chosen_rows(rows, config(rewards="[sparse]"))} == {"sparse"}
     with pytest.raises(UserError, match="has no episode of the chosen methods, planners, tasks, objects and rewards"):

@@ -1,4 +1,4 @@
-"""What a plan costs: `python benchmarks/planning.py [--quick]`.
+"""What a plan costs: `python benchmarks/plans.py [--quick]`.
 
 Milliseconds per plan with the shipped checkpoint, eager and compiled (`planner.compile=true`), the floating-point
 operations in it, and the share of this machine's own rate of float32 matrix products that planning reaches; then the
@@ -16,12 +16,9 @@ from __future__ import annotations
 import argparse
 import copy
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
-
-sys.path.remove(next(place for place in sys.path if place.endswith("benchmarks")))  # this file would hide `planning`
 
 import torch
 from torch import Tensor
