@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 import pyarrow
 from pyarrow import parquet
-from scipy.stats import binomtest
 
-from cavin_pyro.evaluation.statistics import wilson
+from cavin_pyro.evaluation.statistics import mcnemar, wilson
 from cavin_pyro.reproduction.statistics import RESAMPLES, holm
 from cavin_pyro.reproduction.table import CRITERIA, SCHEMA, TABLE, Row, read_table
 from cavin_pyro.storage.files import atomic_write
@@ -109,7 +108,7 @@ def lines(rows: Sequence[Row], criterion: str) -> Iterator[str]:
         yield f"| {' | '.join(map(str, way))} | {' | '.join(shown)} |"
     compared = {(number, place): list(pairs(found[number], place)) for number in numbers for place in range(3)}
     counts = [alone(*pair) for each in compared.values() for pair in each]
-    tests = iter(holm([float(binomtest(one, one + other).pvalue) if one + other else 1.0 for one, other in counts]))
+    tests = iter(holm([mcnemar(one, other) for one, other in counts]))
     yield ""
     yield "| factor | objects | effect, points | each pair: alone before, alone after (p) |"
     yield "| --- | --- | --- | --- |"

@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
+from scipy.stats import bootstrap
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.collection import clutter_area
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
+from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.sampling import WHOLE_TABLE, ObjectRanges
 from envs.observation import MINIMUM_PIXELS, Observation
@@ -240,8 +241,8 @@ def report(lines: list[dict[str, Any]]) -> None:
 
 
 def share(what: str, count: int, of: int) -> str:
-    interval = binomtest(count, of).proportion_ci(method="wilson")
-    return f"{what}: {100 * count / of:.1f} % [{100 * interval.low:.1f}, {100 * interval.high:.1f}], {count} of {of}"
+    rate = wilson(count, of)
+    return f"{what}: {100 * rate['rate']:.1f} % [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}], {count} of {of}"
 
 
 def draw_into(folder: Path) -> Pictures:

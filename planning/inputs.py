@@ -17,6 +17,10 @@ class NoFiniteCandidateError(ValueError):
         super().__init__(f"environment {environment}: {what}")
         self.environment, self.what = environment, what
 
+    def __reduce__(self) -> tuple[type[NoFiniteCandidateError], tuple[int, str]]:
+        """How a worker process hands it to its parent: exceptions are rebuilt from their message alone otherwise."""
+        return type(self), (self.environment, self.what)
+
 
 class OptimizerError(ValueError):
     """An optimizer breaks the interface `planning.optimizers.Optimizer`; the message names its class."""

@@ -10,11 +10,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from scipy.stats import binomtest
 from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.rows import violation, with_current_names
+from cavin_pyro.evaluation.statistics import mcnemar
 from cavin_pyro.storage.run_directory import flat_options, stored_options
 
 SAME_SCENES = (
@@ -60,8 +60,7 @@ def compare(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]
         raise UserError("the two evaluations have no seed in common: give both the same seed=")
     counts = {kind: pairs.count(kind) for kind in ((True, True), (True, False), (False, True), (False, False))}
     alone, others = counts[True, False], counts[False, True]
-    p_value = float(binomtest(alone, alone + others).pvalue) if alone + others else 1.0
-    return Comparison(counts[True, True], alone, others, counts[False, False], p_value)
+    return Comparison(counts[True, True], alone, others, counts[False, False], mcnemar(alone, others))
 
 
 def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:

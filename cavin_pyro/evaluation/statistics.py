@@ -17,6 +17,11 @@ def wilson(successes: int, trials: int) -> Rate:
     return {"rate": successes / trials, "low": float(interval.low), "high": float(interval.high)}
 
 
+def mcnemar(one_alone: int, other_alone: int) -> float:
+    """The exact p-value of McNemar's test: whether one of two succeeds in scenes where the other fails as often."""
+    return float(binomtest(one_alone, one_alone + other_alone).pvalue) if one_alone + other_alone else 1.0
+
+
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Mean, median and 95th percentile."""
     return {

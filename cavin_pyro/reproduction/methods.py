@@ -34,6 +34,11 @@ class Method:
     planners: dict[str, tuple[str, ...]]
     in_paper: bool = True
 
+    @property
+    def reads_point_clouds(self) -> bool:
+        """Whether its models read the features of a pretrained PointNet."""
+        return not any(one.startswith("geometry=") for one in self.training)
+
 
 METHODS: dict[str, Method] = {
     one.name: one

@@ -46,16 +46,17 @@ def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> list[Ro
         UserError: an option that cannot be used, or a stage that failed.
     """
     scale = chosen_scale(config)
-    first = preparation(scale, home, workers=config.workers, device=device)
-    learning = of_shard(trainings(scale, home, chosen_methods(config), device=device), config.shard)
+    methods = chosen_methods(config)
+    first = preparation(scale, home, methods, workers=config.workers, device=device)
+    learning = of_shard(trainings(scale, home, methods, device=device), config.shard)
     folders = {stage.folder for stage in learning}
     own = [
         one
-        for one in evaluations(scale, chosen_methods(config), config.planners)
+        for one in evaluations(scale, methods, config.planners)
         if training_folder(home, one.cell.method, one.training_seed) in folders
     ]
     # Each group needs the one before it.
-    groups = [] if config.models else [[first[0]], [first[1]], learning]
+    groups = [] if config.models else [*([stage] for stage in first), learning]
     models = _models(config, home, own)
     known = _known(config, scale)
     flat = [stage for group in groups for stage in group]

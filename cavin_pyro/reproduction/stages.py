@@ -78,8 +78,8 @@ class Stage:
             raise UserError(f"{self.line} failed: {' '.join(last).removeprefix('error: ')} ({self.folder}/log.txt)")
 
 
-def preparation(scale: Scale, home: Path, *, workers: int, device: str = "cpu") -> list[Stage]:
-    """Data, then the PointNet that all methods share; `device`: of the latter's training."""
+def preparation(scale: Scale, home: Path, methods: Sequence[str], *, workers: int, device: str = "cpu") -> list[Stage]:
+    """Data, then the PointNet that the methods share, if one reads it; `device`: of the latter's training."""
 
     def collected(folder: Path) -> float:
         return _number(folder / "metadata.json", "transitions") / scale.transitions
@@ -99,7 +99,7 @@ def preparation(scale: Scale, home: Path, *, workers: int, device: str = "cpu") 
         "reconstructions.png",
         PRETRAINING_SECONDS,
     )
-    return [collect, pretrain]
+    return [collect, pretrain] if any(METHODS[name].reads_point_clouds for name in methods) else [collect]
 
 
 def trainings(scale: Scale, home: Path, methods: Sequence[str], *, device: str = "cpu") -> list[Stage]:
@@ -114,7 +114,11 @@ def trainings(scale: Scale, home: Path, methods: Sequence[str], *, device: str =
             "train",
             (
                 f"data={home / 'data'}",
-                f"pointnet={home / 'pretrain' / 'pointnet.safetensors'}",
+                *(
+                    [f"pointnet={home / 'pretrain' / 'pointnet.safetensors'}"]
+                    if METHODS[name].reads_point_clouds
+                    else []
+                ),
                 *scale.training,
                 *METHODS[name].training,
                 f"seed={seed}",
@@ -142,27 +146,36 @@ def run_stages(stages: Sequence[Stage], workers: int, progress: Callable[[], Non
         progress: called every second or two.
 
     Raises:
-        UserError: one has failed; those that run go on to their end, others do not begin.
+        UserError: one has failed, the first of them; those that run go on to their end, others do not begin.
         KeyboardInterrupt: also by SIGTERM or SIGHUP; those that run are interrupted as well.
     """
     for stage in stages:
         if stage.finished:
             _tidy(stage.folder)
     processes: list[subprocess.Popen[bytes]] = []
+    failures: list[BaseException] = []
+
+    def run(stage: Stage) -> None:
+        if not failures:
+            try:
+                stage.run(processes.append)
+            except (OSError, UserError) as error:
+                failures.append(error)
+
     with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(stage.run, processes.append) for stage in stages if not stage.finished}
+        running = {pool.submit(run, stage) for stage in stages if not stage.finished}
         try:
             while running:
                 ended, running = wait(running, timeout=POLLING_SECONDS, return_when=FIRST_COMPLETED)
                 progress()
                 for one in ended:
-                    if one.exception() is not None:
-                        pool.shutdown(cancel_futures=True, wait=False)
                     one.result()
         except KeyboardInterrupt:
             pool.shutdown(cancel_futures=True, wait=False)
             _end(processes, running)
             raise
+    if failures:
+        raise failures[0]
 
 
 def _tidy(folder: Path) -> None:

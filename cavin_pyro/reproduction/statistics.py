@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, trim_mean
+from scipy.stats import trim_mean
 
-from cavin_pyro.evaluation.statistics import wilson
+from cavin_pyro.evaluation.statistics import mcnemar, wilson
 from cavin_pyro.reproduction.cells import FIGURES
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.table import CRITERIA, Row
@@ -112,7 +112,7 @@ def _paired(reference: Sequence[Row], others: Sequence[Row], criterion: str) -> 
         "difference": sum(one[s] - other[s] for s in common) / len(common) if common else 0.0,
         "reference_alone": alone,
         "other_alone": other_alone,
-        "p": float(binomtest(alone, alone + other_alone).pvalue) if alone + other_alone else 1.0,
+        "p": mcnemar(alone, other_alone),
     }
 
 

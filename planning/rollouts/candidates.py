@@ -240,6 +240,7 @@ class Candidates:
             return self
         # Not compiled: it happens seldom, and would be another function to compile.
         problem = replace(self.problem, best_only=False, backend=eager)
+        problem.evidence.extend(self.problem.evidence)  # of the search that found them
         return problem.evaluate(self.noise)
 
     def take(self, numbers: Tensor) -> Candidates:

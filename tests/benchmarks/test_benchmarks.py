@@ -153,7 +153,7 @@ def test_pushes_of_robots_are_compared_with_the_sticks_and_drawn(tmp_path: Path)
 @pytest.mark.soak
 def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> None:
     home = tmp_path / "home"
-    for stage in preparation(SCALES["minimal"], home, workers=1):
+    for stage in preparation(SCALES["minimal"], home, ["cavin"], workers=1):
         stage.run()
     options = ("--methods", "cvae_mpc", "mpc", "--steps", "2", "--episodes", "1")
     fast = ("--training", *TINY_TRAINING[1:], "--planning", "planner.samples=8", "planner.horizon=6", "maximum_steps=1")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 import torch
 
 from models.state import State
-from planning.inputs import check_scenes
+from planning.inputs import NoFiniteCandidateError, check_scenes
 
 GOOD = State(torch.zeros(2, 3, 3), torch.zeros(2, 3, 64), torch.ones(2, 3, dtype=torch.bool))
 
@@ -27,3 +29,12 @@ def test_states_of_the_wrong_kind_are_refused(changes: dict, said: str) -> None:
     check_scenes(GOOD, generators)
     with pytest.raises(ValueError, match=said):
         check_scenes(GOOD._replace(**changes), generators)
+
+
+def test_a_worker_process_hands_over_that_no_candidate_is_finite() -> None:
+    error = pickle.loads(pickle.dumps(NoFiniteCandidateError(2, "returns of effect plans")))
+    assert (error.environment, error.what, str(error)) == (
+        2,
+        "returns of effect plans",
+        "environment 2: returns of effect plans",
+    )

@@ -66,8 +66,20 @@ def test_every_command_line_of_a_stage_is_accepted(method: str, scale: str) -> N
 
 def test_networks_of_all_stages_are_trained_on_the_chosen_device() -> None:
     scale = SCALES["smoke"]
-    stages = [*preparation(scale, ROOT, workers=1, device="cuda"), *trainings(scale, ROOT, ["cavin"], device="cuda")]
+    stages = [
+        *preparation(scale, ROOT, ["cavin"], workers=1, device="cuda"),
+        *trainings(scale, ROOT, ["cavin"], device="cuda"),
+    ]
     assert {stage.command for stage in stages if "device=cuda" in stage.options} == {"pretrain", "train"}
+
+
+def test_a_pointnet_is_trained_only_for_methods_that_read_it() -> None:
+    scale = SCALES["minimal"]
+    for methods, wanted in ((["contact"], False), (["cavin", "contact"], True), (PAPER_METHODS, True)):
+        commands = [stage.command for stage in preparation(scale, ROOT, methods, workers=1)]
+        assert commands == (["collect", "pretrain"] if wanted else ["collect"])
+    stages = trainings(scale, ROOT, ["cavin", "contact"])
+    assert [any("pointnet=" in one for one in stage.options) for stage in stages] == [True, False]
 
 
 def test_variants_have_a_planner_each_and_differ_from_the_papers() -> None:

@@ -137,6 +137,45 @@ def test_an_interruption_reaches_the_stages_that_run(tmp_path: Path, monkeypatch
     assert not (tmp_path / "c").exists()  # it had to wait, and does not begin
 
 
+class Failing(Stage):
+    """A command that fails at once."""
+
+    @property
+    def line(self) -> str:
+        return "python -c 'import sys; sys.exit(1)'"
+
+
+def test_an_interruption_after_a_failure_reaches_the_stages_that_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stages, "POLLING_SECONDS", 0.2)
+    failed = tmp_path / "a" / "log.txt"
+    calls = []
+
+    def interrupt() -> None:
+        calls.append(failed.exists())
+        if len(calls) > 10:
+            raise KeyboardInterrupt
+
+    began = time.monotonic()
+    some = [
+        Failing("", (), tmp_path / "a", "never", 1.0),
+        *(Sleeping("", (), tmp_path / name, "never", 60.0) for name in "bc"),
+    ]
+    with pytest.raises(KeyboardInterrupt):
+        run_stages(some, 2, interrupt)
+    assert time.monotonic() - began < 30
+    assert not (tmp_path / "c").exists()  # it had to wait, and does not begin after a failure
+
+
+def test_a_failure_is_told_when_the_stages_that_run_have_ended(tmp_path: Path) -> None:
+    some = [Failing("", (), tmp_path / "a", "never", 1.0), Sleeping("", (), tmp_path / "b", "never", 0.5)]
+    some.append(Sleeping("", (), tmp_path / "c", "never", 60.0))
+    with pytest.raises(UserError, match=r"sys.exit\(1\)' failed"):
+        run_stages(some, 2, lambda: None)
+    assert not (tmp_path / "c").exists()
+
+
 def test_a_killed_stage_is_told_with_its_signal(tmp_path: Path) -> None:
     def kill(process: subprocess.Popen[bytes]) -> None:
         process.kill()

@@ -17,7 +17,7 @@ from cavin_pyro.reproduction.merging import check_shards, merge_tables
 from cavin_pyro.reproduction.pipeline import check_inputs, chosen_rows
 from cavin_pyro.reproduction.results import write_results
 from cavin_pyro.reproduction.scales import SCALES
-from cavin_pyro.reproduction.table import TABLE, episode_row, read_table, write_table
+from cavin_pyro.reproduction.table import TABLE, episode_row, read_table, row_key, write_table
 from cavin_pyro.storage.run_directory import write_config
 
 METHODS = ["cavin", "mpc"]
@@ -75,6 +75,22 @@ def test_shards_are_joined_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
     home.mkdir()
     assert merge_tables(config(output=home), home, folders) == rows
     assert (home / TABLE).read_bytes() == (tmp_path / "whole").read_bytes()
+
+
+def test_joined_shards_keep_what_the_table_before_them_had(tmp_path: Path) -> None:
+    rows = played()
+    more = [{**row, "seed": row["seed"] + 7} for row in rows[:2]]  # of a table that the option `extends` named
+    home = tmp_path / "joined"
+    home.mkdir()
+    joined = merge_tables(config(), home, [shard(tmp_path / name, [*rows, *more]) for name in "ab"])
+    assert sorted(map(row_key, joined)) == sorted(map(row_key, [*rows, *more]))
+
+
+def test_shards_that_have_one_episode_differently_are_refused(tmp_path: Path) -> None:
+    rows = played()
+    other = [{**rows[0], "strict_outcome": "fall"}, *rows[1:]]
+    with pytest.raises(UserError, match="has another episode of cavin in clearing, scene 50000, than a folder"):
+        merge_tables(config(), tmp_path, [shard(tmp_path / "a", rows), shard(tmp_path / "b", other)])
 
 
 def test_shards_that_lack_episodes_or_have_other_options_are_refused(tmp_path: Path) -> None:
