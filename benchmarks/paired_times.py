@@ -24,7 +24,7 @@ from cavin_pyro.evaluation.factory import make_runner
 from models.state import State
 from planning import Planner
 from planning.extensions.touchdown import ObservedPoints
-from planning.protocol import SeeingPlanner
+from planning.protocol import ObservingPlanner
 
 
 class Scene(NamedTuple):
@@ -46,7 +46,7 @@ def planner_and_scenes(options: list[str], seeds: range) -> tuple[Planner, list[
 def milliseconds(planner: Planner, scene: Scene, seed: int) -> float:
     """Processor time of one plan."""
     began = time.process_time()
-    seen: dict[str, Any] = {"observed": scene.observed} if isinstance(planner, SeeingPlanner) else {}
+    seen: dict[str, Any] = {"observed": scene.observed} if isinstance(planner, ObservingPlanner) else {}
     planner.plan(scene.state, [torch.Generator().manual_seed(seed)], **seen)
     return 1e3 * (time.process_time() - began)
 

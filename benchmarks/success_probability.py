@@ -147,7 +147,7 @@ def predictions(regressions: Sequence[Regression], one: Evaluated) -> Lines:
     ]
     found: Lines = []
     for row in one.rows if fitting else ():
-        plans = plans_of(row["prospects"])
+        plans = plans_of(row["success_predictors"])
         told = [fitting[0](plans[: number + 1]) for number in range(len(plans))]
         known = [value for value in told if value is not None]
         if len(known) == len(plans):

@@ -230,7 +230,7 @@ class Planner(Protocol):
 
 
 @runtime_checkable
-class SeeingPlanner(Planner, Protocol):
+class ObservingPlanner(Planner, Protocol):
     """A planner whose method `plan` also takes what the camera sees: `planning.extensions.touchdown.ObservedPoints`."""
 
     touchdown_distance: float

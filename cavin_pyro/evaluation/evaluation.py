@@ -133,7 +133,7 @@ def episode_row(episode: Episode) -> Row:
         "plans": len(episode.plan_records),
         "plans_reaching_goal": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
-        "prospects": columns_of([record.success_predictors for record in episode.plan_records]),
+        "success_predictors": columns_of([record.success_predictors for record in episode.plan_records]),
         "success_probability": _probabilities(episode),
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }

@@ -15,7 +15,7 @@ def predicts_nothing(config: DictConfig) -> bool:
 
 def plan_summary_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
     """One line about an episode's plans, from its row of results; empty for planners that predict nothing."""
-    if predicts_nothing(config) or not row["plans"]:
+    if predicts_nothing(config) or not row.get("plans"):
         return ""
     if row["plans_reaching_goal"]:
         return f"{row['plans_reaching_goal']} of {row['plans']} plans reached the goal by the model"
@@ -24,6 +24,7 @@ def plan_summary_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
 
 def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
     """The same about all episodes; what to try is added if in some of them no plan reached the goal."""
+    rows = [row for row in rows if "plans" in row]  # older versions did not count them
     plans = sum(row["plans"] for row in rows)
     if predicts_nothing(config) or not plans:
         return ""

@@ -19,7 +19,7 @@ from envs.randomness import planner_seed
 from envs.workspace import PUSH_DECIMALS, executed_push
 from models.networks.geometry import Geometry
 from planning import Plan, Planner
-from planning.protocol import SeeingPlanner
+from planning.protocol import ObservingPlanner
 from planning.records import apply
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
@@ -169,8 +169,8 @@ def rollout(
     while not ended:
         began = time.perf_counter()
         state = observed_state(observation, geometry, device)
-        seen = {"observed": observed_points(observation, device)} if isinstance(planner, SeeingPlanner) else {}
-        previous = planner.plan(state, [generator], previous, **seen)
+        observed = {"observed": observed_points(observation, device)} if isinstance(planner, ObservingPlanner) else {}
+        previous = planner.plan(state, [generator], previous, **observed)
         plan = apply(previous, lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),

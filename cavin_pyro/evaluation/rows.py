@@ -58,17 +58,25 @@ LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not writ
     "strict_return": _number,
     "plans": _count,
     "plans_reaching_goal": _count,
-    "prospects": _success_predictors,
+    "success_predictors": _success_predictors,
     "success_probability": _probabilities,
 }
-RENAMED = {"hopeful_plans": "plans_reaching_goal"}  # in the files of older versions: old name, new name
+RENAMED = {  # in the files of older versions: old name, new name
+    "hopeful_plans": "plans_reaching_goal",
+    "prospects": "success_predictors",
+    "way": "allowed_distance",
+    "way_after": "allowed_distance_after",
+}
 
 
 def with_current_names(row: Any) -> Any:
-    """A stored row under the names of this version; anything else as it is."""
+    """A stored row under the names of this version, those of its success predictors too; anything else as it is."""
     if not isinstance(row, Mapping):
         return row
-    return {name if RENAMED.get(name, name) in row else RENAMED[name]: value for name, value in row.items()}
+    return {
+        name if RENAMED.get(name, name) in row else RENAMED[name]: with_current_names(value)
+        for name, value in row.items()
+    }
 
 
 def violation(row: Any) -> str | None:

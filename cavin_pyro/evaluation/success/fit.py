@@ -44,7 +44,7 @@ def read_evaluation(folder: Path) -> Evaluated:
     if not (folder / "config.yaml").is_file():
         raise UserError(f"{folder} holds no evaluation: give folders of evaluate")
     rows = list(finished_episodes(folder / "episodes.jsonl").values())
-    if not rows or any(row.get("prospects") is None for row in rows):
+    if not rows or any(row.get("success_predictors") is None for row in rows):
         raise UserError(
             f"{folder} holds no success predictors of plans: evaluate it again, with a planner that predicts"
         )
@@ -74,7 +74,7 @@ def fit(evaluations: Sequence[Evaluated], name: str, *, ridge: float = RIDGE) ->
     ends = np.array([row["outcome"] == "success" for row in rows])
     if len(ends) < FEWEST:
         raise UserError(f"{len(ends)} episodes of {name} are too few for a fit: evaluate at least {FEWEST}")
-    episodes = [regressors_of(plans_of(row["prospects"])) for row in rows]
+    episodes = [regressors_of(plans_of(row["success_predictors"])) for row in rows]
     names = [one for number, one in enumerate(REGRESSORS) if all(np.isfinite(x[:, number]).all() for x in episodes)]
     kept = [list(REGRESSORS).index(one) for one in names]
     x = np.concatenate([one[:, kept] for one in episodes])

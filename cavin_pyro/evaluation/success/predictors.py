@@ -20,8 +20,8 @@ SUCCESS_PREDICTORS = {
     "pushes_left": "pushes that the episode still allows",
     "objects": "objects that are observed",
     "distance": "metres left to the goal by the task's potential, as observed",
-    "way": "metres left to the goal along allowed places, as observed; with guidance only",
-    "way_after": "the same at the end of the chosen plan, by the model",
+    "allowed_distance": "metres left to the goal along allowed places, as observed; with guidance only",
+    "allowed_distance_after": "the same at the end of the chosen plan, by the model",
     "reaches": "1 if the chosen plan reaches the goal by the model, else 0",
     "reaching": "share of the candidates that do",
     "segments": "of the chosen plan until it ends",
@@ -39,21 +39,21 @@ def success_predictors(
     Args:
         distance: metres, minus the task's `potential`. mask: [M], of the observation.
     """
-    told = plan.success_predictors
-    if told is None:
+    found = plan.success_predictors
+    if found is None:
         return None
     numbers = {
         "step": step,
         "pushes_left": pushes_left,
         "objects": int(mask.sum()),
         "distance": distance,
-        "way": told.distance_to_goal.item(),
-        "way_after": told.distance_to_goal_after.item(),
+        "allowed_distance": found.distance_to_goal.item(),
+        "allowed_distance_after": found.distance_to_goal_after.item(),
         "reaches": int(plan.expected_success.item()),
-        "reaching": told.reaching.item(),
+        "reaching": found.reaching.item(),
         "segments": int(plan.segments.item()),
         "expected_return": plan.expected_return.item(),
-        "failures": told.failures.item(),
+        "failures": found.failures.item(),
         "tracking": _tracking(plan),
     }
     return {name: _rounded(value) for name, value in numbers.items()}

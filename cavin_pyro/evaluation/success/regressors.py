@@ -24,7 +24,7 @@ class Regressor(NamedTuple):
 
 def left(plan: PredictorValues) -> float:
     """Metres left to the goal: along allowed places where guidance knows them, else by the task's potential."""
-    return plan["distance"] if math.isnan(plan["way"]) else plan["way"]
+    return plan["distance"] if math.isnan(plan["allowed_distance"]) else plan["allowed_distance"]
 
 
 def without_progress(plans: Sequence[PredictorValues]) -> int:

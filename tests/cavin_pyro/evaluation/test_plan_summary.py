@@ -33,3 +33,9 @@ def test_a_planner_that_predicts_nothing_says_nothing() -> None:
     assert plan_summary_of_episode(row(20, 0), compose("plan", "planner=random")) == ""
     assert plan_summary([row(20, 0)], compose("evaluate", "planner=random")) == ""
     assert plan_summary_of_episode(row(0, 0), compose("plan")) == ""  # an episode without a plan
+
+
+def test_an_episode_of_an_older_version_without_counts_says_nothing() -> None:
+    assert plan_summary_of_episode({"outcome": "success"}, compose("plan")) == ""
+    assert plan_summary([{"outcome": "success"}], compose("evaluate")) == ""
+    assert plan_summary([{"outcome": "success"}, row(10, 10)], compose("evaluate")).startswith("100.0 % of 10 plans")

@@ -17,7 +17,10 @@ from cavin_pyro.evaluation.rows import finished_episodes
 from cavin_pyro.evaluation.success.predictors import SUCCESS_PREDICTORS as MEANING
 from planning.inputs import NoFiniteCandidateError
 
-PREDICTORS: dict[str, list[Any]] = {name: [0, 0.5] for name in MEANING} | {"pushes_left": [60, 59], "way": [None, None]}
+PREDICTORS: dict[str, list[Any]] = {name: [0, 0.5] for name in MEANING} | {
+    "pushes_left": [60, 59],
+    "allowed_distance": [None, None],
+}
 SHORT = json.dumps(PREDICTORS)[:40]
 ROW: dict[str, Any] = {
     "seed": 10,
@@ -31,7 +34,7 @@ ROW: dict[str, Any] = {
     "ineffective": 1,
     "plans": 2,
     "plans_reaching_goal": 2,
-    "prospects": PREDICTORS,
+    "success_predictors": PREDICTORS,
     "success_probability": [0.9, 1],
     "subgoal_distance": None,
     "planning_ms": [1.5, 2],
@@ -45,7 +48,7 @@ def written(folder: Path, *rows: Any) -> Path:
 
 
 def test_rows_of_this_and_of_older_versions_are_read(tmp_path: Path) -> None:
-    later = ("strict", "plans", "prospects", "probability")
+    later = ("strict", "plans", "success_predictors", "probability")
     older = {name: value for name, value in ROW.items() if not any(part in name for part in later)}
     path = written(tmp_path, ROW, {**older, "seed": 11}, ROW)
     with open(path, "a") as file:
@@ -53,8 +56,14 @@ def test_rows_of_this_and_of_older_versions_are_read(tmp_path: Path) -> None:
     assert finished_episodes(path) == {10: ROW, 11: {**older, "seed": 11}}
 
 
+def under_old_names(values: dict[str, Any], **names: str) -> dict[str, Any]:
+    return {names.get(name, name): value for name, value in values.items()}
+
+
 def test_rows_with_an_old_name_are_read_under_the_new_one(tmp_path: Path) -> None:
-    old = {"hopeful_plans" if name == "plans_reaching_goal" else name: value for name, value in ROW.items()}
+    predictors = under_old_names(PREDICTORS, allowed_distance="way", allowed_distance_after="way_after")
+    row = {**ROW, "success_predictors": predictors}
+    old = under_old_names(row, plans_reaching_goal="hopeful_plans", success_predictors="prospects")
     assert finished_episodes(written(tmp_path, old, {**ROW, "seed": 11})) == {10: ROW, 11: {**ROW, "seed": 11}}
     (tmp_path / "config.yaml").write_text("seed: 10\n")
     (tmp_path / "results.json").write_text(json.dumps({"per_episode": [old]}))
@@ -75,8 +84,11 @@ def test_rows_with_an_old_name_are_read_under_the_new_one(tmp_path: Path) -> Non
         ({**ROW, "seed": 11, "steps": -1}, "steps cannot be -1"),
         ({**ROW, "seed": 11, "planning_ms": 5}, "planning_ms cannot be 5"),
         ({**ROW, "seed": 11, "success_probability": [1.5]}, "success_probability cannot be [1.5]"),
-        ({**ROW, "seed": 11, "prospects": {"step": [0]}}, 'prospects cannot be {"step": [0]}'),
-        ({**ROW, "prospects": {**PREDICTORS, "way": 1}, "seed": 11}, f"prospects cannot be {SHORT}"),
+        ({**ROW, "seed": 11, "success_predictors": {"step": [0]}}, 'success_predictors cannot be {"step": [0]}'),
+        (
+            {**ROW, "success_predictors": {**PREDICTORS, "allowed_distance": 1}, "seed": 11},
+            f"success_predictors cannot be {SHORT}",
+        ),
         ({**ROW, "steps": 5}, "an earlier line has another episode with seed 10"),
     ],
 )

@@ -16,7 +16,7 @@ from envs.workspace import push_endpoints
 from models.state import State
 from planning import CavinPlanner, CvaeMpcPlanner, RandomPlanner, SectarPlanner
 from planning.extensions.touchdown import ObservedPoints, prefer_free
-from planning.protocol import SeeingPlanner
+from planning.protocol import ObservingPlanner
 
 LOW, HIGH = torch.tensor([[0.0, -1.0]]), torch.tensor([[1.0, 1.0]])  # metres
 
@@ -129,8 +129,8 @@ def test_each_environment_has_its_own_points(toy: SimpleNamespace) -> None:
 
 
 def test_planners_that_search_see_and_random_pushes_do_not(toy: SimpleNamespace) -> None:
-    assert all(isinstance(planner, SeeingPlanner) for planner in planners(toy, 0.01))
-    assert not isinstance(RandomPlanner(), SeeingPlanner)
+    assert all(isinstance(planner, ObservingPlanner) for planner in planners(toy, 0.01))
+    assert not isinstance(RandomPlanner(), ObservingPlanner)
 
 
 def test_the_camera_sees_where_pushes_are_unsafe() -> None:

@@ -26,9 +26,9 @@ def rows(count: int, *, seed: int = 0) -> list[dict[str, Any]]:
         success = generator.random() < expit(INTERCEPT + PER_METRE * distance + IF_REACHES * reaches)
         columns: dict[str, list[Any]] = {name: [0.0] * plans for name in SUCCESS_PREDICTORS}
         columns |= {"distance": [distance] * plans, "reaches": [reaches] * plans, "pushes_left": [60] * plans}
-        columns |= {name: [None] * plans for name in ("way", "way_after")}
+        columns |= {name: [None] * plans for name in ("allowed_distance", "allowed_distance_after")}
         end = "success" if success else "timeout"
-        found.append({**ROW, "seed": number, "outcome": end, "plans": plans, "prospects": columns})
+        found.append({**ROW, "seed": number, "outcome": end, "plans": plans, "success_predictors": columns})
     return found
 
 

@@ -54,20 +54,20 @@ def test_a_constant_predictor_and_separable_outcomes_get_finite_slopes() -> None
 
 def test_a_fit_to_episodes_gives_new_ones_their_probabilities(tmp_path: Path) -> None:
     found = fit([read_evaluation(evaluation(tmp_path / "episodes", 3000))], "mine")
-    told = [found(plans_of(row["prospects"])) for row in rows(50, seed=1)]
+    told = [found(plans_of(row["success_predictors"])) for row in rows(50, seed=1)]
     truth = [
-        expit(INTERCEPT + PER_METRE * row["prospects"]["distance"][0] + IF_REACHES * row["prospects"]["reaches"][0])
-        for row in rows(50, seed=1)
+        expit(INTERCEPT + PER_METRE * columns["distance"][0] + IF_REACHES * columns["reaches"][0])
+        for columns in (row["success_predictors"] for row in rows(50, seed=1))
     ]
     assert told == pytest.approx(truth, abs=0.06)
     fresh = rows(1500, seed=2)
-    predicted = [[found(plans_of(row["prospects"])) or 0.0] for row in fresh]
+    predicted = [[found(plans_of(row["success_predictors"])) or 0.0] for row in fresh]
     assert calibration(predicted, [row["outcome"] == "success" for row in fresh]).debiased.value < 0.03
 
 
 def test_a_prediction_goes_no_farther_than_those_of_the_fit(tmp_path: Path) -> None:
     found = fit([read_evaluation(evaluation(tmp_path / "episodes", 200))], "mine")
-    (plan,) = plans_of({name: values[:1] for name, values in rows(1)[0]["prospects"].items()})
+    (plan,) = plans_of({name: values[:1] for name, values in rows(1)[0]["success_predictors"].items()})
     far = found([{**plan, "distance": 50.0}])
     assert far == pytest.approx(expit(found.lowest))
 
@@ -90,7 +90,7 @@ def test_episodes_that_tell_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no evaluation"):
         read_evaluation(tmp_path)
     folder = evaluation(tmp_path / "a", 5)
-    older = [{name: value for name, value in row.items() if name != "prospects"} for row in rows(5)]
+    older = [{name: value for name, value in row.items() if name != "success_predictors"} for row in rows(5)]
     (folder / "episodes.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in older))
     with pytest.raises(UserError, match="holds no success predictors"):
         read_evaluation(folder)

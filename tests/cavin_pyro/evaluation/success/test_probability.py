@@ -38,7 +38,7 @@ def test_a_fit_is_read_as_it_was_written(file: Path) -> None:
 def test_the_planner_and_the_scenes_of_a_fit_get_its_probability(options: tuple[str, ...], file: Path) -> None:
     found = probability_for(compose("evaluate", f"success_probability={file}", *options))
     assert isinstance(found, Regression)
-    plans = plans_of(rows(1)[0]["prospects"])
+    plans = plans_of(rows(1)[0]["success_predictors"])
     assert 0.0 < (found(plans) or 0.0) < 1.0
 
 
@@ -95,7 +95,7 @@ def test_an_option_younger_than_the_fit_must_have_its_default(file: Path) -> Non
 
 def test_a_plan_that_does_not_tell_enough_gets_none(file: Path) -> None:
     (found,) = read_regressions(file)
-    plans = plans_of(rows(1)[0]["prospects"])
+    plans = plans_of(rows(1)[0]["success_predictors"])
     assert found([{**plans[0], "failures": float("nan")}]) is None
 
 

@@ -33,7 +33,7 @@ def test_a_plan_tells_every_number_as_its_row_has_it() -> None:
     assert found["reaching"] == 0.12346 and found["reaches"] == 1 and found["objects"] == 3
     assert found["tracking"] == pytest.approx(0.0, abs=1e-6)
     columns = columns_of([found, found])
-    assert columns is not None and columns["way"] == [None, None] and columns["step"] == [2, 2]
+    assert columns is not None and columns["allowed_distance"] == [None, None] and columns["step"] == [2, 2]
     assert str(plans_of(columns)) == str([found, found])  # NaN differs from itself
 
 
@@ -45,12 +45,15 @@ def test_a_planner_that_predicts_nothing_tells_nothing() -> None:
 
 def test_progress_counts_from_the_last_two_centimetres() -> None:
     ways = (0.50, 0.49, 0.47, 0.46, 0.48, 0.452)
-    plans = [{**told(), "step": 3 * number, "way": way} for number, way in enumerate(ways)]
+    plans = [{**told(), "step": 3 * number, "allowed_distance": way} for number, way in enumerate(ways)]
     assert [without_progress(plans[: number + 1]) for number in range(len(plans))] == [0, 3, 0, 3, 6, 9]
 
 
 def test_every_predictor_is_a_number_and_reads_only_the_past() -> None:
-    first, second = {**told(), "way": 0.5, "way_after": 0.2}, {**told(), "way": 0.1, "way_after": 0.0}
+    first, second = (
+        {**told(), "allowed_distance": 0.5, "allowed_distance_after": 0.2},
+        {**told(), "allowed_distance": 0.1, "allowed_distance_after": 0.0},
+    )
     for name, regressor in REGRESSORS.items():
         assert math.isfinite(regressor.value([first, second])), name
     assert REGRESSORS["metres per push left"].value([first, second]) == pytest.approx(0.1 / 58)
