@@ -2,7 +2,7 @@
 
 Seconds from the start of the process to the first plan, which imports, a world and a depth image precede, and of that
 plan alone; processor time up to then, which is what an idle machine would take; then seconds of a whole episode by
-`python -m cavin_pyro.plan`. Planned directly, compiled with an empty cache of
+`python -m cavin_pyro.plan`. Planned eagerly, compiled with an empty cache of
 native code ("cold": minutes, `--no-cold` leaves it out if the given `--cache` is filled), and compiled in later
 processes ("warm"). Options of `plan` come last, by default `task=clearing`. Set OMP_NUM_THREADS for the number of
 threads.

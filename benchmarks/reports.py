@@ -126,7 +126,7 @@ FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("of these h's subgoal centres", "elbo/difference/h: subgoal centres", error),
     ("of these f's next states", "elbo/difference/f: next states", error),
     ("nats from guide to posterior, at least", "guide_error/joint/rises", shortfall),
-    ("of these ten samples win back", "guide_error/joint/rises/10", error),
+    ("recovered by 10 importance samples, nats", "guide_error/joint/rises/10", error),
     ("nats from guide to posterior: c for p(c given s, s')", f"guide_error/{C}_given_subgoal/rises", shortfall),
     ("nats from guide to posterior: z for p(z given s, a, c)", f"guide_error/{Z}/rises", shortfall),
     ("windows whose k-hat is above its limit", "guide_error", tails),

@@ -9,7 +9,7 @@ from cavin_pyro.config.application import command
 
 @command("demo")
 def main(config: DictConfig) -> None:
-    """Plan and execute an episode of each task with the shipped checkpoint, from segmented depth images."""
+    """Plan and execute an episode of each task with `checkpoint=contact`, from segmented depth images."""
     import copy
 
     from cavin_pyro.config.device import choose_device

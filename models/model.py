@@ -60,7 +60,7 @@ class Model(Program):
         scales: Scales | None = None,
         dynamics: PushOutcome | None = None,
     ) -> None:
-        """T; numbers per object of a point-cloud feature; width of all layers; objects in a scene of the training, at
+        """T; feature dimension per object; width of all layers; objects in a scene of the training, at
         most; how many others enter a relation; the likelihoods' scales; f.
 
         A scene may have more than `maximum_objects`. `neighbours`: the nearest others that enter each sum over other

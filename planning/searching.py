@@ -34,7 +34,7 @@ from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
 from planning.rollouts.segment import Objective, SearchSpace
 
 ROBUSTNESS = PerturbedRollouts()
-AUTO = "auto"  # value of `compile`: native code that is kept already, and makes none
+AUTO = "auto"  # value of `compile`: native code where it is cached; never compiles
 
 
 class SearchingPlanner:

@@ -34,7 +34,7 @@ def check_native_code(config: DictConfig, device: torch.device) -> None:
 def argument_compile(config: DictConfig, device: torch.device, model: Model, path: Path) -> bool | str:
     """The planner's argument `compile`: the option's value, but false where `auto` could give other plans or nothing.
 
-    Native code in float32 makes the plans that are made directly, up to rounding, if both sample noise rather than
+    Native code in float32 makes the plans that eager functions make, up to rounding, if both sample noise rather than
     codes, as they do for warm starts. With products of bfloat16 it rounds at other places.
 
     Args:

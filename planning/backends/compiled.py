@@ -1,4 +1,4 @@
-"""Planning's inner functions as native code, which is made once and kept on disk."""
+"""Planning's inner functions as native code, which is compiled once and cached on disk."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COUNTS = {"num_logical_cores", "num_physical_cores", "num_sockets"}
 class Compiled:
     """Native code, which torch's AOTInductor writes when a function is first called with its constants and shapes.
 
-    This takes one to three minutes for the four or five functions of a planner. The code is kept in a folder of the
+    This takes one to three minutes for the four or five functions of a planner. The code is cached in a folder of the
     user's (`planning.backends.cache`), where later processes find it by a key of everything that determines it. Weights
     become part of the code: they must not change afterwards.
 
@@ -53,7 +53,7 @@ class Compiled:
 
     Without such a folder, or for constants without a fingerprint, it compiles for this process only.
 
-    With `make=False` it only loads what the folder has, and runs all other functions directly.
+    With `make=False` it never compiles: it loads what the cache has, and runs all other functions eagerly.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Compiled:
         *,
         make: bool = True,
     ) -> None:
-        """`folder`: keeps the code; None is `planning.backends.cache.default_folder`. `tracing`: opened while functions
+        """`folder`: of the cache; None is `planning.backends.cache.default_folder`. `tracing`: opened while functions
         become graphs, to tell models that shapes must not depend on values (`planning.protocol.FixedShapes`).
 
         Raises ValueError where code is to be made and there is no C++ compiler.
@@ -74,7 +74,7 @@ class Compiled:
                 f"compile=true needs a C++ compiler, and '{compiler}' was not found: install it, name another one in "
                 "the environment variable CXX, or choose compile=false"
             )
-        self._versions: dict[Any, _Native | None] = {}  # None runs directly
+        self._versions: dict[Any, _Native | None] = {}  # None runs eagerly
         self._compiling = Lock()
         self._tracing = tracing
         self._makes = make
@@ -143,15 +143,15 @@ class Compiled:
         if library is None and not self._makes:
             if not self._refused:
                 _say(
-                    "planning directly what has no native code yet: planner.compile=true makes it, once, in one to "
-                    "three minutes; planner.compile=false looks for none"
+                    "planning eagerly, since no native code is cached for this configuration: planner.compile=true "
+                    "compiles it, once, in one to three minutes; planner.compile=false looks for none"
                 )
             return None
         if library is None:
             _announce("is made for this process only")
             code = torch._inductor.compile(_graph(function, tensors), [*tensors], options=COMPILING)
             return _Native(lambda given: code(*given), function.form())
-        function(*tensors)  # once directly, which tells the form of its result
+        function(*tensors)  # once eagerly, which tells the form of its result
         return _Native(library, function.form())
 
     def _library(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> Library | None:
@@ -170,13 +170,13 @@ class Compiled:
             with self._cache.building(key) as folder:
                 if (library := self._cache.load(key)) is not None:  # another process has made it in the meantime
                     return library
-                _announce(f"is kept in {self._cache.folder}")
+                _announce(f"is cached in {self._cache.folder}")
                 code = _shared_library(_graph(function, tensors), tensors, folder)
                 if PROXY_EXECUTOR in code:
                     return None
                 self._cache.store(key, code)
         except OSError as error:
-            _say(f"native code cannot be kept: {error}")
+            _say(f"native code cannot be cached: {error}")
         return self._cache.load(key)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-NO_NATIVE_CODE = "planning directly what has no native code yet: planner.compile=true makes it"
+NO_NATIVE_CODE = "planning eagerly, since no native code is cached for this configuration"
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": PATHS}
 
 

@@ -140,7 +140,7 @@ class EpisodeConfig(DeviceOptions):
 class PlanConfig(EpisodeConfig):
     """Options of `python -m cavin_pyro.plan`."""
 
-    defaults: list[Any] = field(default_factory=lambda: [*DEFAULTS, "kept_native_code"])
+    defaults: list[Any] = field(default_factory=lambda: [*DEFAULTS, "cached_native_code"])
     output: str | None = option(None, "folder for the results; by default a separate one in runs/plan", group="run")
     video: bool = option(True, "write a video of the episode", group="run")
     save_goal: str | None = option(

@@ -63,7 +63,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("cache")
     (one, told), (other, also_told) = map(finish, [start(folder), start(folder)])
     assert sorted((told + also_told).splitlines()) == [
-        f"compiling for the first plan, which takes one to three minutes; native code is kept in {folder / 'native'}"
+        f"compiling for the first plan, which takes one to three minutes; native code is cached in {folder / 'native'}"
     ]
     results = {text.rpartition(" ")[0] for text in (one, other)}  # without whether the compiler was loaded
     assert len(results) == 1
