@@ -36,9 +36,9 @@ def main(config: DictConfig) -> None:
     )
     check_policy(collection)
     with output_folder(config.output) as folder:
-        if config.repair:
-            print(f"{repair(collection, folder)} files collected again")
         launcher = Launcher(config.launcher, config.workers, config.address)
+        if config.repair:
+            print(f"{repair(collection, folder, workers=launcher)} files collected again")
         metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)
         summary = summarize_data(folder)
         write_json(folder / "statistics.json", summary.figures())

@@ -6,7 +6,6 @@ def main(config: DictConfig) -> None: ...
 
 from __future__ import annotations
 
-import argparse
 import errno
 import importlib.util
 import os
@@ -27,13 +26,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from cavin_pyro import __version__
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import Parser, UserError
 from cavin_pyro.config.imports import without_collections
 
 PACKAGES = ("models", "guides", "planning", "envs")
 REPEATING_SECONDS = 1.0
 RESENDING_SECONDS = 0.05  # for a signal whose exception was dropped
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
+_DISK_ERRORS |= {errno.ENAMETOOLONG}
 
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "calculation overflowed")  # torch's words
 
@@ -68,7 +68,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
 
 
 def guarded(action: Callable[[], T]) -> T:
-    """Run; bad input, a full or forbidden disk and an interruption end in one line instead of a traceback.
+    """Run; bad input, a disk that refuses and an interruption end in one line instead of a traceback.
 
     SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number.
     """
@@ -80,11 +80,7 @@ def guarded(action: Callable[[], T]) -> T:
     except OSError as error:
         if error.errno not in _DISK_ERRORS:
             raise
-        where = f" at {error.filename}" if error.filename else ""
-        _stop(
-            f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR",
-            2,
-        )
+        _stop(_refusal(error), 2)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not any(said in str(error) for said in _NO_MEMORY):
             raise
@@ -93,6 +89,17 @@ def guarded(action: Callable[[], T]) -> T:
         number = error.number if isinstance(error, Interruption) else signal.SIGINT
         by = "" if number == signal.SIGINT else f" by {number.name}"
         _stop(f"interrupted{by}; rerun the same command to resume, if it can", 128 + number)
+
+
+def _refusal(error: OSError) -> str:
+    """What the file system refused, for an error line; only a file that is there can have been an input."""
+    name = error.filename
+    if name and error.errno == errno.ENAMETOOLONG:
+        return f"{name} is no file: {error.strerror}"
+    if name and error.errno in (errno.EACCES, errno.EPERM) and os.path.exists(name) and not os.access(name, os.R_OK):
+        return f"{name} cannot be read: {error.strerror}; change its permissions, or give another"
+    where = f" at {name}" if name else ""
+    return f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR"
 
 
 class Interruption(KeyboardInterrupt):
@@ -182,18 +189,13 @@ class CommandLine:
     config_dir: str | None
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}: --help lists the options")
-
-
 def read_command_line(arguments: Sequence[str]) -> CommandLine:
     """Separate overrides from flags.
 
     Raises:
         UserError: an unknown flag, or one without its value.
     """
-    parser = _Parser(add_help=False, allow_abbrev=False)
+    parser = Parser(hint="--help lists the options", add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
     parser.add_argument("--help", "-h", action="store_true")
     parser.add_argument("--version", action="store_true")

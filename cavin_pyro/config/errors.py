@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 
 class UserError(Exception):
@@ -53,8 +53,15 @@ def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """For commands with words instead of options, such as `assets ycb --to DIR`: a wrong one is a `UserError`."""
+    """Reads a command line, of which a wrong one is a `UserError`.
+
+    hint: what to do about a wrong one; by default the usage, as of `assets ycb --to DIR`.
+    """
+
+    def __init__(self, *arguments: Any, hint: str | None = None, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._hint = hint
 
     def error(self, message: str) -> NoReturn:
         """Called by argparse for a wrong command line."""
-        raise UserError(f"{message}; {' '.join(self.format_usage().split())}")
+        raise UserError(f"{message}; {self._hint or ' '.join(self.format_usage().split())}")

@@ -200,3 +200,10 @@ def configured(schema: type[T], values: Mapping[str, Any], section: str) -> T:
     found: Any = OmegaConf.to_object(merged)
     check_options(schema, vars(found), f"{section}.")
     return found
+
+
+def flat_options(value: Any, prefix: str = "") -> dict[str, Any]:
+    """A configuration's values by the dotted names of options: {"a": {"b": 1}} -> {"a.b": 1}."""
+    if not isinstance(value, dict):
+        return {prefix.rstrip("."): value}
+    return {key: one for name, entry in value.items() for key, one in flat_options(entry, f"{prefix}{name}.").items()}

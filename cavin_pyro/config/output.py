@@ -10,6 +10,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import preset_defaults, search_path
+from cavin_pyro.config.options import flat_options
 
 # The folder of a run without overrides, and the options that never decide which folder it is: runs that differ only in
 # these are the same run.
@@ -60,15 +61,8 @@ def run_name(name: str, config: DictConfig, hydra_config: Any) -> str:
         for group, choice in choices.items()
         if choice != usual.get(group) and not group.startswith("hydra") and f"{{{group}}}" not in pattern
     ]
-    before, now = (_flat(OmegaConf.to_container(one, resolve=True)) for one in (defaults, config))
+    before, now = (flat_options(OmegaConf.to_container(one, resolve=True)) for one in (defaults, config))
     told = {key for key in now if f"{{{key}}}" in pattern} | {"output", *irrelevant}
     other = {key: now.get(key) for key in {*now, *before} - told if now.get(key, {}) != before.get(key, {})}
     digest = hashlib.sha256(json.dumps(other, sort_keys=True).encode()).hexdigest()[:6]
     return "".join([named, *(f"-{choice}" for choice in changed), f"-{digest}" if other else ""])
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Values by dotted names: {"a": {"b": 1}} -> {"a.b": 1}."""
-    if not isinstance(value, dict):
-        return {prefix.rstrip("."): value}
-    return {key: one for name, entry in value.items() for key, one in _flat(entry, f"{prefix}{name}.").items()}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.data.collection import CollectionConfig
 from guides.guide import Guide
 from models.model import Model
@@ -25,6 +26,7 @@ class CheckContext:
         seed: of everything random. world: in which new episodes are made.
         training_episodes, validation_episodes: number of each window's episode `[B]`, by which intervals are clustered;
             without it every window stands for an episode of its own.
+        selection: the options by which training selected windows, such as how far an object had to move.
     """
 
     model: Model
@@ -36,6 +38,7 @@ class CheckContext:
     world: CollectionConfig = field(default_factory=CollectionConfig)
     training_episodes: Tensor | None = None
     validation_episodes: Tensor | None = None
+    selection: WindowConfig = field(default_factory=WindowConfig)
 
     @property
     def codes(self) -> tuple[str, ...]:

@@ -4,8 +4,8 @@ Keys of report.json:
 
     about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`,
                 `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
-                `same` and `verdict`: whether training saw it), `windows` (how many were read), `run` (of this check),
-                `graph` of the program (see `cavin_pyro.criticism.graph`)
+                `same` and `verdict`: whether training saw it), `windows` (how many were read), `windows_digest` (hash
+                of which ones), `run` (of this check), `graph` of the program (see `cavin_pyro.criticism.graph`)
     sections    by name: `title`, `verdict` (`level`: good, inspect, bad, too few or none; `rule`; `advice`, what to do
                 next), `findings` (sentences) and `values`, which the section's function documents
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,20 @@ from cavin_pyro import __version__
 from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptions
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path, write_metadata, write_shard
+from cavin_pyro.data.dataset import (
+    Arrays,
+    EmptyDatasetError,
+    read_metadata,
+    read_shard,
+    shard_path,
+    write_metadata,
+    write_shard,
+)
+from cavin_pyro.data.features import delete_features
 from cavin_pyro.data.model_policy import ModelPushingPolicy, PushingPolicy, load_pusher
 from cavin_pyro.launching.launcher import Launcher, as_launcher
 from cavin_pyro.storage.checkpoint import find_checkpoint
-from cavin_pyro.storage.digests import file_digest
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.files import atomic_write, file_digest
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
@@ -79,11 +88,13 @@ def collect(
         WorkerError: a worker was killed or stopped.
     """
     metadata = _begin(config, folder)
+    if metadata["shards"] == 0:
+        delete_features(folder)  # of an earlier dataset in this folder
     _cut_times(folder, metadata["shards"])
     with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
         if metadata["transitions"] >= transitions:
             return metadata
-        with closing(_shards(config, first=metadata["shards"], workers=workers)) as shards:
+        with closing(_shards(config, itertools.count(metadata["shards"]), workers=workers)) as shards:
             for arrays, seconds in shards:
                 write_shard(shard_path(folder, metadata["shards"]), arrays)
                 made = int(arrays["length"].sum())
@@ -226,9 +237,9 @@ def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str,
 
 
 def _shards(
-    config: CollectionConfig, *, first: int, workers: int | Launcher
+    config: CollectionConfig, numbers: Iterable[int], *, workers: int | Launcher
 ) -> Generator[tuple[Arrays, dict[str, float]], None, None]:
-    numbers = (first + number for number in range(10**9))
+    """The shards with these numbers, in their order."""
     launcher = as_launcher(workers)
     if launcher.here:
         yield from (_collect_shard((config, number)) for number in numbers)
@@ -254,15 +265,13 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
         return metadata
     try:
         metadata = read_metadata(folder)
-    except UserError as error:
-        if "is empty" not in str(error):
-            raise
+    except EmptyDatasetError:
         (folder / "metadata.json").unlink()
         return _begin(config, folder)
     if "sources" in metadata:
         raise UserError(f"{folder} holds a merged dataset, which cannot grow: choose another output=DIR")
     stored = usual | metadata["configuration"]  # older versions lack later options
-    stored["ranges"] = usual["ranges"] | stored["ranges"]
+    stored["ranges"] = usual["ranges"] | (stored["ranges"] or {})
     for name, value in wanted.items():
         if stored[name] != value:
             raise UserError(
@@ -312,15 +321,23 @@ def _plain(value: Any) -> Any:
     return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def repair(config: CollectionConfig, folder: Path) -> int:
-    """Collect again the shards that are missing or corrupt; returns how many there were."""
-    metadata, repaired = _begin(config, folder), 0
+def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 1) -> int:
+    """Collect again the shards that are missing or corrupt; returns how many there were.
+
+    Args:
+        workers: as of `collect`.
+
+    Raises:
+        UserError: as of `collect`.
+    """
+    metadata, damaged = _begin(config, folder), []
     for number in range(metadata["shards"]):
         try:
             read_shard(shard_path(folder, number), metadata=metadata)
         except UserError as error:
             print(f"collecting again: {error}", flush=True)
-            arrays, _ = _collect_shard((replace(config), number))
+            damaged.append(number)
+    with closing(_shards(config, damaged, workers=workers)) as shards:
+        for number, (arrays, _) in zip(damaged, shards, strict=True):
             write_shard(shard_path(folder, number), arrays)
-            repaired += 1
-    return repaired
+    return len(damaged)

@@ -48,7 +48,9 @@ ARRAYS = {
     "friction": Declared("float32", OBJECTS, 0.0),
     "episode": Declared("int64", ("E",), 0, float("inf")),
     "features": Declared("float32", (*STATES, "F"), -2.0, 2.0),
+    "shard_digest": Declared("uint8", (32,), 0, 255),
 }
+BESIDE = ("shard_digest", "features")  # of files beside the shards, see `cavin_pyro.data.features`
 
 
 def check_file(file: h5py.File, configuration: Mapping[str, Any]) -> None:

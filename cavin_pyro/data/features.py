@@ -1,25 +1,42 @@
-"""Geometric features of a dataset, computed once and stored beside it."""
+"""Geometric features of a dataset, computed once and stored beside it: `features-FINGERPRINT/episodes-NNNNN.h5`.
+
+A file of features tells the SHA-256 of the shard that they were made from (`shard_digest`), so those of another shard
+under the same name are never used: they are made again. Files of older versions lack it. Their features are compared
+with those of a few clouds of the shard; if these fit, the file is kept and told its shard.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import inspect
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import check_distinct, read_metadata, read_shard, shard_path, write_shard
+from cavin_pyro.data.dataset import (
+    Arrays,
+    check_distinct,
+    read_metadata,
+    read_shard,
+    shard_digest,
+    shard_path,
+    write_shard,
+)
+from cavin_pyro.data.declaration import BESIDE
 from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.storage.files import clear_abandoned
 from models.networks.geometry import Geometry
 
 BATCH = 4096  # clouds
+COMPARED, TOLERANCE = 64, 1e-3  # clouds whose features must be those that an older version stored, up to rounding
 ABANDONED_SECONDS = 3600.0  # a file that another training writes there is younger
 
 
@@ -43,7 +60,7 @@ def cloud_features(geometry: Geometry, clouds: NDArray[np.floating]) -> NDArray[
 
 
 def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: str) -> NDArray[np.float32]:
-    """Features [E, S+1, M, 64] of one shard, read from beside it if the same `geometry` made them before.
+    """Features [E, S+1, M, 64] of one shard, read from beside it if the same `geometry` made them of it before.
 
     Args:
         fingerprint: see `geometry_fingerprint`.
@@ -51,22 +68,54 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
     Raises:
         UserError: the shard is corrupt.
     """
-    path = folder / f"features-{fingerprint}" / f"episodes-{number:05d}.h5"
-    metadata = read_metadata(folder)
-    if path.exists():
-        try:
-            return read_shard(path, ("features",), metadata=metadata)["features"]
-        except UserError:
-            path.unlink()  # a derived file: damaged ones are made again
-    shard = read_shard(shard_path(folder, number), ("clouds",), metadata=metadata)
-    features = cloud_features(geometry, shard["clouds"])
-    try:
+    shard, metadata = shard_path(folder, number), read_metadata(folder)
+    path = folder / f"features-{fingerprint}" / shard.name
+    digest = np.frombuffer(bytes.fromhex(shard_digest(shard)), np.uint8)
+    stored = _read_stored(path, metadata)
+    if "shard_digest" in stored and np.array_equal(stored["shard_digest"], digest):
+        return stored["features"]
+    clouds = read_shard(shard, ("clouds",), metadata=metadata)["clouds"]
+    if "features" in stored and "shard_digest" not in stored and _fit(stored["features"], clouds, geometry):
+        features = stored["features"]
+    else:
+        features = cloud_features(geometry, clouds)
+    with suppress(OSError):  # a dataset on a read-only or full disk can still be trained on
         path.parent.mkdir(exist_ok=True)
         clear_abandoned(path.parent, older_than=ABANDONED_SECONDS)
-        write_shard(path, {"features": features})
-    except OSError:
-        pass  # a dataset on a read-only or full disk can still be trained on
+        write_shard(path, {"features": features, "shard_digest": digest})
     return features
+
+
+def delete_features(folder: Path) -> None:
+    """Delete the features in a folder in which a dataset begins: an earlier one, which is gone, left them."""
+    for beside in folder.glob("features-*"):
+        if re.fullmatch(r"features-[0-9a-f]{12}", beside.name) and beside.is_dir():
+            with suppress(OSError):  # what cannot be deleted is not used: it tells of another shard
+                clear_abandoned(beside)
+                for path in beside.glob("episodes-*.h5"):
+                    path.unlink(missing_ok=True)
+                beside.rmdir()
+
+
+def _read_stored(path: Path, metadata: Mapping[str, Any]) -> Arrays:
+    """What a file of features holds: nothing if there is none or if it is damaged, which is no loss."""
+    for names in (BESIDE, ("features",)):  # the second as older versions wrote it
+        with suppress(UserError):
+            return read_shard(path, names, metadata=metadata)
+    return {}
+
+
+def _fit(features: NDArray[np.float32], clouds: NDArray[np.floating], geometry: Geometry) -> bool:
+    """Whether features [..., F] are those of clouds [..., P, 3], as far as some clouds throughout them tell."""
+    if features.shape[:-1] != clouds.shape[:-2]:
+        return False
+    flat = clouds.reshape(-1, *clouds.shape[-2:])
+    real = np.flatnonzero(flat.any(axis=(1, 2)))  # padding is the same in all shards
+    chosen = real[np.linspace(0, len(real) - 1, min(COMPARED, len(real))).astype(int)]
+    if not len(chosen):
+        return True
+    again, held = cloud_features(geometry, flat[chosen]), features.reshape(-1, features.shape[-1])[chosen]
+    return again.shape == held.shape and np.allclose(again, held, rtol=0.0, atol=TOLERANCE)
 
 
 def sample_clouds(
@@ -103,5 +152,10 @@ def sample_clouds(
     clouds = np.concatenate(sampled)[:count]
     if len(clouds) < min(count, 2):  # one to learn from and one to validate with
         where = " and ".join(map(str, folders))
-        raise UserError(f"{where}: {len(clouds)} clouds without {', '.join(held_out_objects)}: hold out fewer objects")
+        if held_out_objects:
+            without = ", ".join(held_out_objects)
+            raise UserError(f"{where}: {len(clouds)} clouds without {without}: hold out fewer objects")
+        raise UserError(
+            f"{where}: {len(clouds)} clouds of visible objects, too few to learn from: collect more transitions"
+        )
     return clouds

@@ -142,12 +142,21 @@ def load_windows(
         progress_bar("reading", total=total, unit="file") as bar,
     ):
         for folder, held_out in zip(folders, held_out_of, strict=True):
-            needed, known = (*NEEDED, *held_out.required_arrays), EpisodeNumbers(folder)
+            needed, known, whole = (*NEEDED, *held_out.required_arrays), EpisodeNumbers(folder), 0
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
+                try:
+                    arrays["features"] = shard_features(folder, number, geometry, fingerprint)
+                except UserError as error:  # its clouds, which are read here alone, are corrupt
+                    if not skip_corrupt:
+                        raise
+                    print(f"left out: {error}", flush=True)
+                    continue
                 known.add(number, arrays["episode"])
-                arrays["features"] = shard_features(folder, number, geometry, fingerprint)
                 found.add(held_out.filter_episodes(arrays))
+                whole += 1
                 bar.update()
+            if whole == 0:
+                raise UserError(f"dataset {folder} has no usable shard: collect it again")
         return found.table()
 
 

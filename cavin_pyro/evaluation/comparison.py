@@ -80,7 +80,7 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
         raise UserError(
             f"compare={folder} cannot be read ({error.strerror}): give the folder of an evaluation"
         ) from error
-    except (ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
     rows = [with_current_names(row) for row in rows] if isinstance(rows, list) else rows
     if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import http.client
 import time
 import urllib.error
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.files import PARTIAL, read_json, write_json
+from cavin_pyro.storage.files import PARTIAL, file_digest, read_json, write_json
 from cavin_pyro.storage.progress import progress_bar
 
 TIMEOUT = 30.0  # seconds without an answer
@@ -40,7 +39,7 @@ class Checksums:
         Raises:
             UserError: it differs; the file is deleted.
         """
-        known, found = self._known.get(file.name), _sha256(file)
+        known, found = self._known.get(file.name), file_digest(file)
         if known not in (None, found):
             file.unlink()
             raise UserError(
@@ -51,7 +50,7 @@ class Checksums:
     def record(self, file: Path) -> None:
         """Record the checksum of a file that has passed every check."""
         if file.name not in self._known:
-            self._known[file.name] = _sha256(file)
+            self._known[file.name] = file_digest(file)
             write_json(self.path, self._known)
 
 
@@ -89,7 +88,7 @@ def _receive(url: str, partial: Path) -> None:
             begun = begun if answer.status == http.HTTPStatus.PARTIAL_CONTENT else 0
             _store(url, answer, partial, begun)
     except urllib.error.HTTPError as error:
-        if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+        if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and partial.exists():
             partial.unlink()  # it has all that there is, or of something else: begin anew
             _receive(url, partial)
             return
@@ -133,11 +132,3 @@ def _check_size(url: str, size: int) -> None:
 
 def _unreachable(url: str) -> str:
     return f"{urllib.parse.urlsplit(url).netloc} cannot be reached"
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        digest = hashlib.sha256()
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()

@@ -45,7 +45,8 @@ def in_workers(
         ordered: in the order of the jobs; no worker then runs ahead by more than two jobs for each worker.
 
     Raises:
-        WorkerError: a worker was killed or stopped. What other workers had finished by then comes first.
+        WorkerError: a worker was killed or stopped, or what it answers cannot be unpickled. What other workers had
+            finished by then comes first.
         Exception: whatever the function raises, with the worker's traceback as its cause.
     """
     ahead = 2 * workers if ordered else None
@@ -118,10 +119,13 @@ class _Workers:
             except (EOFError, OSError):
                 dead.append(pipe)
                 continue
+            except Exception as error:  # unpickling calls the constructors of others' classes
+                who = f"worker process {self._process(pipe).pid}"
+                raise WorkerError(f"{who} answered what cannot be read here ({_line(error)})") from error
             number = self._jobs.pop(pipe)
             if not succeeded:
-                error, text = result
-                raise error from RuntimeError(f"in a worker process:\n{text}")
+                line, text = result
+                raise self._receive_error(pipe, line) from RuntimeError(f"in a worker process:\n{text}")
             yield number, result
         if dead:
             raise WorkerError(self._epitaph(dead[0]))
@@ -154,8 +158,20 @@ class _Workers:
             raise WorkerError(f"worker process {pid} was stopped by a signal and does not go on; {_ADVICE}")
         self._suspects = {pid for pid in stopped if pid is not None}
 
+    def _process(self, pipe: Connection) -> BaseProcess:
+        return next(worker.process for worker in self._workers if worker.pipe is pipe)
+
+    def _receive_error(self, pipe: Connection, line: str) -> BaseException:
+        """A worker's error, or in its place one that tells it in a `line`."""
+        try:
+            error: BaseException = pipe.recv()
+        except Exception as why:
+            who = f"worker process {self._process(pipe).pid}"
+            return WorkerError(f"{who} failed: {line} (an error that cannot be read here: {_line(why)})")
+        return error
+
     def _epitaph(self, pipe: Connection) -> str:
-        process = next(worker.process for worker in self._workers if worker.pipe is pipe)
+        process = self._process(pipe)
         process.join(ENDING_SECONDS)
         code = process.exitcode
         if code in GROUP_SIGNALS:
@@ -204,15 +220,32 @@ def _work(pipe: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
-            answer: tuple[bool, Any] = True, function(job)
+            result = function(job)
         except Exception as error:
-            answer = False, (error, traceback.format_exc())
+            _send_error(pipe, error)
+            continue
         try:
-            pipe.send(answer)
+            pipe.send((True, result))
         except OSError:
             return
-        except Exception as error:  # an error of the user's own that cannot be sent
-            pipe.send((False, (RuntimeError(f"{type(error).__name__}: {error}"), traceback.format_exc())))
+        except Exception as error:  # a result that cannot be sent
+            _send_error(pipe, RuntimeError(_line(error)))
+
+
+def _send_error(pipe: Connection, error: Exception) -> None:
+    """Send an error that is being handled: its line and traceback first, since the error itself may not arrive."""
+    with suppress(OSError):  # the parent has closed the pipe: the worker ends when it receives
+        pipe.send((False, (_line(error), traceback.format_exc())))
+        try:
+            pipe.send(error)
+        except OSError:
+            raise
+        except Exception:  # of the user's own, and cannot be sent
+            pipe.send(RuntimeError(_line(error)))
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _end_with_parent() -> None:

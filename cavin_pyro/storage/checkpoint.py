@@ -6,6 +6,7 @@ classes that it names must be defined in this program's packages, or in a module
 
 from __future__ import annotations
 
+import errno
 import json
 import sysconfig
 from collections.abc import Mapping, Sequence
@@ -131,10 +132,10 @@ def find_checkpoint(name: str) -> Path:
         UserError: there is neither; the names are listed.
     """
     path = Path(name)
-    if path.suffix or len(path.parts) > 1 or path.is_file():
+    if path.suffix or len(path.parts) > 1 or _is_file(path):
         return path
     shipped = shipped_folder() / f"{name}.safetensors"
-    if not shipped.is_file():
+    if not _is_file(shipped):
         names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.safetensors")))
         if name in CHECKPOINTS:
             model, guide = CHECKPOINTS[name]
@@ -167,15 +168,31 @@ def verify_checkpoint(path: Path) -> None:
     _read(path)
 
 
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that is too long for one is none.
+
+    Raises:
+        UserError: it may not be looked for.
+    """
+    try:
+        return path.is_file()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return False
+        raise UserError(f"checkpoint {path} cannot be read: {error.strerror}") from error
+
+
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     """The header and the checked weights of a checkpoint."""
-    if not path.is_file():
+    if not _is_file(path):
         raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
-    check_manifest(path, shipped_folder())
     try:
+        check_manifest(path, shipped_folder())
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except PermissionError as error:
+        raise UserError(f"checkpoint {path} cannot be read: {error.strerror or error}") from error
     except (SafetensorError, OSError) as error:
         raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
     if header.get("format") != FORMAT:

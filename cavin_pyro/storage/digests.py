@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.files import atomic_write, file_digest
 
 MANIFEST = "sha256sums.txt"  # in the folder of the shipped checkpoints, as `sha256sum --check` reads it
 
@@ -22,11 +22,6 @@ def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
         digest.update(f"{name} {value.dtype} {list(value.shape)} ".encode())
         digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
-
-
-def file_digest(path: Path) -> str:
-    """The SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_manifest(folder: Path) -> dict[str, str]:

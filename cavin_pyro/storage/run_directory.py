@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import flat_options
 from cavin_pyro.storage.files import CONFIG_NAME, atomic_write, holds_no_result, read_json, write_json
 from envs.tasks import TASKS, GeneratedLayouts
 
@@ -43,7 +44,7 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         return  # there is nothing to protect
     try:
         earlier = stored_options(path)
-    except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
+    except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
     now = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
@@ -57,7 +58,7 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
 def stored_options(path: Path) -> dict[str, Any]:
     """The options in a `config.yaml` by their dotted names, with what older versions left out."""
     options = flat_options(OmegaConf.to_container(OmegaConf.load(path)))
-    if options.get("task") in TASKS:
+    if isinstance(name := options.get("task"), str) and name in TASKS:
         task = TASKS[options.pop("task")]
         options["task._target_"] = f"{task.__module__}.{task.__qualname__}"
     if "reward" in options:
@@ -115,13 +116,3 @@ def _of_transitions(data: Any) -> str:
         return " and ".join(f"{dataset['transitions']} transitions ({dataset['fingerprint']})" for dataset in data)
     except (TypeError, KeyError):
         return "something unreadable"
-
-
-def flat_options(value: Any, prefix: str = "") -> dict[str, Any]:
-    """A configuration's values by option: {"a": {"b": 1}} -> {"a.b": 1}."""
-    if not isinstance(value, dict):
-        return {prefix.rstrip("."): value}
-    flat: dict[str, Any] = {}
-    for name, entry in value.items():
-        flat |= flat_options(entry, f"{prefix}{name}.")
-    return flat

@@ -7,10 +7,10 @@ has written to FILE.
 
 from __future__ import annotations
 
-import json
 import re
+import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,12 @@ import torch
 from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.checkpoint import Checkpoint, checkpoint_bytes, load_checkpoint, shipped_folder
-from cavin_pyro.storage.digests import file_digest, update_manifest
-from cavin_pyro.storage.files import atomic_write, read_json, write_json
+from cavin_pyro.storage.digests import update_manifest
+from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write_json
 
 BASELINES = ("sectar", "cvae_mpc", "mpc")
 PARTS = ("model", "guide", "pointnet", "geometry")
-PRETRAINED = re.compile(r"output=(\S+)/pretrain\b")
+PRETRAINED = re.compile(r"output=(.+)/pretrain\b")
 PUBLIC_HOME = "runs/reproduce"  # in shipped files, instead of the folder of the machine that trained
 
 
@@ -132,12 +132,40 @@ def _public(record: Mapping[str, Any], checkpoint: Checkpoint) -> dict[str, Any]
 
     The PointNet may be another reproduction's, with `output=HOME/pretrain`.
     """
-    text = json.dumps(record)
-    homes = {Path(checkpoint.config["output"]).parent.parent, *map(Path, PRETRAINED.findall(text))}
-    for home in homes:
-        text = text.replace(f"{home}/", f"{PUBLIC_HOME}/") if home.name else text
-    found: dict[str, Any] = json.loads(text)
-    return found
+    arguments = [argument for text in _strings(record) for argument in _arguments(text)]
+    pretrained = {found[1] for found in map(PRETRAINED.search, arguments) if found}
+    homes = {Path(checkpoint.config["output"]).parent.parent, *map(Path, pretrained)}
+    private = sorted((f"{home}/" for home in homes if home.name), key=len, reverse=True)  # one may lie in another
+    quoted = [home.replace("'", "'\"'\"'") for home in private]  # as commands have it, whose arguments are quoted
+
+    def public(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {public(name): public(entry) for name, entry in value.items()}
+        if isinstance(value, list | tuple):
+            return [public(entry) for entry in value]
+        for home in (*private, *quoted) if isinstance(value, str) else ():
+            value = value.replace(home, f"{PUBLIC_HOME}/")
+        return value
+
+    return {name: public(entry) for name, entry in record.items()}
+
+
+def _strings(value: Any) -> Iterator[str]:
+    """All texts within a record."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from (text for entry in value.values() for text in _strings(entry))
+    elif isinstance(value, list | tuple):
+        yield from (text for entry in value for text in _strings(entry))
+
+
+def _arguments(command: str) -> list[str]:
+    """The arguments of a command as a shell takes them, or the words of a text that is none."""
+    try:
+        return shlex.split(command)
+    except ValueError:
+        return command.split()
 
 
 def _write(path: Path, checkpoint: Checkpoint) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from typing import Any
 
@@ -79,16 +79,13 @@ def elbo_terms(model: Program, guide: Program, window: Window, *, encoded: Tenso
     return {name: term.sum() for name, term in window_terms(model, guide, window, encoded=encoded).items()}
 
 
-@torch.no_grad()
-def mean_terms(model: Program, guide: Program, window: Window, *, encoded: Tensor | None = None) -> dict[str, float]:
-    """The same, each divided by the number of windows or transitions that count for it."""
-    sequences = max(1, int(window.sequence_mask.sum()))
-    transitions = max(1, int(window.transition_mask.sum()))
-    means = {}
-    for name, value in elbo_terms(model, guide, window, encoded=encoded).items():
-        latent = name.startswith("kl_") or name.partition("_")[2] in EFFECT_AND_MOTION_SITES
-        means[name] = value.item() / (sequences if latent else transitions)
-    return means
+def term_counts(names: Iterable[str], window: Window) -> dict[str, int]:
+    """How many windows of a batch [B], or how many of their transitions, count for each of these terms."""
+    sequences, transitions = int(window.sequence_mask.sum()), int(window.transition_mask.sum())
+    return {
+        name: sequences if name.startswith("kl_") or name.partition("_")[2] in EFFECT_AND_MOTION_SITES else transitions
+        for name in names
+    }
 
 
 def first_nonfinite(terms: dict[str, Tensor]) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import pyro
 import torch
@@ -11,6 +11,14 @@ from pyro.infer import TraceGraph_ELBO
 from torch import Tensor, nn
 
 from models.state import Window
+
+
+@runtime_checkable
+class DifferentiableBound(Protocol):
+    """A bound whose loss is a tensor with gradients, as most of Pyro's are; their base class does not declare it."""
+
+    def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Any:
+        """The loss, a scalar, summed over the windows that the programs are called with."""
 
 
 def loss_with_gradients(

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from cavin_pyro.training.consistency import consistency_loss
 from cavin_pyro.training.counterfactual import counterfactual_loss
-from cavin_pyro.training.gradients import loss_with_gradients
+from cavin_pyro.training.gradients import DifferentiableBound, loss_with_gradients
 from cavin_pyro.training.rollout import rollout_loss
 from guides.guide import Guide
 from models.model import Model
@@ -41,10 +41,14 @@ class Objective:
 
     With weights of one, no warm-up and no other term, the defaults, this is the bound and nothing else.
 
+    The validation loss, by which training chooses the best checkpoint, is another: -ELBO from one sample of the codes,
+    whatever the bound and its weights, and the rollout and consistency terms. It has no counterfactual term.
+
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: per code, positive. warm_up_steps: over which the weights of the
             codes' log densities (of prior and guide) grow from nearly zero.
-        counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`.
+        counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`. The validation
+            loss, which chooses the best checkpoint, does not contain it.
         rollout_weight: of the error where f reads its own predictions, see `cavin_pyro.training.rollout`. The bound
             contains each push already, so a weight trades its density for the accuracy of rollouts.
         consistency_weight: of how likely sampled motions reach the subgoal, see `cavin_pyro.training.consistency`; it
@@ -85,7 +89,7 @@ class Objective:
             raise ValueError(f"objective.{wrong[0]} must be 0 or more, not {numbers[wrong[0]]:g}")
         if counterfactual_weight and elbo.num_particles != 1:
             raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
-        if counterfactual_weight and not hasattr(elbo, "differentiable_loss"):
+        if counterfactual_weight and not isinstance(elbo, DifferentiableBound):
             raise ValueError(f"the counterfactual term takes objective.elbo Trace_ELBO, not {type(elbo).__name__}")
         if isinstance(elbo, COMPILED):
             raise ValueError(
@@ -173,8 +177,8 @@ class BoundObjective(nn.Module):
         guide: Any = self.guide
         if any(weight != 1.0 for weight in weights.values()):
             model, guide = _Weighted(weights)(model), _Weighted(weights)(guide)
-        bound: Any = objective.elbo
-        if not hasattr(bound, "differentiable_loss"):
+        bound = objective.elbo
+        if not isinstance(bound, DifferentiableBound):
             return loss_with_gradients(bound, model, guide, window, list(self.parameters()))
         encoded = self.model.encode(window)  # once for both programs
         if not objective.counterfactual_weight:

@@ -18,7 +18,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
-from models.networks.pointnet import PointNetAutoencoder
+from models.networks.pointnet import CLOUD_UNIT, PointNetAutoencoder, chamfer_distance
 
 CPU = torch.device("cpu")
 
@@ -58,19 +58,17 @@ def pretrain(
     validation, training = torch.from_numpy(clouds[:held_out]).to(device), clouds[held_out:]
     autoencoder.to(device)
     optimizer = torch.optim.Adam(autoencoder.parameters(), lr=learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     rows: list[tuple[int, float, float]] = []
-    begun, running = 0, 0.0
+    begun, running, rate = 0, 0.0, learning_rate
     digest = hashlib.sha256(clouds.tobytes()).hexdigest()
     if resume is not None and resume.exists():
-        with resuming(resume) as (tensors, state):
+        with resuming(resume) as (tensors, state, whole):
             if state["clouds"] != digest:
                 raise ValueError("it was made with other clouds")
             autoencoder.load_state_dict(section(tensors, "autoencoder"))
-            load_optimizer(optimizer, tensors)
+            load_optimizer(optimizer, tensors, complete=not whole)
             generator.bit_generator.state = state["generator"]
-            schedule.last_epoch, schedule._last_lr = state["step"], [state["rate"]]
-            optimizer.param_groups[0]["lr"] = float(state["rate"])
+            rate = float(state["rate"])
             rows = [(int(step), float(loss), float(validated)) for step, loss, validated in state["rows"]]
             begun = rows[-1][0]
             if begun != state["step"]:
@@ -78,13 +76,14 @@ def pretrain(
     with progress_bar("pretraining", total=steps, initial=begun) as bar:
         for step in range(begun + 1, steps + 1):
             batch = send(_augment(training[generator.integers(len(training), size=batch_size)], generator), device)
+            optimizer.param_groups[0]["lr"] = rate
             optimizer.zero_grad(set_to_none=True)
             loss = autoencoder.loss(batch)
             if not math.isfinite(loss.item()):
                 raise UserError(f"pretraining stopped at step {step}: the loss is not finite: lower learning_rate")
             loss.backward()
             optimizer.step()
-            schedule.step()
+            rate = _rate_after(step, rate, steps)
             running += loss.item()
             bar.update()
             if step % max(1, steps // 50) == 0 or step == steps:
@@ -94,13 +93,22 @@ def pretrain(
                 bar.set_postfix(validation=f"{rows[-1][2]:.4f}")
                 if resume is not None:
                     weights = {f"autoencoder.{name}": value for name, value in autoencoder.state_dict().items()}
-                    state = {"clouds": digest, "step": step, "rate": schedule.get_last_lr()[0], "rows": rows}
+                    state = {"clouds": digest, "step": step, "rate": rate, "rows": rows}
                     state["generator"] = generator.bit_generator.state
                     write_resume(resume, {**weights, **optimizer_tensors(optimizer)}, state)
     autoencoder.cpu()
     with atomic_write(log) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("step", "training", "validation"), *rows])
     return {"validation": rows[-1][2], "mean_shape": _mean_shape_loss(training, validation)}
+
+
+def _rate_after(step: int, rate: float, steps: int) -> float:
+    """The learning rate after so many steps, from that of the last of them: a cosine that ends at 0.
+
+    It is multiplied up from step to step, as torch's `CosineAnnealingLR` does it. The formula of the whole curve
+    differs in the last bits, with which pretrained weights would no longer be reproduced exactly.
+    """
+    return (1 + math.cos(math.pi * step / steps)) / (1 + math.cos(math.pi * (step - 1) / steps)) * rate
 
 
 def _augment(clouds: NDArray[np.float32], generator: np.random.Generator) -> Tensor:
@@ -117,8 +125,6 @@ def _loss(autoencoder: PointNetAutoencoder, clouds: Tensor) -> float:
 
 @torch.inference_mode()
 def _mean_shape_loss(training: NDArray[np.float32], validation: Tensor) -> float:
-    from models.networks.pointnet import CLOUD_UNIT, chamfer_distance
-
     pooled = torch.from_numpy(training[:: max(1, len(training) // 64), 0][:64].copy()).to(validation.device)
     distance = chamfer_distance(pooled.expand(len(validation), -1, -1) / CLOUD_UNIT, validation / CLOUD_UNIT)
     return float(distance.mean())

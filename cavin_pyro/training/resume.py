@@ -17,7 +17,9 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import atomic_write
 
-ENTRIES = {"adam": ("exp_avg", "exp_avg_sq"), "muon": ("momentum_buffer",)}  # as large as a weight, of each optimizer
+# What each optimizer keeps for a weight: moments as large as the weight, and Adam the number of its steps.
+ENTRIES = {"adam": ("exp_avg", "exp_avg_sq", "step"), "muon": ("momentum_buffer",)}
+NUMBERS = ("step",)  # of these, those that are single numbers
 
 
 def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
@@ -29,8 +31,10 @@ def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, 
 
 
 @contextmanager
-def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
-    """Yield the tensors and the state of a resume file; whatever does not fit within the block is a damaged file.
+def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any], bool]]:
+    """Yield the tensors and the state of a resume file, and whether its digest shows that it is whole.
+
+    Whatever does not fit within the block is a damaged file.
 
     Raises:
         UserError: the file is truncated, changed or of another training.
@@ -39,11 +43,12 @@ def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if header.get("sha256") not in (None, tensors_digest(tensors)):  # older versions wrote none
+        digest = header.get("sha256")  # older versions wrote none
+        if digest not in (None, tensors_digest(tensors)):
             raise ValueError("its tensors are not those that were saved")
         if odd := [name for name, value in tensors.items() if not bool(value.isfinite().all())]:
             raise ValueError(f"{odd[0]} is not finite")
-        yield tensors, json.loads(header.get("state", "{}"))
+        yield tensors, json.loads(header.get("state", "{}")), digest is not None
     except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         line = " ".join(str(error).split())[:200]
         raise UserError(
@@ -60,23 +65,34 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, part: str = "adam") -> d
     }
 
 
-def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], part: str = "adam") -> None:
-    """Take over the moments that `optimizer_tensors` gave.
+def load_optimizer(
+    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], part: str = "adam", *, complete: bool = True
+) -> None:
+    """Take over the moments that `optimizer_tensors` gave after at least one step.
+
+    Args:
+        complete: every weight must have moments. False for a file that is known to be whole: weights that no gradient
+            has reached (of a network that the model does not use) have none, and their moments begin at zero.
 
     Raises:
-        ValueError: some lack, or are of another shape.
+        ValueError: some are missing, of another shape, or of no weight; the line names one.
     """
     moments: dict[int, dict[str, Tensor]] = {}
     for name, value in section(tensors, part).items():
         place, _, entry = name.partition(".")
         moments.setdefault(int(place), {})[entry] = value
     parameters: list[nn.Parameter] = [one for group in optimizer.param_groups for one in group["params"]]
+    if unknown := [number for number in moments if not 0 <= number < len(parameters)]:
+        raise ValueError(f"{part}.{unknown[0]} belongs to no weight")
     for number, parameter in enumerate(parameters):
+        if number not in moments and not complete:
+            continue
         for entry in ENTRIES[part]:
-            if number in moments and moments[number][entry].shape != parameter.shape:
+            moment = moments.get(number, {}).get(entry)
+            if moment is None:
+                raise ValueError(f"{part}.{number}.{entry} is missing")
+            if moment.shape != (() if entry in NUMBERS else parameter.shape):
                 raise ValueError(f"{part}.{number}.{entry} is of another shape")
-    if max(moments, default=0) >= len(parameters):
-        raise ValueError(f"{part}.{max(moments)} belongs to no weight")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 

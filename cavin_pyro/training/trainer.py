@@ -25,14 +25,16 @@ from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import ScalarLog, progress_bar
-from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, mean_terms
+from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, term_counts
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.optimizers import make_optimizers
-from cavin_pyro.training.randomness import forked, random_state, set_random_state, stored_states, take_over
+from cavin_pyro.training.randomness import forked, stored_states, take_over
 from cavin_pyro.training.reflection import reflect
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
 from guides.guide import Guide
 from models.model import Model
+
+VALIDATION_BATCH = 1024  # windows at once, which bounds the memory
 
 Row = dict[str, float]
 
@@ -163,28 +165,32 @@ class Trainer:
         self._keep()
 
     def _validation_terms(self) -> tuple[Row, float]:
-        """Mean terms over the validation windows, and the loss per window, always with the same noise."""
+        """Terms of the validation windows, and the loss per window, always with the same noise.
+
+        Each term of the bound is a mean over all windows or transitions that count for it, each other term over all
+        windows.
+        """
         numbers, device = self.windows.validation, self.windows.device
         chosen = numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))]
-        totals: Row = {}
-        parts: Sequence[Tensor] = chosen[: self.config.validation_windows].split(1024)
+        sums: Row = {}
+        counts: dict[str, int] = {}
+        parts: Sequence[Tensor] = chosen[: self.config.validation_windows].split(VALIDATION_BATCH)
         loss, parts = 0.0, parts if self._fixed is None else [self._fixed]
         with forked(device), torch.no_grad(), pyro.validation_enabled(False):
             torch.manual_seed(0)
             for part in parts:
                 window = self.windows.batch(part)
-                encoded, state = self.model.encode(window), random_state(device)
-                for name, value in mean_terms(self.model, self.guide, window, encoded=encoded).items():
-                    totals[name] = totals.get(name, 0.0) + value * len(part)
-                set_random_state(state, device)
-                loss += sum(
-                    value.item() for value in elbo_terms(self.model, self.guide, window, encoded=encoded).values()
-                )
-                for name, term in self._objective.terms_of_model(self.model, window).items():
-                    loss += term.item()
-                    totals[name] = totals.get(name, 0.0) + term.item()
-        count = sum(len(part) for part in parts)
-        return {name: value / count for name, value in totals.items()}, loss / count
+                encoded = self.model.encode(window)
+                bound = elbo_terms(self.model, self.guide, window, encoded=encoded)
+                others = self._objective.terms_of_model(self.model, window)
+                terms = {name: term.item() for name, term in {**bound, **others}.items()}
+                loss += sum(terms[name] for name in bound)
+                for name in others:
+                    loss += terms[name]
+                for name, count in {**term_counts(bound, window), **dict.fromkeys(others, len(part))}.items():
+                    sums[name], counts[name] = sums.get(name, 0.0) + terms[name], counts.get(name, 0) + count
+        means = {name: value / max(1, counts[name]) for name, value in sums.items()}
+        return means, loss / sum(len(part) for part in parts)
 
     def _write_rows(self) -> None:
         with atomic_write(self.folder / "metrics.csv") as temporary, open(temporary, "w", newline="") as file:
@@ -212,11 +218,11 @@ class Trainer:
         """
         if self.step or not self.resume_path.exists():
             return
-        with resuming(self.resume_path) as (tensors, _):
+        with resuming(self.resume_path) as (tensors, _, whole):
             for part, module in (("model", self.model), ("guide", self.guide)):
                 module.load_state_dict(section(tensors, part))
             for part, optimizer in self._optimizers.items():
-                load_optimizer(optimizer, tensors, part)
+                load_optimizer(optimizer, tensors, part, complete=not whole)
             step, best, best_step, stale = tensors["counters"].tolist()
             if not (math.isfinite(best) and 1 <= best_step <= step and stale >= 0):
                 raise ValueError("its counters contradict one another")

@@ -43,7 +43,7 @@ class EpisodeVideo(EpisodeCallback):
 
     def __init__(self, path: Path, task: Task, fps: int = FRAMES_PER_SECOND, *, env: PushingEnv | None = None) -> None:
         self.path, self.task, self.fps = path, task, fps
-        self.camera = Camera()
+        self.camera = Camera() if env is None else env.scene.camera.resized(*VIDEO_SIZE)
         self._env = env
         self._record: PlanRecord | None = None
         self._reached: list[NDArray[np.float32]] = []
@@ -109,9 +109,7 @@ class EpisodeVideo(EpisodeCallback):
     def _photograph(self) -> NDArray[np.uint8]:
         if self._env is None:
             raise RuntimeError("this video was made without an environment: use add")
-        scene = self._env.scene
-        self.camera = scene.camera.resized(*VIDEO_SIZE)
-        return scene.photograph(self.camera)
+        return self._env.scene.photograph(self.camera)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

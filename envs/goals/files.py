@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ MILLIMETRE = 1e-3  # metres per unit of a PNG, as depth cameras write them
 LARGEST = 32 * 2**20  # bytes of a file
 WIDEST = 2048  # pixels of an image
 FARTHEST = 100.0  # metres; larger numbers are not metres
+# What numpy raises for a damaged array.
+_UNREADABLE = (ValueError, TypeError, SyntaxError, TokenError, EOFError, OSError, ArithmeticError, MemoryError)
 
 
 def read_goal(path: str | Path) -> Goal:
@@ -118,9 +121,11 @@ def _depth_of_png(content: bytes) -> NDArray[np.float64]:
 
 
 def _array(content: bytes) -> NDArray[np.float64]:
+    if not content.startswith(np.lib.format.MAGIC_PREFIX):  # numpy would try others
+        raise ValueError("is damaged or no .npy of numbers (it begins as something else, such as a pickle)")
     try:
         found = np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError, MemoryError) as error:
+    except _UNREADABLE as error:
         raise ValueError(f"is damaged or no .npy of numbers ({error})") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu" or found.ndim != 2:
         raise ValueError("must hold one array [height, width] of numbers, in metres")

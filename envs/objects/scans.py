@@ -12,15 +12,18 @@ inertias (kilograms times square metres):
 from __future__ import annotations
 
 import json
-import math
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from envs.assets import assets_folder
 from envs.objects.asset import ObjectAsset, plain_name
 
 SCANS = "ycb"  # the folder's name within the assets, and the prefix of its objects' names
+FARTHEST = 100.0  # metres; larger numbers are not metres
 _GET = f"get them with: python -m cavin_pyro.assets {SCANS} --to DIR"
 
 
@@ -35,7 +38,7 @@ class ScannedObjects:
     def __init__(self, assets: str | Path | None) -> None:
         if assets is None:
             raise ValueError(f"these objects are scans, in no folder that was named: give env.assets=DIR; {_GET}")
-        folder = Path(assets) / SCANS
+        folder = assets_folder(assets) / SCANS
         self._assets = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in _manifest(folder).items()}
         self.names = tuple(self._assets)
 
@@ -52,7 +55,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"no objects in {folder}: meta.json cannot be read ({error.strerror}); {get}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{folder / 'meta.json'} is damaged: it is not JSON; {get}") from error
     if not isinstance(manifest, dict) or not manifest:
         raise ValueError(f"{folder / 'meta.json'} is damaged: it names no object; {get}")
@@ -60,7 +63,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
         file
         for name in manifest
         for file in (f"{name}.obj", f"{name}_vhacd.obj")
-        if plain_name(name) != name or not (folder / file).is_file()
+        if plain_name(name) != name or not os.path.isfile(folder / file)
     ]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
@@ -69,14 +72,15 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def _scan(folder: Path, name: str, values: Any) -> ObjectAsset:
-    numbers = [values.get("mass"), *values.get("inertia_diag", [])] if isinstance(values, dict) else []
-    if len(numbers) != 4 or not all(isinstance(value, int | float) and 0 < value < math.inf for value in numbers):
+    told = values if isinstance(values, dict) else {}
+    mass, inertia = told.get("mass"), told.get("inertia_diag")
+    if not (isinstance(inertia, list) and len(inertia) == 3 and all(map(_is_positive, [mass, *inertia]))):
         raise ValueError(f"{folder / 'meta.json'} is damaged: {name} needs a mass and an inertia_diag of three numbers")
     collision = folder / f"{name}_vhacd.obj"
-    x, y, z = map(float, numbers[1:])
+    x, y, z = map(float, inertia)
     return ObjectAsset(
         name=f"{SCANS}/{name}",
-        mass=float(numbers[0]),
+        mass=float(told["mass"]),
         radius=_radius(collision),
         collision=collision.absolute(),
         visual=(folder / f"{name}.obj").absolute(),
@@ -84,11 +88,22 @@ def _scan(folder: Path, name: str, values: Any) -> ObjectAsset:
     )
 
 
+def _is_positive(value: Any) -> bool:
+    """Whether a value in JSON is a positive number, which true is not, nor one that no float holds."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= sys.float_info.max
+
+
 def _radius(mesh: Path) -> float:
-    """Metres from the origin to the farthest vertex."""
+    """Metres from the origin to the farthest vertex.
+
+    Raises:
+        ValueError: there is no vertex, or one is no point within `FARTHEST`.
+    """
     try:
         lines = mesh.read_text(encoding="utf-8").splitlines()
         vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float64)
+        if not (np.abs(vertices) < FARTHEST).all():  # also if one is no number
+            raise ValueError("no metres")
         return float(np.linalg.norm(vertices.reshape(-1, 3), axis=1).max())
     except (OSError, ValueError) as error:
-        raise ValueError(f"{mesh} is damaged: its vertices cannot be read") from error
+        raise ValueError(f"{mesh} is damaged: its vertices cannot be read as points in metres") from error

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from xml.etree import ElementTree
 
+from envs.assets import assets_folder
 from envs.physics import ArmDescription
 
 URDF = Path("sawyer", "sawyer_stick.urdf")  # inside the folder of assets
@@ -33,14 +35,14 @@ def sawyer(assets: str | Path | None = None) -> ArmDescription:
     """
     if assets is None:
         raise ValueError(f"robot sawyer needs a folder with {URDF.as_posix()}, and none was given: {HOW_TO_GET}")
-    urdf = Path(assets).expanduser() / URDF
-    if not urdf.is_file():
+    urdf = assets_folder(assets) / URDF
+    if not os.path.isfile(urdf):  # unlike Path.is_file, it takes any name
         raise ValueError(f"robot sawyer needs {URDF.as_posix()}, which is not in {assets}: {HOW_TO_GET}")
     try:
         meshes = [mesh.attrib["filename"] for mesh in ElementTree.parse(urdf).getroot().iter("mesh")]
     except (ElementTree.ParseError, KeyError) as error:
         raise ValueError(f"{urdf} is no URDF ({error}): {HOW_TO_GET}") from error
-    missing = [name for name in meshes if not (urdf.parent / name).is_file()]
+    missing = [name for name in meshes if not os.path.isfile(urdf.parent / name)]
     if missing:
         raise ValueError(f"robot sawyer needs {missing[0]}, which is not in {urdf.parent}: {HOW_TO_GET}")
     joints = [f"right_j{number}" for number in range(7)]

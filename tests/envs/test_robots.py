@@ -286,6 +286,16 @@ def test_missing_files_are_named_in_one_line(tmp_path: Path) -> None:
         assert "python -m cavin_pyro.assets sawyer --to DIR" in str(caught.value)
 
 
+def test_the_folder_may_be_named_from_the_users_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "mine" / "sawyer").mkdir(parents=True)
+    (tmp_path / "mine" / "sawyer" / "sawyer_stick.urdf").write_text("<robot/>")
+    assert sawyer("~/mine").urdf == tmp_path / "mine" / "sawyer" / "sawyer_stick.urdf"
+    for absent in ("~nobody-of-this-name/mine", "a" * 300):
+        with pytest.raises(ValueError, match=rf"needs sawyer/sawyer_stick.urdf, which is not in {absent}"):
+            sawyer(absent)
+
+
 def test_a_urdf_of_something_else_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "sawyer").mkdir()
     (tmp_path / "sawyer" / "sawyer_stick.urdf").write_text('<robot name="r"><link name="base"/></robot>')

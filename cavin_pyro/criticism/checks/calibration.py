@@ -51,18 +51,18 @@ TOLERANCE = 0.05  # a 90 % interval that holds this much more or less is called 
 Scores = Mapping[str, Mapping[str, Mapping[str, dict[str, Any]]]]  # predictor, group, coordinate: as of `scores`
 
 EXPLANATION = """
-{samples} samples of each prediction of {windows} held-out windows, in all of which some object moved more than 0.1 m
-and none more than 0.5 m. f predicts the state after each push from the state before it; h the state after the
-segment, with codes from the prior (its mixture p(s' | s) over p(c | s), what can be known before acting) or from the
-guide, which knows the result. Objects that really moved more than 1 cm are kept apart from those that lay still: most
-lie still, and would dominate the numbers. The PIT is where the truth lies among the samples: uniform if the
-prediction is right, heaped at the ends if it is too sure, in the middle if it is too wide. Only where all objects
-count together should it be uniform for a right model, since the groups are chosen by the truth. The stated scale is
-the spread of the samples, over the RMS error of their mean it is 1 where the likelihood is right, for features and
-pushes as well as centres: the scales are the weights of the loss, so that one four times too wide weighs its term
-sixteen times too little; for f, and for h with codes from the guide, the RMS error is the scale that would be right.
-CRPS and energy score weigh error and spread in one number, lower is better; the energy score takes all centres of a
-window together.
+{samples} samples of each prediction of {windows} held-out windows, in all of which some object moved more than
+{minimum:g} m and none more than {maximum:g} m, as in training. f predicts the state after each push from the state
+before it; h the state after the segment, with codes from the prior (its mixture p(s' | s) over p(c | s), what can be
+known before acting) or from the guide, which knows the result. Objects that really moved more than 1 cm are kept apart
+from those that lay still: most lie still, and would dominate the numbers. The PIT is where the truth lies among the
+samples: uniform if the prediction is right, heaped at the ends if it is too sure, in the middle if it is too wide.
+Only where all objects count together should it be uniform for a right model, since the groups are chosen by the truth.
+The stated scale is the spread of the samples, over the RMS error of their mean it is 1 where the likelihood is right,
+for features and pushes as well as centres: the scales are the weights of the loss, so that one four times too wide
+weighs its term sixteen times too little; for f, and for h with codes from the guide, the RMS error is the scale that
+would be right. CRPS and energy score weigh error and spread in one number, lower is better; the energy score takes all
+centres of a window together.
 """
 
 
@@ -89,10 +89,11 @@ def assess_calibration(context: CheckContext, *, windows: int = 400, samples: in
             energy[name] = energy_score(prediction.centers, real, counted).mean().item()
             energy["nothing_moves"] = energy_score(window.first.centers[None], real, counted).mean().item()
     numbers = {"windows": len(window.actions), "samples": samples}
+    moves = {"minimum": context.selection.minimum_move, "maximum": context.selection.maximum_move}
     return Section(
         name="calibration",
         title="Are the predictions of f and h as sure as they should be?",
-        explanation=" ".join(EXPLANATION.format(**numbers).split()),
+        explanation=" ".join(EXPLANATION.format(**numbers, **moves).split()),
         findings=[*_scale_findings(scales), *_findings(results, energy)],
         values={
             **numbers,

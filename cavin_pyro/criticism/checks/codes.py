@@ -22,6 +22,7 @@ from cavin_pyro.criticism.statistics.inference.information import (
     prior_varies,
 )
 from cavin_pyro.criticism.statistics.inference.simulation import simulate, simulated_information
+from cavin_pyro.criticism.statistics.intervals import normal_interval
 from cavin_pyro.criticism.statistics.prior.classifier import divergence_bound, held_out_logits
 from cavin_pyro.criticism.statistics.prior.features import describe
 from cavin_pyro.criticism.statistics.windows import seeded
@@ -32,7 +33,6 @@ from models.state import Window
 
 NAME, TITLE = "codes", "What the codes carry"
 USED, UNUSED = 0.5, 0.1  # nats: a code that surely costs more is used, one that surely costs less is not
-NORMAL = 1.96  # standard errors to either side, of a 95 % interval
 GIVEN = {"effect_code": "I(c; s' | s)", "motion_code": "I(z; a | s, c)"}
 
 EXPLANATION = """
@@ -144,8 +144,7 @@ def _simulated(context: CheckContext, few: Window, episodes: Tensor, particles: 
 def _verdict(values: dict[str, Any], codes: tuple[str, ...], episodes: Tensor) -> Verdict:
     levels = []
     for name in codes:
-        rate = values[name]["kl"]
-        low, high = (rate["mean"] + sign * NORMAL * rate["standard_error"] for sign in (-1, 1))
+        low, high = normal_interval(values[name]["kl"])
         levels.append(GOOD if low >= USED and values[name]["active"] else BAD if high <= UNUSED else INSPECT)
     rule = (
         f"Good if every code has an active dimension and costs more than {USED:g} nats at the lower end of its 95 % "

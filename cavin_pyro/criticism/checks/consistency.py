@@ -26,6 +26,24 @@ from cavin_pyro.criticism.verdicts.verdict import FEW, GOOD, NONE, Verdict, grad
 from cavin_pyro.storage.progress import progress_bar
 from models.model import Model
 
+TITLE = "Subgoal consistency in physics"
+NEAR, FAR = 0.35, 0.65  # of the way to the subgoal
+FEWEST = 50  # scenes
+_EXPLANATION = f"""\
+The paper asserts that the pushes generated for a state s and an effect code c lead to the subgoal h(s, c). This check \
+executes them: it samples and observes scenes as data collection does, obtains codes, executes the pushes g(s, c, z) \
+in PyBullet, and compares the observed state afterwards with the subgoal and with f's prediction.
+
+An effect code is sampled from the prior, or chosen as by a planner: of many samples, the one whose subgoal brings the \
+first object closest to a point {100 * GOAL_DISTANCE:g} cm away in a random direction. A motion code is sampled from \
+the prior, or it is the closest of many: the one that leads f closest to the subgoal, which is what the planner \
+executes. Models of one code have no motion to choose; for models without h, f chooses the code and only f is compared \
+with physics.
+
+Distances are means over the objects that the subgoal moves by more than {100 * MOVING:g} cm, between centres. The \
+relative distance is 0 where the subgoal is reached and 1 where nothing moves; its 95 % interval comes from resampling \
+scenes. An unsafe push would bring the tool down on an object and is not executed; an ineffective one moves nothing."""
+
 
 def check_objects(model: Model, objects: int) -> None:
     """Make sure that a model knows so many objects.
@@ -96,25 +114,6 @@ def _verdict(numbers: Mapping[str, Any], name: str, scenes: int) -> Verdict:
 def name_of(selection: tuple[str, str]) -> str:
     """How the codes were obtained, for people."""
     return f"effect {selection[0]}" + ("" if selection[1] == GIVEN else f", motion {selection[1]}")
-
-
-TITLE = "Subgoal consistency in physics"
-NEAR, FAR = 0.35, 0.65  # of the way to the subgoal
-FEWEST = 50  # scenes
-_EXPLANATION = f"""\
-The paper asserts that the pushes generated for a state s and an effect code c lead to the subgoal h(s, c). This check \
-executes them: it samples and observes scenes as data collection does, obtains codes, executes the pushes g(s, c, z) \
-in PyBullet, and compares the observed state afterwards with the subgoal and with f's prediction.
-
-An effect code is sampled from the prior, or chosen as by a planner: of many samples, the one whose subgoal brings the \
-first object closest to a point {100 * GOAL_DISTANCE:g} cm away in a random direction. A motion code is sampled from \
-the prior, or it is the closest of many: the one that leads f closest to the subgoal, which is what the planner \
-executes. Models of one code have no motion to choose; for models without h, f chooses the code and only f is compared \
-with physics.
-
-Distances are means over the objects that the subgoal moves by more than {100 * MOVING:g} cm, between centres. The \
-relative distance is 0 where the subgoal is reached and 1 where nothing moves; its 95 % interval comes from resampling \
-scenes. An unsafe push would bring the tool down on an object and is not executed; an ineffective one moves nothing."""
 
 
 def _findings(selection: tuple[str, str], numbers: Mapping[str, Any]) -> list[str]:

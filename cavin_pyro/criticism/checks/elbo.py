@@ -9,12 +9,12 @@ from cavin_pyro.criticism.figures.elbo import draw_differences
 from cavin_pyro.criticism.section import Picture, Section, Table
 from cavin_pyro.criticism.statistics.clusters import mean_with_error
 from cavin_pyro.criticism.statistics.elbo import TOTAL, adjusted_difference, scene_sizes, terms_by_window
+from cavin_pyro.criticism.statistics.intervals import normal_interval
 from cavin_pyro.criticism.statistics.windows import seeded
 from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, grade
 
 NAME, TITLE = "elbo", "The ELBO, term by term"
 SMALL_LOSS, LARGE_LOSS = 5.0, 20.0  # nats per window
-NORMAL = 1.96  # standard errors to either side, of a 95 % interval
 
 
 def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4, batch: int = 256) -> Section:
@@ -76,13 +76,12 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
 
 
 def _verdict(total: dict[str, float], windows: int, episodes: torch.Tensor) -> Verdict:
-    ends = [total["mean"] + sign * NORMAL * total["standard_error"] for sign in (-1, 1)]
     rule = (
         "How much worse -ELBO is on held-out windows: good if its 95 % interval over episodes ends below "
         f"{SMALL_LOSS:g} nats, bad if it begins above {LARGE_LOSS:g}."
     )
     advice = "The model overfits: collect more data, or stop training earlier."
-    level = grade(*ends, good=SMALL_LOSS, bad=LARGE_LOSS)
+    level = grade(*normal_interval(total), good=SMALL_LOSS, bad=LARGE_LOSS)
     return conclude(level, rule, advice, windows=windows, episodes=episodes)
 
 

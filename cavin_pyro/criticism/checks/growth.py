@@ -26,13 +26,13 @@ CURVES = {
 }
 
 EXPLANATION = """
-{episodes} new episodes of up to {pushes} pushes by the data's heuristic policy, from seeds that no dataset
-has. From the first state alone, f predicts all that follows from the pushes that were made, and h from a code
-per segment that the guide infers from the real states before and after that segment; both go on from their
-own predictions, without noise. The error is the distance of predicted from real centres, averaged over an
-episode's objects. The segments are whatever the policy does: {informative:.0f} % of them are of the kind that
-h was trained on (some object moves more than 0.1 m). An episode ends when an object falls, so later segments
-are of fewer episodes.
+{episodes} new episodes of up to {pushes} pushes by the data's heuristic policy, from seeds that no dataset has. From
+the first state alone, f predicts all that follows from the pushes that were made, and h from a code per segment that
+the guide infers from the real states before and after that segment; both go on from their own predictions, without
+noise. The error is the distance of predicted from real centres, averaged over an episode's objects. The segments are
+whatever the policy does: {informative:.0f} % of them are of the kind that h was trained on (some object moves more
+than {minimum:g} m and none more than {maximum:g} m). An episode ends when an object falls, so later segments are of
+fewer episodes.
 """
 
 
@@ -48,13 +48,21 @@ def assess_growth(context: CheckContext, *, episodes: int = 40, segments: int = 
         errors = errors_over_segments(context.model, context.guide, recording, T)
     results = {name: [summary(column) for column in values.unbind(-1)] for name, values in errors.items()}
     moved = farthest_moves(recording, T)
-    informative = (moved[moved.isfinite()] > 0.1).float().mean().item()
+    minimum, maximum = context.selection.minimum_move, context.selection.maximum_move
+    made = moved[moved.isfinite()]
+    informative = ((made > minimum) & (made < maximum)).float().mean().item()
     relative = _relative(errors, context.seed)
     return Section(
         name="growth",
         title="How does the error grow with the horizon?",
         explanation=" ".join(
-            EXPLANATION.format(episodes=episodes, pushes=segments * T, informative=100 * informative).split()
+            EXPLANATION.format(
+                episodes=episodes,
+                pushes=segments * T,
+                informative=100 * informative,
+                minimum=minimum,
+                maximum=maximum,
+            ).split()
         ),
         findings=list(_findings(results)),
         values={

@@ -34,16 +34,16 @@ Results = dict[str, dict[str, dict[str, dict[str, float]]]]
 
 EXPLANATION = """
 {replicates} replicated datasets were generated, each with one sample for each of {windows} held-out windows, from
-their first states alone. The windows are a selection, as in training: some object moved more than 0.1 m, none
-more than 0.5 m, and every push was safe. The codes come from the prior, which is what planning samples (prior
+their first states alone. The windows are a selection, as in training: some object moved more than {minimum:g} m, none
+more than {maximum:g} m, and every push was safe. The codes come from the prior, which is what planning samples (prior
 predictive), or from the guide, which infers from the whole window (posterior predictive). "As sampled" is the program
-with the noise of its likelihoods; "means" and "as planned" have codes sampled and all else at the likelihoods'
-means, as a planner has it. The tail probability is the share of replicated datasets whose mean (or 95 % quantile)
-is at least the observed one (ties count half): near 0 the model makes too little of it, near 1 too much. Only
-centres are predicted, so objects stand for discs: two are taken to be inside each other where their centres are
-nearer than {pair:.1f} cm in the plane, nearer than in all but 1 % of the training windows; a push touches where
-its path comes within {tool:.1f} cm of a centre, a distance that as many pushes in training windows come within as
-move an object by 1 cm. The object that a push moves is the one that goes farthest, if that is more than 3 cm.
+with the noise of its likelihoods; "means" and "as planned" have codes sampled and all else at the likelihoods' means,
+as a planner has it. The tail probability is the share of replicated datasets whose mean (or 95 % quantile) is at least
+the observed one (ties count half): near 0 the model makes too little of it, near 1 too much. Only centres are
+predicted, so objects stand for discs: two are taken to be inside each other where their centres are nearer than
+{pair:.1f} cm in the plane, nearer than in all but 1 % of the training windows; a push touches where its path comes
+within {tool:.1f} cm of a centre, a distance that as many pushes in training windows come within as move an object by 1
+cm. The object that a push moves is the one that goes farthest, if that is more than 3 cm.
 """
 
 
@@ -81,11 +81,12 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         for statistic in statistics
     }
     numbers = {"replicates": replicates, "windows": len(window.actions)}
+    moves = {"minimum": context.selection.minimum_move, "maximum": context.selection.maximum_move}
     distances = {"pair": 100 * nearness.pair, "tool": 100 * nearness.tool}
     return Section(
         name="predictive",
         title="Do generated pushes and their outcomes look real?",
-        explanation=" ".join(EXPLANATION.format(**numbers, **distances).split()),
+        explanation=" ".join(EXPLANATION.format(**numbers, **distances, **moves).split()),
         findings=list(_findings(statistics, results)),
         values={
             **numbers,

@@ -12,6 +12,7 @@ from cavin_pyro.criticism.figures.prior import draw_prior
 from cavin_pyro.criticism.section import Picture, Section, Table
 from cavin_pyro.criticism.statistics.clusters import Interval
 from cavin_pyro.criticism.statistics.codes import Codes, sample_guide, sample_prior, without_codes
+from cavin_pyro.criticism.statistics.intervals import as_percent
 from cavin_pyro.criticism.statistics.prior.classifier import ClassifierTest, classifier_test
 from cavin_pyro.criticism.statistics.prior.decoded import LABELS, Difference, compare_decoded, decoded_statistics
 from cavin_pyro.criticism.statistics.prior.expected_coverage import (
@@ -101,11 +102,19 @@ def assess_prior(context: CheckContext, *, windows: int = 1000, samples: int = 5
 
 
 def _elsewhere(episodes: Tensor) -> Tensor:
-    """For each window, a window of another episode if there is one: `[B]`."""
+    """For each window, a window of another episode, or itself if there is no other: `[B]`.
+
+    Every window stands in for one other, unless one episode has more than half of the windows: then those of the rest
+    stand in for its windows in turn.
+    """
     order = episodes.argsort(stable=True)
-    _, counts = torch.unique(episodes, return_counts=True)
+    numbers, counts = torch.unique(episodes, return_counts=True)
     other = torch.empty_like(order)
     other[order] = order.roll(int(counts.max()))
+    largest = episodes == numbers[counts.argmax()]
+    rest = (~largest).nonzero().squeeze(-1)
+    if 0 < len(rest) < len(episodes) - len(rest):
+        other[largest] = rest[torch.arange(len(episodes) - len(rest)) % len(rest)]
     return other
 
 
@@ -215,10 +224,10 @@ def _findings(
 ) -> list[str]:
     sentences = []
     if tests:
-        share, control = tests["prior"].told_apart, tests["shuffled"].told_apart
+        told, shuffled = (as_percent(tests[source].told_apart._asdict()) for source in ("prior", "shuffled"))
         sentences.append(
-            f"A classifier of (s, c, z) tells {_percent(share)} of held-out pairs apart (50 % by chance; p = "
-            f"{tests['prior'].p_value:.3g}); {_percent(control)} when the prior's codes are those of another scene."
+            f"A classifier of (s, c, z) tells {told} of held-out pairs apart (50 % by chance; p = "
+            f"{tests['prior'].p_value:.3g}); {shuffled} when the prior's codes are those of another scene."
         )
     for space, found in covered.items():
         gap, control = found["prior"][0], found["shuffled"][0]
@@ -238,10 +247,6 @@ def _findings(
             f"{factor * difference['high']:+.1f}), {one['standardised']['prior']:+.2f} standard deviations."
         )
     return sentences
-
-
-def _percent(interval: Interval) -> str:
-    return f"{interval.mean:.0%} ({interval.low:.0%} to {interval.high:.0%})"
 
 
 def _tables(

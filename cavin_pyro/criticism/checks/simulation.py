@@ -20,6 +20,7 @@ from cavin_pyro.criticism.statistics.inference.simulation import (
     held_jointly,
     simulate,
 )
+from cavin_pyro.criticism.statistics.intervals import as_percent
 from cavin_pyro.criticism.statistics.predictions import has_subgoals
 from cavin_pyro.criticism.statistics.windows import from_same_starts, seeded
 from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, within, worst
@@ -140,22 +141,18 @@ def _findings(values: dict[str, Any], found: dict[str, Calibration]) -> list[str
             contraction = found[variant].contraction[name]
             worst_held = min(entry["mean"] for entry in one["held_by_dimension"])
             sentences.append(
-                f"{SYMBOLS[name]}, {VARIANTS[variant]}: 90 % intervals hold {_percent(one['held']['90'])} over all "
-                f"dimensions and {_percent(one['held_informed']['90'])} over the {one['informed']} informed ones of "
+                f"{SYMBOLS[name]}, {VARIANTS[variant]}: 90 % intervals hold {as_percent(one['held']['90'])} over all "
+                f"dimensions and {as_percent(one['held_informed']['90'])} over the {one['informed']} informed ones of "
                 f"{one['dimensions']} (worst dimension {worst_held:.0%}); 50 % intervals hold "
-                f"{_percent(one['held_informed']['50'])} of these. Contraction given s is "
+                f"{as_percent(one['held_informed']['50'])} of these. Contraction given s is "
                 f"{contraction.max().item():.2f} at most."
             )
         joint = values[variant]["joint"]
         sentences.append(
-            f"Jointly, {VARIANTS[variant]}: the 90 % region holds {_percent(joint['90'])}, the 50 % region "
-            f"{_percent(joint['50'])}."
+            f"Jointly, {VARIANTS[variant]}: the 90 % region holds {as_percent(joint['90'])}, the 50 % region "
+            f"{as_percent(joint['50'])}."
         )
     return sentences
-
-
-def _percent(interval: dict[str, float]) -> str:
-    return f"{interval['mean']:.0%} ({max(interval['low'], 0.0):.0%} to {min(interval['high'], 1.0):.0%})"
 
 
 def _tables(values: dict[str, Any], found: dict[str, Calibration]) -> list[Table]:

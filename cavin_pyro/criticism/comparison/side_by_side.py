@@ -10,9 +10,10 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.comparison.pairing import load_pair
 from cavin_pyro.criticism.comparison.scores import FEATURES, LABELS, better, explained_sites, window_scores
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.loading import Accept, load_pair
+from cavin_pyro.criticism.loading import Accept
 from cavin_pyro.criticism.report import Part, render, write_report
 from cavin_pyro.criticism.section import Section, Table
 from cavin_pyro.criticism.sections import fingerprint_of, run_sections

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from cavin_pyro.criticism.statistics.clusters import mean_interval
 from cavin_pyro.criticism.statistics.codes import SYMBOLS
 from cavin_pyro.criticism.statistics.elbo import TOTAL, terms_by_window
 from cavin_pyro.criticism.statistics.inference.simulation import calibrate, held, held_jointly, simulate
+from cavin_pyro.criticism.statistics.intervals import as_percent
 from cavin_pyro.criticism.statistics.predictions import (
     has_subgoals,
     predict_subgoals,
@@ -82,26 +84,22 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int, repeats:
 
 def sentences(before: Measured, after: Measured) -> list[str]:
     """Both measurements, side by side, for the terminal."""
+    percent = partial(as_percent, digits=1)
     lines = []
     for symbol, code in before["codes"].items():
         now = after["codes"][symbol]
         lines += [
-            f"90 % intervals of {symbol} hold {_percent(code['held'])}, now {_percent(now['held'])}; of informed "
-            f"dimensions ({code['informed']}, now {now['informed']}) {_percent(code['held_informed'])}, "
-            f"now {_percent(now['held_informed'])}; of the worst dimension {_percent(code['held_worst'])}, "
-            f"now {_percent(now['held_worst'])}"
+            f"90 % intervals of {symbol} hold {percent(code['held'])}, now {percent(now['held'])}; of informed "
+            f"dimensions ({code['informed']}, now {now['informed']}) {percent(code['held_informed'])}, "
+            f"now {percent(now['held_informed'])}; of the worst dimension {percent(code['held_worst'])}, "
+            f"now {percent(now['held_worst'])}"
         ]
-    lines.append(f"90 % regions of all codes hold {_percent(before['joint'])}, now {_percent(after['joint'])}")
+    lines.append(f"90 % regions of all codes hold {percent(before['joint'])}, now {percent(after['joint'])}")
     elbo, now = (one["minus_elbo"]["mean"] for one in (before, after))
     lines.append(f"real windows: -ELBO {elbo:.2f} nats, now {now:.2f}")
     if before["subgoal_held"]:
         lines.append(
-            f"real windows: 90 % intervals of h's centres that moved hold {_percent(before['subgoal_held'])}, "
-            f"now {_percent(after['subgoal_held'])}"
+            f"real windows: 90 % intervals of h's centres that moved hold {percent(before['subgoal_held'])}, "
+            f"now {percent(after['subgoal_held'])}"
         )
     return lines
-
-
-def _percent(interval: dict[str, float]) -> str:
-    low, high = max(0.0, interval["low"]), min(1.0, interval["high"])
-    return f"{interval['mean']:.1%} ({low:.1%} to {high:.1%})"

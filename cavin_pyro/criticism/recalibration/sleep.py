@@ -14,13 +14,13 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
+from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.statistics.inference.simulation import simulate
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.training.elbo import Program, elbo_terms, substitute
 from models.state import Window
 
-CLIP_NORM = 250.0  # of the gradient of the mean loss per window, as in training
 REPORTS = 10  # rows of losses that a run returns
 
 
@@ -45,7 +45,7 @@ def sleep(
     learning_rate: float = 3e-3,
     wake_weight: float = 0.03,
 ) -> list[dict[str, float]]:
-    """Fit a guide by Adam with a cosine schedule; the model stays as it is.
+    """Fit a guide by Adam, with training's cosine schedule and clipping of gradients; the model stays as it is.
 
     Args:
         batch: gives real windows `[B]`, other ones for each step. wake_weight: of -ELBO on these, beside the sleep
@@ -60,13 +60,13 @@ def sleep(
     model.requires_grad_(False)
     guide.requires_grad_(True)
     optimizer = torch.optim.Adam(guide.parameters(), lr=learning_rate)
+    as_training = TrainerConfig(steps=steps, learning_rate=learning_rate, schedule="cosine")
     rows: list[dict[str, float]] = []
     sums, since = {"sleep": 0.0, "wake": 0.0}, 0
     with progress_bar("sleeping", total=steps) as bar:
         for step in range(steps):
-            rate = learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
             for group in optimizer.param_groups:
-                group["lr"] = rate
+                group["lr"] = as_training.rate(step)
             window = batch()
             losses = {"sleep": sleep_loss(model, guide, window)}
             if wake_weight:
@@ -76,7 +76,7 @@ def sleep(
                 raise UserError(f"calibration stopped after step {step}: the loss is not finite: lower learning_rate")
             optimizer.zero_grad(set_to_none=True)
             total.backward()
-            nn.utils.clip_grad_norm_(guide.parameters(), CLIP_NORM)
+            nn.utils.clip_grad_norm_(guide.parameters(), as_training.clip_norm)
             optimizer.step()
             sums = {name: sums[name] + loss.item() for name, loss in losses.items()}
             bar.update()

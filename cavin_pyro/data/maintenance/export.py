@@ -20,7 +20,7 @@ import numpy as np
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError, WorkerError
 from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
-from cavin_pyro.data.declaration import ARRAYS, padded
+from cavin_pyro.data.declaration import ARRAYS, BESIDE, padded
 from cavin_pyro.data.sources import seed_of, slots_of, source_of_shards, sources_of
 from cavin_pyro.launching.workers import in_workers
 from cavin_pyro.storage.files import output_folder
@@ -162,7 +162,7 @@ def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
 
     metadata = read_metadata(folder)
     seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
-    names = tuple(name for name in ARRAYS if name != "features")
+    names = tuple(name for name in ARRAYS if name not in BESIDE)
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
         for number, shard in iterate_shards(folder, names):
             arrays = padded(shard, slots_of(metadata))

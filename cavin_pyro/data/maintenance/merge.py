@@ -10,9 +10,10 @@ from typing import Any
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import check_distinct, read_metadata, shard_path, write_metadata
+from cavin_pyro.data.features import delete_features
 from cavin_pyro.data.maintenance.verify import find_defects
 from cavin_pyro.data.sources import COUNTS, seed_of, sources_of
-from cavin_pyro.storage.files import atomic_write, clear_abandoned, output_folder
+from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
 
 WORLD = ("object_set", "camera", "segmentation", "ranges", "steps")  # options that sources must have in common
@@ -41,8 +42,7 @@ def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:
         for folder in folders:
             if defect := next(find_defects(folder), None):
                 raise UserError(f"{defect}; python -m cavin_pyro.data verify {folder} names every defect")
-        for beside in target.glob("features-*"):
-            clear_abandoned(beside)
+        delete_features(target)  # of a killed merge, perhaps of other datasets
         metadata = _merged(every)
         files = [(folder, n) for folder, one in zip(folders, every, strict=True) for n in range(one["shards"])]
         with progress_bar("copying", total=len(files), unit="file") as bar:

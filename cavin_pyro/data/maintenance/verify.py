@@ -9,11 +9,11 @@ from typing import Any
 import h5py
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, read_metadata, shard_path
-from cavin_pyro.data.declaration import ARRAYS, check_file, check_values
+from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, read_metadata, shard_digest, shard_path
+from cavin_pyro.data.declaration import ARRAYS, BESIDE, check_file, check_values
 from cavin_pyro.storage.progress import progress_bar
 
-REQUIRED = tuple(name for name in ARRAYS if name != "features")  # of a shard; features lie beside it
+REQUIRED = tuple(name for name in ARRAYS if name not in BESIDE)  # of a shard
 _UNREADABLE = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError)  # what h5py raises
 
 
@@ -52,7 +52,10 @@ def find_defects(folder: Path) -> Iterator[str]:
             yield from (f"{path}: {defect}" for defect in found)
             for features in (one / path.name for one in beside):
                 if features.exists():
-                    yield from (f"{features}: {defect}" for defect in _damage(features, ("features",), metadata, {}))
+                    stored = Arrays()
+                    yield from (f"{features}: {defect}" for defect in _damage(features, BESIDE, metadata, stored))
+                    if not found and "shard_digest" in stored and _digest(stored) != shard_digest(path):
+                        yield f"{features}: it is of other content than {path}"
             pushes = pushes + int(arrays["length"].sum()) if "length" in arrays else -(10**15)
             bar.update()
     if pushes >= 0 and pushes != metadata["transitions"]:
@@ -69,6 +72,8 @@ def _damage(path: Path, names: tuple[str, ...], metadata: Mapping[str, Any], arr
         with h5py.File(path, "r") as file:
             check_file(file, configuration)
             for name in names:
+                if name == "shard_digest" and name not in file:
+                    continue  # features of an older version
                 try:
                     array = file[name][()]
                     check_values({name: array})
@@ -81,17 +86,18 @@ def _damage(path: Path, names: tuple[str, ...], metadata: Mapping[str, Any], arr
 
 def _disagreements(arrays: Arrays, number: int, known: EpisodeNumbers, metadata: Mapping[str, Any]) -> Iterator[str]:
     """Contradictions between readable arrays of a shard, other shards and the metadata."""
-    if "episode" in arrays:
-        try:
-            known.add(number, arrays["episode"])
-        except UserError as error:
-            yield str(error).partition(": ")[0]
+    if "episode" in arrays and (repetition := known.repetition(number, arrays["episode"])):
+        yield f"it {repetition}"
     if {"length", "actions"} <= set(arrays) and (arrays["length"] > arrays["actions"].shape[1]).any():
         yield f"array length: {arrays['length'].max()} pushes in an episode of {arrays['actions'].shape[1]}"
     if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= len(metadata["shape_names"]):
         yield f"array shape: object {arrays['shape'].max()} of {len(metadata['shape_names'])} in metadata.json"
     if {"mask", "visible"} <= set(arrays) and (arrays["visible"] & ~arrays["mask"][:, None]).any():
         yield "array visible: an object that mask denies is visible"
+
+
+def _digest(features: Arrays) -> str:
+    return features["shard_digest"].tobytes().hex()
 
 
 def _line(error: BaseException) -> str:

@@ -84,6 +84,7 @@ def _plain(command: str) -> dict:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_examples_of_help_are_valid(command: str) -> None:
+    assert EXAMPLES[command]
     for overrides in EXAMPLES[command]:
         line = read_command_line(overrides.split())
         if not line.multirun:

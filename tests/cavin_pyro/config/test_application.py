@@ -55,6 +55,34 @@ def test_a_disk_that_refuses_is_one_line_that_says_where(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
+def test_an_input_that_may_not_be_read_is_no_full_disk(
+    number: int, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "input.json"
+    path.touch()
+    monkeypatch.setattr(os, "access", lambda place, mode: str(place) != str(path))  # root may read everything
+    with pytest.raises(SystemExit) as stop:
+        guarded(lambda: refuse(number, str(path)))
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == (
+        f"error: {path} cannot be read: {os.strerror(number)}; change its permissions, or give another\n"
+    )
+
+
+def test_a_name_that_is_too_long_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        guarded(lambda: Path("a" * 300).read_bytes())
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"error: {'a' * 300} is no file: File name too long\n"
+
+
+@pytest.mark.parametrize("arguments", [["--cfg", "everything"], ["--config-dir"]])
+def test_a_wrong_flag_is_one_line(arguments: list[str]) -> None:
+    with pytest.raises(UserError, match="--help lists the options$"):
+        command_module.read_command_line(arguments)
+
+
 def test_errors_that_are_bugs_keep_their_traceback() -> None:
     for error in (ValueError("a bug"), OSError(errno.ENOTCONN, "a bug"), KeyError("a bug")):
 

@@ -18,8 +18,9 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.loading import compare_data, load_context, load_programs, sample_windows, trained_windows
+from cavin_pyro.criticism.loading import load_context, load_programs, sample_windows, trained_windows
 from cavin_pyro.criticism.section import Section
+from cavin_pyro.criticism.training_data import compare_data
 from cavin_pyro.data.dataset import content_records, read_metadata, write_metadata
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
@@ -70,6 +71,7 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
     check_config: Callable[..., DictConfig], trained: Path, pushes: Path
 ) -> None:
     context, about = load_context(check_config("windows=1000"))
+    assert context.seed == 0
     checkpoint = load_checkpoint(trained)
     windows, segment_length, seed = trained_windows(checkpoint, trained)
     table = load_windows([pushes], context.geometry, windows, segment_length=segment_length, seed=seed)
@@ -79,23 +81,24 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
         torch.testing.assert_close(window.states.centers, table.batch(counted).states.centers, rtol=0, atol=0)
         assert window.sequence_mask.all()
         assert about["windows"][name] == len(counted) > 0
+        assert getattr(context, f"{name}_episodes").equal(table.episodes[counted])
     assert not context.model.training and not context.guide.training
     parameters = [*context.model.parameters(), *context.guide.parameters()]
     assert parameters and not any(parameter.requires_grad for parameter in parameters)
     assert json.loads(json.dumps(about)) == about
+    assert context.selection == windows and windows.minimum_move == WINDOWS["minimum_move"]
+    assert load_context(check_config("windows=1000"))[1]["windows_digest"] == about["windows_digest"]
+    for other in ("windows=2", "seed=1"):
+        assert load_context(check_config("windows=3", other))[1]["windows_digest"] != about["windows_digest"]
 
 
-def test_sampled_windows_depend_on_their_seed(check_config: Callable[..., DictConfig], pushes: Path) -> None:
-    context, _ = load_context(check_config("windows=1000"))
+def test_sampled_windows_depend_on_their_seed() -> None:
     numbers = torch.arange(40)
-    table: Any = SimpleNamespace(sequence_mask=numbers % 2 == 0, batch=lambda chosen: chosen, episodes=numbers // 10)
-    (first, episodes), (again, _), (other, _) = (
-        sample_windows(table, numbers, 6, seed=[seed, 0]) for seed in (0, 0, 1)
-    )
+    table: Any = SimpleNamespace(sequence_mask=numbers % 2 == 0)
+    first, again, other = (sample_windows(table, numbers, 6, seed=[seed, 0]) for seed in (0, 0, 1))
     assert len(set(first.tolist())) == 6 and first.equal(again) and not first.equal(other)
-    assert (first % 2 == 0).all() and episodes.equal(first // 10)
-    assert sample_windows(table, numbers[:7], 1000, seed=[0])[0].tolist() == [0, 2, 4, 6]
-    assert context.seed == 0
+    assert (first % 2 == 0).all()
+    assert sample_windows(table, numbers[:7], 1000, seed=[0]).tolist() == [0, 2, 4, 6]
 
 
 def test_a_report_says_whether_the_model_was_trained_on_the_data(own_pushes: Path) -> None:

@@ -138,14 +138,15 @@ def test_scans_and_builtin_shapes_are_collected_together(
     assert drawn == {"mug", "ycb/mug", "ycb/brick"}
 
 
+@pytest.mark.parametrize("workers", [1, 2])
 def test_missing_and_damaged_files_are_collected_again(
-    small: SimpleNamespace, own_pushes: Path, capsys: pytest.CaptureFixture[str]
+    workers: int, small: SimpleNamespace, own_pushes: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = data_of(own_pushes)
     shard_path(own_pushes, 0).unlink()
     content = shard_path(own_pushes, 2).read_bytes()
     shard_path(own_pushes, 2).write_bytes(content[: len(content) // 2])
-    assert repair(small.pushes, own_pushes) == 2
+    assert repair(small.pushes, own_pushes, workers=workers) == 2
     assert data_of(own_pushes) == before
     assert capsys.readouterr().out.count("collecting again: shard") == 2
     assert repair(small.pushes, own_pushes) == 0
@@ -179,6 +180,32 @@ def test_an_empty_dataset_is_begun_again(small: SimpleNamespace, tmp_path: Path)
     counts = {"shards": 0, "episodes": 0, "transitions": 0}
     (tmp_path / "metadata.json").write_text(json.dumps({**metadata, **counts}))
     assert collect(small.pushes, tmp_path, transitions=1, workers=1)["configuration"]["seed"] == 3
+
+
+def test_a_dataset_is_not_begun_again_for_a_word_in_its_folders_name(
+    small: SimpleNamespace, own_pushes: Path, tmp_path: Path
+) -> None:
+    folder = own_pushes.rename(tmp_path / "this is empty")
+    metadata = json.loads((folder / "metadata.json").read_text())
+    (folder / "metadata.json").write_text(json.dumps({**metadata, "version": 2}))
+    before = data_of(folder)
+    with pytest.raises(UserError, match="has format version 2"):
+        collect(small.pushes, folder, transitions=1, workers=1)
+    assert data_of(folder) == before
+
+
+def test_a_dataset_that_begins_has_no_features_of_an_earlier_one(small: SimpleNamespace, tmp_path: Path) -> None:
+    old, users = tmp_path / "features-0123456789ab", tmp_path / "features-of-mine"
+    for folder in (old, users):
+        folder.mkdir()
+        (folder / "episodes-00000.h5").touch()
+    collect(small.pushes, tmp_path, transitions=1, workers=1)
+    assert not old.exists()
+    assert [path.name for path in users.iterdir()] == ["episodes-00000.h5"]
+    old.mkdir()
+    (old / "episodes-00000.h5").touch()
+    collect(small.pushes, tmp_path, transitions=30, workers=1)  # it goes on
+    assert [path.name for path in old.iterdir()] == ["episodes-00000.h5"]
 
 
 def test_the_time_of_every_file_is_recorded_apart_from_the_data(pushes: Path) -> None:

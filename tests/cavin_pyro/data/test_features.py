@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data import features
-from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path
+from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.features import cloud_features, geometry_fingerprint, sample_clouds, shard_features
 from envs.objects.shapes import BUILTIN_NAMES
 from models.networks.pointnet import PointNet
@@ -72,6 +72,73 @@ def test_damaged_features_are_made_again(own_pushes: Path) -> None:
     assert read_shard(path)["features"].shape == first.shape
 
 
+def test_features_are_those_of_the_shard_that_is_there(own_pushes: Path) -> None:
+    """After another collection's file took its place, or a killed merge left features behind."""
+    pointnet = PointNet()
+    fingerprint = geometry_fingerprint(pointnet)
+    first, other = (shard_features(own_pushes, number, pointnet, fingerprint) for number in (0, 1))
+    shard_path(own_pushes, 1).replace(shard_path(own_pushes, 0))
+    found = shard_features(own_pushes, 0, pointnet, fingerprint)
+    assert not np.array_equal(found, first)
+    np.testing.assert_array_equal(found, other)
+
+
+def test_features_that_an_older_version_stored_are_used(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They do not tell of which shard they are: a few of them are computed again, and if they fit, all are kept."""
+    pointnet = PointNet()
+    fingerprint = geometry_fingerprint(pointnet)
+    arrays = read_shard(shard_path(own_pushes, 0))
+    made = cloud_features(pointnet, arrays["clouds"])
+    path = own_pushes / f"features-{fingerprint}" / "episodes-00000.h5"
+    path.parent.mkdir()
+    write_shard(path, {"features": made})
+    computed = []
+    monkeypatch.setattr(
+        features, "cloud_features", lambda *given: (computed.append(len(given[1])), cloud_features(*given))[1]
+    )
+    for _ in range(2):
+        np.testing.assert_array_equal(shard_features(own_pushes, 0, pointnet, fingerprint), made)
+    assert len(computed) == 1 and computed[0] < arrays["clouds"][..., 0, 0].size  # the second time none
+    write_shard(path, {"features": made})
+    changed = {**arrays, "clouds": arrays["clouds"][::-1].copy()}
+    write_shard(shard_path(own_pushes, 0), changed)
+    found = shard_features(own_pushes, 0, pointnet, fingerprint)
+    np.testing.assert_array_equal(found, cloud_features(pointnet, changed["clouds"]))
+
+
+def test_two_trainings_may_find_the_same_damaged_features(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pointnet = PointNet()
+    fingerprint = geometry_fingerprint(pointnet)
+    first = shard_features(own_pushes, 0, pointnet, fingerprint)
+    (path,) = own_pushes.glob("features-*/*.h5")
+    path.write_bytes(b"damaged")
+    unlink = Path.unlink
+
+    def beaten(self: Path, missing_ok: bool = False) -> None:
+        unlink(self, missing_ok=True)  # the other training was faster
+        unlink(self, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", beaten)
+    np.testing.assert_array_equal(shard_features(own_pushes, 0, pointnet, fingerprint), first)
+
+
+def test_damaged_features_of_a_dataset_that_cannot_be_written_to_are_made_again(
+    own_pushes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pointnet = PointNet()
+    fingerprint = geometry_fingerprint(pointnet)
+    first = shard_features(own_pushes, 0, pointnet, fingerprint)
+    (path,) = own_pushes.glob("features-*/*.h5")
+    path.write_bytes(b"damaged")
+
+    def refuse(*arguments: object, **options: object) -> None:
+        raise PermissionError(13, os.strerror(13))
+
+    for name in ("unlink", "mkdir", "write_bytes"):
+        monkeypatch.setattr(Path, name, refuse)
+    np.testing.assert_array_equal(shard_features(own_pushes, 0, pointnet, fingerprint), first)
+
+
 def test_a_dataset_that_cannot_be_written_to_can_be_read(own_pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(source: Path, target: Path) -> None:
         raise PermissionError(13, os.strerror(13))
@@ -128,6 +195,14 @@ def test_clouds_of_held_out_objects_are_not_sampled(pushes: Path) -> None:
     others = sample_clouds([pushes], count=60, generator=np.random.default_rng(0), held_out_objects=[name])
     assert len(others) == 60
     assert commonest not in shapes_of(others)
+
+
+def test_too_few_clouds_are_not_blamed_on_objects_that_nobody_held_out(own_pushes: Path) -> None:
+    for number in range(3):
+        arrays = read_shard(shard_path(own_pushes, number))
+        write_shard(shard_path(own_pushes, number), {**arrays, "visible": np.zeros_like(arrays["visible"])})
+    with pytest.raises(UserError, match=r"pushes: 0 clouds of visible objects, too few .*: collect more transitions"):
+        sample_clouds([own_pushes], count=5, generator=np.random.default_rng(0))
 
 
 def test_holding_out_everything_leaves_nothing_to_learn_from(pushes: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,14 @@ import h5py
 import numpy as np
 import pytest
 
+from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.collection import repair
 from cavin_pyro.data.dataset import iterate_shards, read_metadata, read_shard, shard_path, write_metadata, write_shard
-from cavin_pyro.data.declaration import ARRAYS
+from cavin_pyro.data.declaration import ARRAYS, BESIDE
 from cavin_pyro.data.features import geometry_fingerprint, sample_clouds, shard_features
+from cavin_pyro.data.maintenance.info import describe
+from cavin_pyro.data.maintenance.verify import find_defects
 from cavin_pyro.data.windows import load_windows
 from models.networks.pointnet import PointNet
 
@@ -75,7 +79,7 @@ def test_an_array_that_nobody_reads_tells_of_a_shard_of_another_size(own_pushes:
 
 
 def test_what_is_collected_is_what_is_declared(pushes: Path) -> None:
-    assert set(read_shard(shard_path(pushes, 0))) | {"features"} == set(ARRAYS)
+    assert {*read_shard(shard_path(pushes, 0)), *BESIDE} == set(ARRAYS)
 
 
 def test_features_of_another_shape_are_made_again(own_pushes: Path) -> None:
@@ -85,6 +89,47 @@ def test_features_of_another_shape_are_made_again(own_pushes: Path) -> None:
     for bad in (good[1:], good.astype(np.float64), np.full_like(good, np.nan)):
         write_shard(own_pushes / f"features-{fingerprint}" / "episodes-00000.h5", {"features": bad})
         np.testing.assert_array_equal(shard_features(own_pushes, 0, pointnet, fingerprint), good)
+
+
+def test_a_shard_with_damaged_clouds_is_left_out_as_others_are(
+    own_pushes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = WindowConfig(minimum_move=0.001, validation_fraction=0.4)
+    whole = load_windows([own_pushes], PointNet(), config)
+    for number in range(3):
+        path = shard_path(own_pushes, number)
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2 : len(content) // 2 + 8] = bytes(8)  # among the clouds, most of the file
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=r"episodes-0000[0-2]\.h5 is missing or corrupt"):
+            load_windows([own_pushes], PointNet(), config)
+        if number == 0:
+            kept = load_windows([own_pushes], PointNet(), config, skip_corrupt=True)
+            assert 0 < len(kept.starts) < len(whole.starts)
+            assert f"left out: shard {path}" in capsys.readouterr().out
+    with pytest.raises(UserError, match="has no usable shard: collect it again"):
+        load_windows([own_pushes], PointNet(), config, skip_corrupt=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"shape_names": 5}, "shape_names must be a list of names"),
+        ({"shape_names": [["mug"]]}, "shape_names must be a list of names"),
+        ({"configuration": {"steps": 6, "ranges": [1]}}, "ranges must be a table"),
+    ],
+)
+def test_metadata_of_another_form_are_refused(changes: dict, said: str, own_pushes: Path, small: Any) -> None:
+    write_metadata(own_pushes, {**read_metadata(own_pushes), **changes})
+    for use in (read_metadata, partial(repair, small.pushes), describe, lambda folder: [*find_defects(folder)]):
+        with pytest.raises(UserError, match=rf"metadata\.json is damaged: {said}"):
+            use(own_pushes)
+
+
+@pytest.mark.parametrize("name", ["a" * 300, f"{'a' * 300}/b"])
+def test_a_name_that_no_folder_can_have_is_one_line(name: str) -> None:
+    with pytest.raises(UserError, match="dataset a+(/b)? cannot be read: File name too long"):
+        read_metadata(Path(name))
 
 
 def test_the_same_data_given_twice_are_refused(own_pushes: Path, pushes: Path) -> None:

@@ -35,6 +35,7 @@ class Site:
         self.files: dict[str, bytes] = {}
         self.asked: list[tuple[str, str | None]] = []
         self.cut: int | None = None
+        self.refuses = False  # whether it answers every request as if it were for bytes that it has not
         site = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -46,7 +47,7 @@ class Site:
                     return
                 start = int(re.fullmatch(r"bytes=(\d+)-", wanted)[1]) if wanted else 0
                 content = site.files[path][start:]
-                if wanted and not content:
+                if site.refuses or (wanted and not content):
                     self.send_error(416)
                     return
                 self.send_response(206 if start else 200)
@@ -175,6 +176,20 @@ def test_a_download_without_end_is_given_up(
     status, _, line = assets("ycb", "--to", tmp_path, "--source", site.address)
     assert status == 2 and said in line
     assert len(site.asked) == 1 and not (tmp_path / "ycb").exists()
+
+
+@pytest.mark.parametrize("begun", [b"", b"something else"])
+def test_a_server_that_refuses_every_range_is_asked_for_the_whole_and_then_given_up(
+    begun: bytes, site: Site, assets: Callable, tmp_path: Path
+) -> None:
+    site.refuses = True
+    if begun:
+        (tmp_path / ".ycb.downloads").mkdir()
+        (tmp_path / ".ycb.downloads" / f"{Path(SUGAR).name}.partial").write_bytes(begun)
+    status, _, said = assets("ycb", "--to", tmp_path, "--source", site.address)
+    assert status == 2 and f"{site.address}/{SUGAR} answers 416" in said and "name a mirror with --source URL" in said
+    assert site.asked == [*([(SUGAR, f"bytes={len(begun)}-")] if begun else []), (SUGAR, None)]
+    assert not left(tmp_path)
 
 
 def test_finished_pieces_are_not_fetched_again(site: Site, assets: Callable, tmp_path: Path) -> None:

@@ -48,6 +48,34 @@ def test_a_bug_in_a_worker_is_raised_with_its_traceback() -> None:
 
 
 @pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("unsent", "Error: Can't .* local object"),
+        ("unsent error", r"^ZeroDivisionError: \('a bug', <function act"),
+    ],
+)
+def test_what_cannot_be_pickled_is_a_bug_with_its_traceback(what: str, said: str) -> None:
+    with pytest.raises(RuntimeError, match=said) as caught:
+        list(in_workers(act, [(what, 0.0)], 1))
+    assert "Traceback" in str(caught.value.__cause__)
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("two words", r"failed: TwoWordsError: one and two \(an error that cannot be read here: TypeError: "),
+        ("unread", r"answered what cannot be read here \(ZeroDivisionError: division by zero\)"),
+    ],
+)
+def test_what_cannot_be_unpickled_is_one_line(what: str, said: str) -> None:
+    with pytest.raises(WorkerError, match=rf"^worker process \d+ {said}") as caught:
+        list(in_workers(act, [(what, 0.0)], 1))
+    assert "\n" not in str(caught.value)
+    assert what == "unread" or 'raise TwoWordsError("one", "two")' in str(caught.value.__cause__)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize(
     ("job", "said"),
     [
         (("signal", signal.SIGKILL), r"was killed by signal 9 \(SIGKILL\), perhaps because memory ran out: try fewer"),

@@ -10,6 +10,24 @@ from multiprocessing.connection import Connection
 from cavin_pyro.launching.workers import in_workers
 
 
+class TwoWordsError(Exception):
+    """It cannot be unpickled: Python gives its constructor the message alone."""
+
+    def __init__(self, one: str, two: str) -> None:
+        super().__init__(f"{one} and {two}")
+
+
+class Unreadable:
+    """It can be pickled, but not unpickled."""
+
+    def __reduce__(self) -> tuple:
+        return divide, ()
+
+
+def divide() -> float:
+    return 1 / 0
+
+
 def act(job: tuple[str, float]) -> object:
     what, value = job
     if what == "sleep":
@@ -22,6 +40,14 @@ def act(job: tuple[str, float]) -> object:
         return b"0" * int(value)
     elif what == "exit":
         os._exit(int(value))
+    elif what == "two words":
+        raise TwoWordsError("one", "two")
+    elif what == "unread":
+        return Unreadable()
+    elif what == "unsent":
+        return lambda: None
+    elif what == "unsent error":
+        raise ZeroDivisionError("a bug", lambda: None)
     elif what == "fail":
         raise ZeroDivisionError("a bug")
     return os.getpid()

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ from safetensors.torch import load_file, save_file
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model
-from cavin_pyro.storage.checkpoint import default_checkpoint, load_checkpoint, save_checkpoint
+from cavin_pyro.storage.checkpoint import default_checkpoint, find_checkpoint, load_checkpoint, save_checkpoint
 from cavin_pyro.storage.geometry import load_pointnet
 from models.networks.pointnet import PointNet
 
@@ -151,3 +152,20 @@ def test_sections_that_are_never_built_are_not_checked(
 def test_the_default_checkpoint_lies_in_the_checkout() -> None:
     root = Path(__file__).resolve().parents[3]
     assert default_checkpoint() == root / "checkpoints" / "cavin.safetensors"
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "a" * 250, f"{'a' * 300}.safetensors", f"folder/{'a' * 300}"])
+def test_a_name_that_no_file_can_have_is_one_line(name: str) -> None:
+    with pytest.raises(UserError, match=r"(unknown checkpoint 'a+': choose from|no checkpoint at )"):
+        load_checkpoint(find_checkpoint(name))
+
+
+def test_a_checkpoint_that_may_not_be_looked_for_is_one_line(
+    checkpoint_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *arguments: object, **options: object) -> None:
+        raise PermissionError(13, os.strerror(13), str(path))
+
+    monkeypatch.setattr(os, "stat", refuse)
+    with pytest.raises(UserError, match=r"cannot be read: Permission denied"):
+        load_checkpoint(checkpoint_file)

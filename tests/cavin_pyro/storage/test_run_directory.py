@@ -62,6 +62,22 @@ def test_a_run_whose_task_was_stored_by_name_resumes(tmp_path: Path) -> None:
         check_same_run(tmp_path, config(task={"_target_": "my.Own"}), ignore=())
 
 
+@pytest.mark.parametrize(
+    ("stored", "said"),
+    [
+        ("task: [a]\nreward: sparse\n", "a run with .*=.*, not"),
+        ("task: {a: [1]}\n", "a run with .*=.*, not"),
+        ("[" * 5000, "config.yaml is damaged"),
+    ],
+)
+def test_a_stored_configuration_of_another_form_is_one_line(stored: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(stored)
+    (tmp_path / "metrics.csv").touch()
+    with pytest.raises(UserError, match=said) as refused:
+        check_same_run(tmp_path, config(task="crossing"), ignore=())
+    assert "\n" not in str(refused.value)
+
+
 def test_a_run_from_before_checkpoints_had_planners_resumes(tmp_path: Path) -> None:
     write_config(tmp_path, config(checkpoint="cavin", planner={"samples": 8}))
     (tmp_path / "episodes.jsonl").touch()

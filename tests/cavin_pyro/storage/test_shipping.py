@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from safetensors.torch import save
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_model
 from cavin_pyro.storage import shipping
-from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint, save_checkpoint
 from cavin_pyro.storage.digests import file_digest, read_manifest
 from cavin_pyro.storage.shipping import main, ship, ship_guide, ship_models
 
@@ -81,6 +82,33 @@ def test_a_shipped_file_has_the_weights_as_they_were_and_no_path_of_the_machine(
     assert all(torch.equal(before.tensors[name], after.tensors[name]) for name in after.tensors)
     assert str(tmp_path).encode() not in path.read_bytes()
     assert after.config == {**before.config, "output": "runs/reproduce/train/sectar-1", "data": "runs/reproduce/data"}
+
+
+@pytest.mark.parametrize("name", ["józef", "two words", 'quoted" \\ back', "o'brien"])
+def test_no_path_of_the_machine_is_shipped_whatever_the_folder_is_called(name: str, home: Path, tmp_path: Path) -> None:
+    """Commands have their arguments quoted for a shell, and JSON escapes letters, quotes and backslashes."""
+    moved, pretrained = tmp_path / name / "run", tmp_path / name / "another" / "pretrain"
+    moved.parent.mkdir()
+    home.rename(moved)
+    path = moved / "train" / "sectar-1" / "checkpoint.safetensors"
+    content = load_checkpoint(path)
+    config = {**content.config, "output": str(path.parent), "data": [f"{moved}/data"]}
+    arguments = [shlex.quote(f"{option}={moved}/{end}") for option, end in (("data", "data"), ("output", "train/x"))]
+    provenance = {
+        **content.provenance,
+        "command": " ".join(["python -m cavin_pyro.train", *arguments]),
+        "pointnet": {"command": f"python -m cavin_pyro.pretrain {shlex.quote(f'output={pretrained}')} seed=1"},
+    }
+    path.write_bytes(checkpoint_bytes(content.tensors, config, provenance))
+    ship(moved, "sectar", tmp_path / "shipped")
+    after = load_checkpoint(tmp_path / "shipped" / "sectar.safetensors")
+    assert (after.config["output"], after.config["data"]) == ("runs/reproduce/train/sectar-1", ["runs/reproduce/data"])
+    found = [shlex.split(one["command"])[3:] for one in (after.provenance, after.provenance["pointnet"])]
+    assert found == [
+        ["data=runs/reproduce/data", "output=runs/reproduce/train/x"],
+        ["output=runs/reproduce/pretrain", "seed=1"],
+    ]
+    assert str(tmp_path) not in str((after.config, after.provenance))
 
 
 def test_what_is_missing_or_unfinished_is_not_shipped(home: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,14 +13,17 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
+from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.training import pretraining
-from cavin_pyro.training.resume import write_resume
+from cavin_pyro.training.optimizers import OPTIMIZERS, make_optimizers
+from cavin_pyro.training.resume import ENTRIES, load_optimizer, optimizer_tensors, write_resume
 from cavin_pyro.training.run import _keep_best
+from cavin_pyro.training.trainer import Trainer
 from tests.cavin_pyro.training.test_pretraining import clouds, pretrained
-from tests.cavin_pyro.training.test_trainer import trainer
+from tests.cavin_pyro.training.test_trainer import SHORT, trainer
 
 Tensors = dict[str, Tensor]
 
@@ -43,6 +47,11 @@ CHANGES = {
     "another shape": put("model.", lambda one: one[:0]),
     "a moment of another shape": put("adam.0.exp_avg", lambda one: one[:0]),
     "a moment of no weight": lambda tensors: tensors.update({"adam.99999.exp_avg": torch.zeros(1)}),
+    "a moment of a negative number": lambda tensors: tensors.update({"adam.-1.exp_avg": torch.zeros(1)}),
+    "no moments": without("adam"),
+    "no moments of a weight": without("adam.0."),
+    "half of the moments of a weight": without("adam.0.exp_avg_sq"),
+    "moments without their step": without("adam.0.step"),
     "a moment without a number": lambda tensors: tensors.update({"adam.x.exp_avg": torch.zeros(1)}),
     "NaN": put("model.", lambda one: one * torch.nan),
     "a short generator": put("batches", lambda one: one[:10]),
@@ -83,6 +92,70 @@ def test_a_changed_resume_file_is_named(name: str, own: Path, small: SimpleNames
         with pytest.raises(UserError, match=r"resume\.safetensors is damaged \(.*\): delete it to start again") as no:
             trainer(small, own).resume()
         assert "\n" not in str(no.value)
+
+
+PARAMETERS = 3
+
+
+def stepped(name: str, *, without_gradient: int | None = None) -> tuple[torch.optim.Optimizer, Tensors]:
+    """An optimizer of three matrices after a step, and its moments."""
+    torch.manual_seed(0)
+    weights = [nn.Parameter(torch.randn(6, 6)) for _ in range(PARAMETERS)]
+    (optimizer,) = make_optimizers(name, weights, 0.1).values()
+    for number, weight in enumerate(weights):
+        weight.grad = None if number == without_gradient else torch.ones_like(weight)
+    optimizer.step()
+    return optimizer, optimizer_tensors(optimizer, name)
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_moments_that_lack_are_named(name: str) -> None:
+    optimizer, tensors = stepped(name)
+    load_optimizer(optimizer, tensors, name)
+    assert optimizer_tensors(optimizer, name).keys() == tensors.keys()
+    with pytest.raises(ValueError, match=rf"^{name}\.0\.\w+ is missing$"):
+        load_optimizer(optimizer, {}, name)
+    assert len(tensors) == PARAMETERS * len(ENTRIES[name])
+    for lacking in tensors:
+        with pytest.raises(ValueError, match=rf"^{re.escape(lacking)} is missing$"):
+            load_optimizer(optimizer, {one: value for one, value in tensors.items() if one != lacking}, name)
+    with pytest.raises(ValueError, match=rf"^{name}\.3 belongs to no weight$"):
+        load_optimizer(optimizer, {**tensors, f"{name}.3.exp_avg": torch.zeros(6, 6)}, name)
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_a_weight_without_gradient_has_no_moments_and_a_whole_file_need_not_hold_them(name: str) -> None:
+    optimizer, tensors = stepped(name, without_gradient=1)
+    assert not [one for one in tensors if one.startswith(f"{name}.1.")]
+    load_optimizer(optimizer, tensors, name, complete=False)
+    with pytest.raises(ValueError, match=rf"^{name}\.1\.\w+ is missing$"):
+        load_optimizer(optimizer, tensors, name)
+
+
+@pytest.mark.parametrize("lacking", ENTRIES["adam"])
+def test_half_of_the_moments_of_a_weight_are_damage_in_every_file(lacking: str) -> None:
+    optimizer, tensors = stepped("adam")
+    del tensors[f"adam.2.{lacking}"]
+    with pytest.raises(ValueError, match=rf"^adam\.2\.{lacking} is missing$"):
+        load_optimizer(optimizer, tensors, complete=False)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_training_with_weights_that_get_no_gradient_resumes(
+    optimizer: str, small: SimpleNamespace, tmp_path: Path
+) -> None:
+    config = TrainerConfig(**{**vars(SHORT), "optimizer": optimizer})
+
+    def made() -> Trainer:
+        run = trainer(small, tmp_path / "run", config)
+        for made in run._optimizers.values():
+            made.add_param_group({"params": [nn.Parameter(torch.zeros(8, 8))]})
+        return run
+
+    made().run()
+    again = made()
+    again.resume()
+    assert (again.step, len(again.rows)) == (8, 4)
 
 
 def test_an_older_resume_file_without_a_digest_is_gone_on_from(own: Path, small: SimpleNamespace) -> None:

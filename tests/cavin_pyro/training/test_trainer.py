@@ -20,6 +20,8 @@ from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.training import trainer as trainer_module
+from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.trainer import Row, Trainer, read_rows
 from models.state import State
@@ -52,7 +54,12 @@ def windows(episodes: int = 10, positions: int = 6) -> WindowTable:
 
 
 def trainer(
-    small: SimpleNamespace, folder: Path, config: TrainerConfig = SHORT, hook: Hook | None = None, seed: int = 0
+    small: SimpleNamespace,
+    folder: Path,
+    config: TrainerConfig = SHORT,
+    hook: Hook | None = None,
+    seed: int = 0,
+    objective: Objective | None = None,
 ) -> Trainer:
     """A trainer of a small cascade; the hook is called after each checkpoint."""
     parts = small.parts()
@@ -63,7 +70,7 @@ def trainer(
             hook(run, step)
 
     folder.mkdir(exist_ok=True)
-    programs = (parts["model"], parts["guide"], Objective(Trace_ELBO()))
+    programs = (parts["model"], parts["guide"], objective or Objective(Trace_ELBO()))
     run = Trainer(*programs, windows(), folder, save, config, seed=seed)
     return run
 
@@ -150,6 +157,57 @@ def test_validation_always_uses_the_same_noise(small: SimpleNamespace, tmp_path:
     latent = [value for name, value in run.rows[0].items() if name.startswith("validation_") and "next" not in name]
     dynamics = sum(terms) - sum(value for value in latent if value != run.rows[0]["validation_loss"])
     assert run.rows[0]["validation_loss"] == pytest.approx(sum(terms) + 2 * dynamics, rel=1e-5)
+
+
+def test_metrics_are_means_over_what_counts_in_all_parts_of_the_validation(
+    small: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts in which different numbers of windows and transitions count, one of them none."""
+    monkeypatch.setattr(trainer_module, "VALIDATION_BATCH", 4)
+    run = trainer(small, tmp_path / "run")
+    order = torch.randperm(9, generator=torch.Generator().manual_seed(0))
+    parts = run.windows.validation[order].split(4)
+    run.windows.sequence_mask[parts[1]] = False
+    run.windows._transition_mask[run.windows.starts[parts[0]]] = False
+    sums: dict[str, float] = {}
+    torch.manual_seed(0)
+    for part in parts:
+        for name, value in elbo_terms(run.model, run.guide, run.windows.batch(part)).items():
+            sums[name] = sums.get(name, 0.0) + value.item()
+    batches = [run.windows.batch(part) for part in parts]
+    windows_that_count = sum(int(batch.sequence_mask.sum()) for batch in batches)
+    transitions_that_count = sum(int(batch.transition_mask.sum()) for batch in batches)
+    assert (windows_that_count, len(parts)) == (5, 3) and transitions_that_count < 27
+    terms, loss = run._validation_terms()
+    assert terms.keys() == sums.keys()
+    for name, value in terms.items():
+        count = transitions_that_count if name.startswith("nll_next") else windows_that_count
+        assert value == pytest.approx(sums[name] / count, rel=1e-6), name
+    assert loss == pytest.approx(sum(sums.values()) / 9, rel=1e-6)
+
+
+def test_metrics_of_a_validation_in_which_no_window_counts_are_zero(small: SimpleNamespace, tmp_path: Path) -> None:
+    run = trainer(small, tmp_path / "run")
+    run.windows.sequence_mask[run.windows.validation] = False
+    terms, loss = run._validation_terms()
+    assert {value for name, value in terms.items() if not name.startswith("nll_next")} == {0.0}
+    assert math.isfinite(loss) and terms["nll_next_centers"] > 0
+
+
+def test_the_validation_loss_has_the_terms_of_the_model_and_not_the_counterfactual_one(
+    small: SimpleNamespace, tmp_path: Path
+) -> None:
+    losses = {}
+    for name, weights in {
+        "plain": {},
+        "counterfactual": {"counterfactual_weight": 2.0},
+        "rollout": {"rollout_weight": 2.0},
+    }.items():
+        run = trainer(small, tmp_path / name, objective=Objective(Trace_ELBO(), **weights))
+        terms, losses[name] = run._validation_terms()
+        assert ("rollout" in terms) == (name == "rollout")
+    assert losses["counterfactual"] == losses["plain"]
+    assert losses["rollout"] == pytest.approx(losses["plain"] + terms["rollout"])
 
 
 def test_gradients_are_clipped(small: SimpleNamespace, tmp_path: Path) -> None:

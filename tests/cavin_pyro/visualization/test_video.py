@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from cavin_pyro.evaluation.rollout import PlanRecord, rollout
 from cavin_pyro.visualization.video import EpisodeVideo
 from envs.layouts import load_task
-from envs.pushing import PushingEnv
+from envs.pushing import VIDEO_SIZE, PushingEnv
+from envs.sensors.camera import Camera
 from models.networks.pointnet import PointNet
 from models.state import State
 from planning import RandomPlanner
@@ -159,6 +160,15 @@ def test_drawing_over_a_frame_costs_little(tmp_path: Path) -> None:
             times.append(time.perf_counter() - began)
         video.add(frame())
     assert min(times) < 5e-3
+
+
+def test_the_first_plan_is_drawn_as_the_environments_camera_sees_it(tmp_path: Path) -> None:
+    camera = Camera(position=(0.6, 0.0, 1.4))
+    env = PushingEnv(task="insertion", objects=2, camera=camera, render_mode="rgb_array")
+    with EpisodeVideo(tmp_path / "episode.mp4", LAYOUT, env=env) as video:
+        video.on_plan(record(photograph=True))
+        assert video.camera == camera.resized(*VIDEO_SIZE)
+    env.close()
 
 
 def test_an_episode_is_filmed_from_the_first_push_to_the_last(tmp_path: Path) -> None:

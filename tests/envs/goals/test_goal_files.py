@@ -63,6 +63,12 @@ def npy(values: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
+def npz(values: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, values)
+    return buffer.getvalue()
+
+
 def header_of(shape: tuple[int, ...]) -> bytes:
     """An .npy that says that it holds many more numbers than it does."""
     buffer = io.BytesIO()
@@ -73,6 +79,9 @@ def header_of(shape: tuple[int, ...]) -> bytes:
 REFUSED: dict[str, tuple[str, bytes, str]] = {
     "suffix": ("goal.pt", pickle.dumps(FLAT), r"must be a file that ends in \.png, \.npy, \.safetensors$"),
     "pickle": ("goal.npy", pickle.dumps(FLAT), r"is damaged or no \.npy of numbers \(.*pickle"),
+    "zip": ("goal.npy", b"PK\x03\x04junkjunk", r"is damaged or no \.npy of numbers"),
+    "arrays": ("goal.npy", npz(FLAT), r"is damaged or no \.npy of numbers"),
+    "unbalanced": ("goal.npy", npy(FLAT).replace(b"}", b"{"), r"is damaged or no \.npy of numbers"),
     "objects": ("goal.npy", npy(np.array([{"a": 1}], dtype=object)), r"is damaged or no \.npy of numbers \(.*pickle"),
     "claims": ("goal.npy", header_of((10**6, 10**6)), r"is damaged or no \.npy of numbers"),
     "cut": ("goal.npy", npy(FLAT)[:2000], r"is damaged or no \.npy of numbers"),

@@ -187,6 +187,23 @@ def test_an_environment_takes_all_that_is_in_the_folder(tiny_assets: Path) -> No
         (lambda folder: [(folder / file).unlink() for file in ("mug.obj", "angle_vhacd.obj")], "mug.obj and 1 more"),
         (lambda folder: (folder / "meta.json").write_text('{"../mug": {}}'), "incomplete: ../mug.obj"),
         (lambda folder: (folder / "meta.json").write_text('{"mug": {"mass": 1}}'), "mug needs a mass and an inertia"),
+        (lambda folder: (folder / "meta.json").write_text("[" * 100_000), "meta.json is damaged: it is not JSON"),
+        (lambda folder: (folder / "meta.json").write_text(f'{{"{"a" * 300}": {{}}}}'), "incomplete: aaa"),
+        *(
+            (lambda folder, values=values: tell_of_mug(folder, values), "mug needs a mass and an inertia_diag of three")
+            for values in (
+                {"mass": 0.1, "inertia_diag": 5},
+                {"mass": 0.1, "inertia_diag": {"x": 1, "y": 1, "z": 1}},
+                {"mass": True, "inertia_diag": [1, 1, 1]},
+                {"mass": 0.1, "inertia_diag": [1, 1, True]},
+                {"mass": 0.1, "inertia_diag": [1, 1]},
+                {"mass": 0.1, "inertia_diag": [1, 1, float("nan")]},
+                {"mass": 10**400, "inertia_diag": [1, 1, 1]},
+                [0.1, 1, 1, 1],
+            )
+        ),
+        (lambda folder: (folder / "mug_vhacd.obj").write_text("v nan 0 0\n"), "mug_vhacd.obj is damaged"),
+        (lambda folder: (folder / "mug_vhacd.obj").write_text("v 0 0 1e999\nv 1 0 0\n"), "mug_vhacd.obj is damaged"),
         (lambda folder: (folder / "mug_vhacd.obj").write_text("v 0 0\n"), "mug_vhacd.obj is damaged"),
         (lambda folder: (folder / "mug_vhacd.obj").write_text(""), "mug_vhacd.obj is damaged"),
     ],
@@ -201,6 +218,20 @@ def test_a_folder_that_lacks_something_gets_its_one_line(
             load_object_set(word, tmp_path)
         assert "\n" not in str(caught.value) and str(folder) in str(caught.value)
         assert said.startswith(("meta.json is damaged", "mug")) or "cavin_pyro.assets ycb --to" in str(caught.value)
+
+
+def tell_of_mug(folder: Path, values: object) -> None:
+    (folder / "meta.json").write_text(json.dumps({"mug": values}))
+
+
+def test_the_folder_may_be_named_from_the_users_home(
+    tiny_assets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    shutil.copytree(tiny_assets, tmp_path / "mine")
+    assert load_object_set("ycb", "~/mine").names == TINY
+    with pytest.raises(ValueError, match="^no objects in .*meta.json cannot be read"):
+        load_object_set("ycb", "~nobody-of-this-name/mine")
 
 
 def test_without_a_folder_the_line_says_how_to_get_one() -> None:

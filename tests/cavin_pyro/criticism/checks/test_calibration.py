@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pyro
@@ -11,6 +12,7 @@ from pyro import poutine
 from pyro.nn import PyroModule
 from scipy.stats import kstest, norm
 
+from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.criticism.checks.calibration import assess_calibration
 from cavin_pyro.criticism.checks.predictive import assess_predictive
 from cavin_pyro.criticism.context import CheckContext
@@ -238,6 +240,14 @@ def test_the_sections_cover_all_parts_of_a_cascade_and_are_repeatable(right: Sim
     again = sections(context)
     assert str(again[0].values) == str(predictive.values)
     assert str(again[1].values) == str(calibration.values)
+
+
+def test_the_text_has_the_moves_by_which_training_selected_windows(right: SimpleNamespace) -> None:
+    context = context_of(OnlyDynamics(), NoGuide(), right.f)
+    for section in sections(context):
+        assert "moved more than 0.1 m" in section.explanation and "more than 0.5 m" in section.explanation
+    for section in sections(replace(context, selection=WindowConfig(minimum_move=0.025, maximum_move=0.375))):
+        assert "moved more than 0.025 m" in section.explanation and "more than 0.375 m" in section.explanation
 
 
 def test_a_model_of_dynamics_alone_is_checked_for_what_it_has(right: SimpleNamespace) -> None:

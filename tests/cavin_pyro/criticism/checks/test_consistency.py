@@ -118,7 +118,9 @@ def test_a_model_whose_subgoals_are_what_physics_does_is_consistent(oracle: Orac
 
 def test_a_model_whose_subgoals_oppose_its_pushes_is_detected(oracle: Oracle) -> None:
     wrong = Oracle(wish=lambda before, after: 2 * before - after)
-    for right, way in zip(results(oracle), results(wrong), strict=True):
+    selections = results(wrong)
+    assert len(selections) == len(code_selections(("effect_code", "motion_code")))
+    for right, way in zip(results(oracle), selections, strict=True):
         assert way["relative"] == pytest.approx(2.0, abs=0.1)
         assert way["progress"] == pytest.approx(-1.0, abs=0.1)
         assert way["nearer"] == 0
@@ -129,21 +131,26 @@ def test_a_model_whose_subgoals_move_nothing_gives_no_number_and_says_so() -> No
     section = assess_consistency(
         context_of(Oracle(wish=lambda before, after: before)), scenes=SCENES, objects=OBJECTS, samples=2
     )
-    assert all(math.isnan(way["relative"]) for way in section.values["selections"])
+    selections = section.values["selections"]
+    assert len(selections) == len(section.findings) == len(code_selections(("effect_code", "motion_code")))
+    assert all(math.isnan(way["relative"]) for way in selections)
     assert all("no subgoal moves an object" in finding for finding in section.findings)
 
 
 def test_a_model_of_one_code_has_no_motion_to_choose(oracle: Oracle) -> None:
     model = SimpleNamespace(**{name: getattr(oracle, name) for name in ("subgoal", "actions", "next_state")})
     model.maximum_objects, model.codes, model.effect_prior = 5, ("effect_code",), standard
-    assert [(way["effect"], way["motion"]) for way in results(model)] == [("sampled", "given"), ("chosen", "given")]
-    assert all(way["relative"] < 0.08 for way in results(model))
+    selections = results(model)
+    assert [(way["effect"], way["motion"]) for way in selections] == [("sampled", "given"), ("chosen", "given")]
+    assert all(way["relative"] < 0.08 for way in selections)
 
 
 def test_a_model_without_subgoals_is_compared_with_its_prediction_only(oracle: Oracle) -> None:
     model = SimpleNamespace(actions=oracle.actions, next_state=oracle.next_state)
     model.maximum_objects, model.codes, model.motion_prior = 5, ("motion_code",), standard
-    for way in results(model):
+    selections = results(model)
+    assert [(way["effect"], way["motion"]) for way in selections] == [("sampled", "given"), ("chosen", "given")]
+    for way in selections:
         assert way["prediction"]["relative"] < 0.08
         assert "relative" not in way and "wanted" not in way
 

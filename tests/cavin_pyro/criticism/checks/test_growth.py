@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pyro
 import pytest
 import torch
@@ -9,6 +11,7 @@ from pyro import distributions
 from pyro.nn import PyroModule
 from torch import Tensor
 
+from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.criticism.checks.growth import assess_growth
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.recordings import Recording, record
@@ -113,3 +116,11 @@ def test_the_section_of_a_cascade() -> None:
     assert all(len(curve) == 2 and curve[0]["count"] == 2 for curve in errors.values())
     assert all(curve[0]["q25"] <= curve[0]["median"] <= curve[0]["q75"] for curve in errors.values())
     assert len(section.findings) == 2
+    # Which segments h was trained on, the options of its training say.
+    shares = []
+    for minimum, maximum in ((0.0, 10.0), (0.0, 0.0), (10.0, 20.0)):
+        selection = WindowConfig(minimum_move=minimum, maximum_move=maximum)
+        other = assess_growth(replace(context, selection=selection), episodes=1, segments=1)
+        shares.append(other.values["informative_share"])
+        assert f"moves more than {minimum:g} m and none more than {maximum:g} m" in other.explanation
+    assert shares == [1.0, 0.0, 0.0]

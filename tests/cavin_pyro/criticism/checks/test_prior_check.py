@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cavin_pyro.criticism.checks.aggregate import assess_aggregate
-from cavin_pyro.criticism.checks.prior import assess_prior
+from cavin_pyro.criticism.checks.prior import _elsewhere, assess_prior
 from cavin_pyro.criticism.context import CheckContext
 
 FEW = {"samples": 20, "permutations": 99}
@@ -31,6 +31,22 @@ def test_few_episodes_give_a_warning_instead_of_a_conclusion(scenes: SimpleNames
     section = assess_prior(scenes.context(scenes.guide(), batch=120, each=6), **FEW)
     assert section.verdict is not None and section.verdict.level == "too few"
     assert "120 windows of 20 episodes" in section.verdict.rule
+
+
+@pytest.mark.parametrize(
+    "numbers", [[0, 0, 0, 1], [0, 1], [0, 0, 1, 1], [2, 0, 2, 2, 1, 2, 2], [5, 5, 1, 2, 1], [0, 1, 2], [1] * 9 + [0]]
+)
+def test_another_scene_is_one_of_another_episode(numbers: list[int]) -> None:
+    episodes = torch.tensor(numbers)
+    other = _elsewhere(episodes)
+    assert (episodes[other] != episodes).all()
+    assert torch.equal(other, _elsewhere(episodes))
+    if 2 * max(map(numbers.count, numbers)) <= len(numbers):
+        assert sorted(other.tolist()) == list(range(len(numbers)))  # each window stands in for one other
+
+
+def test_windows_of_one_episode_stand_in_for_themselves() -> None:
+    assert _elsewhere(torch.zeros(3)).tolist() == [0, 1, 2]
 
 
 def test_pushes_and_subgoals_of_a_cascade_are_compared(cascade: CheckContext) -> None:

@@ -11,15 +11,17 @@ import torch
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism import sections
+from cavin_pyro.criticism.comparison.pairing import load_pair
 from cavin_pyro.criticism.comparison.scores import better
 from cavin_pyro.criticism.comparison.side_by_side import (
     assess_pair,
     check_pair,
     verdicts_side_by_side,
     write_comparison,
+    write_pair,
 )
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.loading import load_pair
 from cavin_pyro.criticism.report import render
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.criticism.statistics.clusters import Interval
@@ -97,3 +99,36 @@ def test_a_pair_has_the_windows_that_both_held_out(small: SimpleNamespace, pushe
         with pytest.raises(UserError, match="give both"):
             check_pair(compose("check", one, *data))
     assert check_pair(compose("check", *paths.values(), *data)) and not check_pair(compose("check", *data))
+
+
+def test_sections_run_again_where_the_other_checkpoint_changes_the_common_windows(
+    small: SimpleNamespace, pushes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[int] = []
+
+    def assess(context: CheckContext, **sizes: int) -> Section:
+        ran.append(len(context.validation.actions))
+        return Section("elbo", "ELBO", "", [], {"windows": ran[-1]})
+
+    def save(name: str, seed: int) -> None:
+        config = {**small.config(), "windows": WINDOWS, "seed": seed}
+        save_checkpoint(tmp_path / name, parts=small.parts(), config=config, provenance={})
+
+    def check() -> list[int]:
+        ran.clear()
+        write_pair(compose("check", *options), ["elbo"], folder)
+        reports = [json.loads((folder / name / "report.json").read_text()) for name in ("a", "b")]
+        windows = [report["sections"]["elbo"]["values"]["windows"] for report in reports]
+        assert windows == [report["about"]["windows"]["validation"] for report in reports]
+        return [*ran]
+
+    monkeypatch.setattr(sections, "SECTIONS", {"elbo": assess})
+    folder = tmp_path / "out"
+    folder.mkdir()
+    options = [f"a={tmp_path / 'a'}", f"b={tmp_path / 'b'}", f"data={pushes}", "windows=1000"]
+    save("a", seed=1), save("b", seed=2)
+    (first, second), again = check(), check()
+    assert first == second and not again
+    save("b", seed=1)  # another training under the same path, which held out all windows of a
+    (third, fourth), again = check(), check()
+    assert third == fourth > first and not again

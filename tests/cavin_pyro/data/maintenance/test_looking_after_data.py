@@ -121,6 +121,25 @@ def test_flipped_bytes_lost_files_and_wrong_counts_are_named_together(data: Call
     assert "array clouds" in output and "00001.h5: it is missing" in output
 
 
+def test_features_of_another_file_are_named(data: Callable, own_pushes: Path) -> None:
+    pointnet = PointNet()
+    mark = geometry_fingerprint(pointnet)
+    shard_features(own_pushes, 1, pointnet, mark)
+    features = own_pushes / f"features-{mark}" / shard_path(own_pushes, 1).name
+    spoil(shard_path(own_pushes, 1), put("angle", 0.5))
+    status, output, _ = data("verify", own_pushes)
+    assert (status, output) == (2, f"{features}: it is of other content than {shard_path(own_pushes, 1)}\n")
+
+
+def test_a_repeated_episode_is_told_whatever_the_folder_is_called(
+    data: Callable, own_pushes: Path, tmp_path: Path
+) -> None:
+    folder = own_pushes.rename(tmp_path / "old: pushes")
+    spoil(shard_path(folder, 1), put("episode", 0))
+    status, output, _ = data("verify", folder)
+    assert (status, output) == (2, f"{shard_path(folder, 1)}: it repeats episode 0\n")
+
+
 def test_metadata_that_count_other_pushes_are_named(data: Callable, own_pushes: Path) -> None:
     metadata = read_metadata(own_pushes)
     write_metadata(own_pushes, {**metadata, "transitions": metadata["transitions"] - 1})
