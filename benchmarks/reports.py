@@ -67,7 +67,7 @@ def cost(code: Values) -> str:
 
 
 def informed(code: Values) -> str:
-    return f"{tenths(code['held_informed']['90'])}, {code['informed']} of {code['dimensions']}"
+    return f"{tenths(code['coverage_informed']['90'])}, {code['informed']} of {code['dimensions']}"
 
 
 def groups(decoded: Values) -> str:
@@ -87,7 +87,7 @@ def replicates(statistic: Values) -> str:
     return hundredfold(None if source is None else source["mean"]["mean"] for source in sources)
 
 
-def held(moved: Values) -> str:
+def covered(moved: Values) -> str:
     return f"{50 * sum(moved[axis]['coverage']['90'] for axis in 'xy'):.0f} %"
 
 
@@ -101,7 +101,7 @@ def rollout(selections: Sequence[Values], effect: str, motion: str) -> Values:
     return next(one for one in selections if one["effect"] == effect and one["motion"] in names)
 
 
-def way_left(effect: str, motion: str) -> Callable[[Sequence[Values]], str]:
+def remaining(effect: str, motion: str) -> Callable[[Sequence[Values]], str]:
     return lambda selections: whole(rollout(selections, effect, motion), mean="relative")
 
 
@@ -133,18 +133,22 @@ FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("nats that refining the guide for each window gains", "amortization/gap", error),
     ("the same, median over windows", "amortization/gap_median", median),
     ("nats left to the guide's family, at least", "amortization/approximation_gap", error),
-    ("90 % intervals of c hold, all dimensions", f"simulation/program/codes/{C}/held/90", tenths),
-    ("90 % intervals of c hold, informed dimensions", f"simulation/program/codes/{C}", informed),
-    ("50 % intervals of c hold, informed dimensions", f"simulation/program/codes/{C}/held_informed/50", tenths),
-    ("90 % intervals of z hold, all dimensions", f"simulation/program/codes/{Z}/held/90", tenths),
-    ("90 % intervals of z hold, informed dimensions", f"simulation/program/codes/{Z}", informed),
-    ("90 % region of all codes holds", "simulation/program/joint/90", tenths),
+    ("coverage of 90 % intervals of c, all dimensions", f"simulation/program/codes/{C}/coverage/90", tenths),
+    ("coverage of 90 % intervals of c, informed dimensions", f"simulation/program/codes/{C}", informed),
+    (
+        "coverage of 50 % intervals of c, informed dimensions",
+        f"simulation/program/codes/{C}/coverage_informed/50",
+        tenths,
+    ),
+    ("coverage of 90 % intervals of z, all dimensions", f"simulation/program/codes/{Z}/coverage/90", tenths),
+    ("coverage of 90 % intervals of z, informed dimensions", f"simulation/program/codes/{Z}", informed),
+    ("coverage of the 90 % region of all codes", "simulation/program/joint/90", tenths),
     ("E KL(q, p) of c, nats, and active dimensions", f"codes/{C}", cost),
     ("E KL(q, p) of z, nats, and active dimensions", f"codes/{Z}", cost),
     ("nats that c carries in generated windows", f"codes/{C}/simulated_information", bounds),
     ("nats that z carries in generated windows", f"codes/{Z}/simulated_information", bounds),
-    ("a guide's and a prior's codes told apart", "prior/classifier/prior/told_apart", whole),
-    ("a guide's and another scene's codes told apart", "prior/classifier/shuffled/told_apart", whole),
+    ("AUC: a guide's codes against a prior's", "prior/classifier/prior/auc", whole),
+    ("AUC: a guide's codes against another scene's", "prior/classifier/shuffled/auc", whole),
     ("expected coverage of codes is off by, points", "prior/coverage/codes/prior", points),
     ("expected coverage of first pushes' starts is off by, points", "prior/coverage/first push/prior", points),
     ("first push passes near an object, % (1)", "prior/decoded/first_push_near", groups),
@@ -164,16 +168,28 @@ FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("stated scale over RMS error: features of h", "calibration/scales/h_features/ratio", interval),
     ("stated scale over RMS error: starts of pushes of g", "calibration/scales/g_start/ratio", interval),
     ("stated scale over RMS error: motions of pushes of g", "calibration/scales/g_motion/ratio", interval),
-    ("90 % intervals of f hold, centres that moved", "calibration/scores/f/moved", held),
-    ("90 % intervals of h hold, centres that moved, guide's codes", "calibration/scores/h_guide/moved", held),
+    ("coverage of 90 % intervals of f, centres that moved", "calibration/scores/f/moved", covered),
+    ("coverage of 90 % intervals of h, centres that moved, guide's codes", "calibration/scores/h_guide/moved", covered),
     ("f is off after 1 and 10 segments, cm", "growth/errors/f", ends),
     ("h is off after 1 and 10 segments, cm", "growth/errors/h", ends),
     ("f after 10 segments, of the error if nothing moves", "growth/relative", whole),
     ("f is off along the prior's pushes; objects move, cm", "consistency/selections", missed),
-    ("way left: sampled effect and motion", "consistency/selections", way_left("sampled", "sampled")),
-    ("way left: sampled effect, closest motion", "consistency/selections", way_left("sampled", "closest")),
+    (
+        "remaining distance: sampled effect and motion",
+        "consistency/selections",
+        remaining("sampled", "sampled"),
+    ),
+    (
+        "remaining distance: sampled effect, closest motion",
+        "consistency/selections",
+        remaining("sampled", "closest"),
+    ),
     ("f expects to be left; is left, cm", "consistency/selections", expected),
-    ("way left: chosen effect, closest motion", "consistency/selections", way_left("chosen", "closest")),
+    (
+        "remaining distance: chosen effect, closest motion",
+        "consistency/selections",
+        remaining("chosen", "closest"),
+    ),
 )
 
 

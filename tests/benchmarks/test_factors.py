@@ -27,6 +27,7 @@ def row(method: str, planner: str, objects: int, training_seed: int, scene: int,
     values = dict.fromkeys(SCHEMA.names, 0)
     outcomes = {f"{name}_outcome": "success" if solved else "timeout" for name in ("strict", "published")}
     where = {"task": "crossing", "reward": "sparse", "objects": objects, "seed": scene}
+    where |= {f"{name}_steps": 10 if solved else 7 for name in ("strict", "published")}
     return {**values, **where, **outcomes, "method": method, "planner": planner, "training_seed": training_seed}
 
 
@@ -55,8 +56,10 @@ def test_the_factor_that_matters_is_named_and_the_one_that_does_not_is_zero(tabl
     ended = run_script(FILE, str(table), "--collect", *given, folder=ROOT)
     assert ended.status == 0, ended.errors
     assert "| contact | few | paper | 66.7 %" in ended.output and "| cavin | many | paper | 0.0 %" in ended.output
+    assert "| cavin | many | paper | 0.0 % (0.0 to 11.4) | 60.0 |" in ended.output  # failures take all pushes
     networks = next(line for line in ended.output.splitlines() if line.startswith("| networks, `contact`"))
     assert "+66.7 (" in networks and "0, 20 (4.6e-05)" in networks  # 24 * 2 / 2^20
+    assert "| -33.3 (" in networks  # two thirds of the scenes: 10 pushes instead of 60
     data = next(line for line in ended.output.splitlines() if line.startswith("| data, `many` after `few`"))
     assert "+0.0 (+0.0 to +0.0)" in data and "0, 0 (1)" in data
 
@@ -66,10 +69,10 @@ def test_trainings_are_resampled_not_only_scenes(factors: Any) -> None:
     never = dict.fromkeys(scenes, False)
     one_training = {scene: scene[0] == 0 for scene in scenes}
     mean, low, high = factors.effect([(never, one_training)])
-    assert mean == pytest.approx(100 / 3) and low == 0.0 and high == 100.0  # no training but the first gains
+    assert mean == pytest.approx(1 / 3) and low == 0.0 and high == 1.0  # no training but the first gains
     half = {scene: scene[1] % 2 == 0 for scene in scenes}
     mean, low, high = factors.effect([(never, half)])
-    assert mean == 50.0 and 38 < low < 45 and 55 < high < 62
+    assert mean == 0.5 and 0.38 < low < 0.45 and 0.55 < high < 0.62
 
 
 def test_a_way_without_all_scenes_is_refused(table: Path, tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ def cascade() -> Report:
     rises = {str(count): error(count / 10) for count in (1, 10, 1000)}
     scored = {"moved": {axis: {"coverage": {"90": share}} for axis, share in (("x", 0.8), ("y", 0.9))}}
     code = {
-        "held": {"90": interval(0.9)},
-        "held_informed": {"50": interval(0.55), "90": interval(0.91)},
+        "coverage": {"90": interval(0.9)},
+        "coverage_informed": {"50": interval(0.55), "90": interval(0.91)},
         "informed": 3,
         "dimensions": 16,
         "kl": error(4.5),
@@ -59,7 +59,7 @@ def cascade() -> Report:
     difference = dict.fromkeys(("-ELBO", "h: subgoal centres", "f: next states"), error(5.4))
     near, far = {"distance": 0.003, "chance": 0.001}, {"distance": 0.001, "chance": 0.001}
     aggregate = {name: {"windows": 1000, "all_dimensions": far, "active_dimensions": near} for name in codes}
-    told = {"prior": {"told_apart": interval(0.78)}, "shuffled": {"told_apart": interval(0.93)}}
+    told = {"prior": {"auc": interval(0.78)}, "shuffled": {"auc": interval(0.93)}}
     scales = dict.fromkeys(("f_centers", "f_features", "h_centers", "h_features", "g_start", "g_motion"))
     words = "all codes: at least 19 nats short; k-hat is above 0.67 for 34% of the windows (28% to 41%)."
     guide_error = {"joint": {"rises": rises, "pareto_k": {"above_limit": 0.34}}, "motion_code": {"rises": rises}}
@@ -158,13 +158,13 @@ def test_a_model_with_both_codes_has_every_figure(shown: dict[str, list[str]]) -
         "-ELBO, held-out less training windows, nats": "5.40 ± 0.25",
         "nats from guide to posterior, at least": "100.00 ± 0.25",  # of the most samples, not the first key
         "windows whose k-hat is above its limit": "34 % (28 to 41)",
-        "90 % intervals of c hold, informed dimensions": "91.0 % (89.0 to 94.0), 3 of 16",
+        "coverage of 90 % intervals of c, informed dimensions": "91.0 % (89.0 to 94.0), 3 of 16",
         "first push passes near an object, % (1)": "86.0, 60.0, 20.0, 92.0",
         "codes without their states: distance beyond chance": "0.0020",
         "farthest move by f along the pushes, cm (2)": "10.0, 5.0, 15.0",
-        "90 % intervals of f hold, centres that moved": "85 %",
+        "coverage of 90 % intervals of f, centres that moved": "85 %",
         "f is off after 1 and 10 segments, cm": "2.5, 12.7",
-        "way left: sampled effect, closest motion": "39 % (34 to 44)",
+        "remaining distance: sampled effect, closest motion": "39 % (34 to 44)",
         "f expects to be left; is left, cm": "1.4, 4.9",
     }
     assert {label: shown[label][0] for label in expected} == expected
@@ -176,9 +176,8 @@ def test_what_does_not_apply_to_a_model_is_a_dash(shown: dict[str, list[str]]) -
         "The prior": "-",
         "Consistency": "-",
     }
-    assert (
-        shown["a guide's and a prior's codes told apart"][1] == shown["way left: sampled effect and motion"][1] == "-"
-    )
+    for label in ("AUC: a guide's codes against a prior's", "remaining distance: sampled effect and motion"):
+        assert shown[label][1] == "-"
     assert shown["farthest move by f along the pushes, cm (2)"][1] == "-, 5.0, 15.0"
 
 
@@ -187,7 +186,7 @@ def test_another_report_changes_the_verdict_and_the_figure_that_it_changes_and_n
 ) -> None:
     other = cascade()
     other["sections"]["prior"]["verdict"]["level"] = "good"
-    other["sections"]["prior"]["values"]["classifier"]["prior"]["told_apart"] = interval(0.55)
+    other["sections"]["prior"]["values"]["classifier"]["prior"]["auc"] = interval(0.55)
     other["sections"]["calibration"]["values"]["scales"]["g_start"]["ratio"]["mean"] = None  # not finite
     folders = written(tmp_path / "one", cascade()), written(tmp_path / "other", other)
     found = tables(reports, capsys, monkeypatch, *folders)
@@ -195,7 +194,7 @@ def test_another_report_changes_the_verdict_and_the_figure_that_it_changes_and_n
     assert changed == {
         "section": ["`one`", "`other`"],
         "The prior": ["bad", "good"],
-        "a guide's and a prior's codes told apart": ["78 % (76 to 81)", "55 % (53 to 58)"],
+        "AUC: a guide's codes against a prior's": ["78 % (76 to 81)", "55 % (53 to 58)"],
         "stated scale over RMS error: starts of pushes of g": ["1.40 (1.38 to 1.43)", "-"],
     }
 

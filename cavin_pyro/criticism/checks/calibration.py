@@ -211,7 +211,7 @@ def _findings(results: Scores, energy: Mapping[str, float]) -> Iterator[str]:
             verdict = "about right" if abs(held - 0.9) <= TOLERANCE else "too wide" if held > 0.9 else "too narrow"
             whose = "objects that moved" if group == "moved" else "objects that lay still"
             yield (
-                f"For {whose}, 90 % intervals of x and y from {PREDICTORS[predictor]}, hold {100 * held:.0f} % "
+                f"For {whose}, 90 % intervals of x and y from {PREDICTORS[predictor]}, cover {100 * held:.0f} % "
                 f"({verdict}); stated scale {100 * scale:.2f} cm, RMS error {100 * error:.2f} cm, "
                 f"CRPS {100 * crps:.2f} cm."
             )

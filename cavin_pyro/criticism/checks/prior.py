@@ -29,7 +29,7 @@ from models.model import Model
 from models.state import State, Window
 
 NAME, TITLE = "prior", "Is the prior right, given the state?"
-APART = (0.6, 0.7)  # share of pairs that a classifier tells apart: good up to, bad from
+AUC_LIMITS = (0.6, 0.7)  # of a classifier: good up to, bad from
 GAP = (0.1, 0.15)  # largest deviation of the expected coverage
 NEAR = (0.05, 0.15)  # difference in the share of first pushes that pass near an object
 SOURCES = {"guide": "from the guide", "prior": "from the prior", "shuffled": "from the prior of another scene"}
@@ -41,7 +41,7 @@ enough. For each of {windows} held-out windows of {episodes} episodes, one pair 
 from the prior at the same first state.
 
 A classifier (a small network, cross-validated by episode) reads (s, c, z): the state, the codes, their place in the
-prior, and the subgoal and pushes that they decode to. The share of held-out pairs that it tells apart is 0.5 if prior
+prior, and the subgoal and pushes that they decode to. Its AUC on held-out pairs is 0.5 if prior
 and guide agree; p is from exchanging the pairs of whole episodes, and a large one proves nothing. The expected coverage
 (TARP) asks how many of {samples} codes of the prior lie nearer to a reference than the guide's: in the space of codes,
 and, in the plane, for the start of the first push, with a random object as the reference. The control repeats all of it
@@ -86,7 +86,7 @@ def assess_prior(context: CheckContext, *, windows: int = 1000, samples: int = 5
     numbers = {"windows": len(episodes), "episodes": values["episodes"], "samples": samples}
     curves = {space: {source: curve for source, (_, curve) in found.items()} for space, found in covered.items()}
     caption = (
-        "Left: share of pairs that a classifier tells apart, with 95 % intervals over episodes; 0.5 where the prior is "
+        "Left: AUC of a classifier, with 95 % intervals over episodes; 0.5 where the prior is "
         "right. Right: expected coverage against its level; on the diagonal where it is right."
     )
     return Section(
@@ -196,8 +196,8 @@ def _verdict(
 ) -> Verdict:
     levels = []
     if tests:
-        share = tests["prior"].told_apart
-        levels.append(grade(share.low, share.high, good=APART[0], bad=APART[1]))
+        share = tests["prior"].auc
+        levels.append(grade(share.low, share.high, good=AUC_LIMITS[0], bad=AUC_LIMITS[1]))
     gaps = [found["prior"][0] for found in covered.values()]
     levels += [grade(gap.low, gap.high, good=GAP[0], bad=GAP[1]) for gap in gaps]
     if "first_push_near" in decoded:
@@ -205,10 +205,11 @@ def _verdict(
         ends = (0.0 if low <= 0 <= high else min(abs(low), abs(high)), max(abs(low), abs(high)))
         levels.append(grade(*ends, good=NEAR[0], bad=NEAR[1]))
     rule = (
-        f"The worst of: pairs told apart (good up to {APART[0]:g}, bad from {APART[1]:g}), deviation of the expected "
-        f"coverage (good up to {GAP[0]:g}, bad from {GAP[1]:g}), and the difference in first pushes that pass near an "
-        f"object (good up to {100 * NEAR[0]:g} points, bad from {100 * NEAR[1]:g}). Good if the whole 95 % interval "
-        "over episodes is on the good side, bad if the whole is on the bad one; a large p counts for nothing."
+        f"The worst of: a classifier's AUC (good up to {AUC_LIMITS[0]:g}, bad from {AUC_LIMITS[1]:g}), deviation of "
+        f"the expected coverage (good up to {GAP[0]:g}, bad from {GAP[1]:g}), and the difference in first pushes that "
+        f"pass near an object (good up to {100 * NEAR[0]:g} points, bad from {100 * NEAR[1]:g}). Good if the whole "
+        "95 % interval over episodes is on the good side, bad if the whole is on the bad one; a large p counts for "
+        "nothing."
     )
     advice = (
         "Have the planner choose among many samples instead of trusting one; train with prior=mixture, or for "
@@ -224,10 +225,10 @@ def _findings(
 ) -> list[str]:
     sentences = []
     if tests:
-        told, shuffled = (as_percent(tests[source].told_apart._asdict()) for source in ("prior", "shuffled"))
+        told, shuffled = (as_percent(tests[source].auc._asdict()) for source in ("prior", "shuffled"))
         sentences.append(
-            f"A classifier of (s, c, z) tells {told} of held-out pairs apart (50 % by chance; p = "
-            f"{tests['prior'].p_value:.3g}); {shuffled} when the prior's codes are those of another scene."
+            f"A classifier of (s, c, z) orders {told} of held-out pairs correctly (AUC; 50 % by chance; p = "
+            f"{tests['prior'].p_value:.3g}), and {shuffled} when the prior's codes are those of another scene."
         )
     for space, found in covered.items():
         gap, control = found["prior"][0], found["shuffled"][0]
@@ -254,9 +255,9 @@ def _tables(
     covered: dict[str, dict[str, tuple[Interval, Tensor]]],
     decoded: dict[str, dict[str, Any]],
 ) -> list[Table]:
-    header = ["codes from the guide against codes", "told apart", "low", "high", "accuracy", "p", "KL at least (nats)"]
+    header = ["codes from the guide against codes", "AUC", "low", "high", "accuracy", "p", "KL at least (nats)"]
     rows: list[list[Any]] = [
-        [SOURCES[source], *test.told_apart, test.accuracy.mean, test.p_value, max(0.0, test.divergence.low)]
+        [SOURCES[source], *test.auc, test.accuracy.mean, test.p_value, max(0.0, test.divergence.low)]
         for source, test in tests.items()
     ]
     gaps = [

@@ -1,4 +1,4 @@
-"""Simulation-based calibration: whether the guide's intervals hold the codes that made a window."""
+"""Simulation-based calibration: whether the guide's intervals cover the codes that made a window."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from cavin_pyro.criticism.statistics.inference.simulation import (
     LEVELS,
     Calibration,
     calibrate,
-    held,
-    held_jointly,
+    coverage,
+    joint_coverage,
     simulate,
 )
 from cavin_pyro.criticism.statistics.intervals import as_percent
@@ -27,20 +27,20 @@ from cavin_pyro.criticism.verdicts.verdict import Verdict, conclude, within, wor
 
 NAME, TITLE = "simulation", "Simulation-based calibration of the guide"
 ACTIVE_CONTRACTION = 0.1  # a dimension counts as informed where its variance shrinks by more, given s
-GOOD, BAD = (0.86, 0.94), (0.80, 0.98)  # of what 90 % intervals hold
+GOOD, BAD = (0.86, 0.94), (0.80, 0.98)  # of the coverage of 90 % intervals
 VARIANTS = {
     "program": "as the program says",
     "clean_features": "h's features without noise",
 }
 
 EXPLANATION = """
-Codes are drawn from the prior at the first states of held-out windows of {episodes} episodes, {windows} windows are
-generated from them by the model's program, and {samples} codes are drawn from the guide for each. If the guide were the
-posterior, its 90 % intervals would hold the true code in 90 % of the windows, whatever the model: so what is missing is
-the guide's fault alone. Ranks heaped at the ends mean a guide that is too narrow; in the middle, too wide. The joint
-region holds the codes at which the guide's density is highest. Contraction is how much of the prior's variance, given
-s, the posterior takes away: 0 where a dimension learns nothing. Dimensions that learn nothing are right without merit,
-so that informed ones (contraction above {contraction:g}) count on their own.
+Codes are sampled from the prior at the first states of held-out windows of {episodes} episodes, the model's program
+generates {windows} windows from them, and {samples} codes are sampled from the guide for each. If the guide were the
+posterior, its 90 % intervals would cover the true code in 90 % of the windows, whatever the model. So a lack of
+coverage is the guide's error alone. Ranks heaped at the ends mean a guide that is too narrow; in the middle, too wide.
+The joint region has the codes at which the guide's density is highest. Contraction is how much of the prior's variance,
+given s, the posterior takes away: 0 where a dimension learns nothing. Dimensions that learn nothing are right without
+merit, so that informed ones (contraction above {contraction:g}) count on their own.
 
 The program gives features of unit length an isotropic noise, so that generated features are longer than any that the
 guide has seen; "h's features without noise" shows how much of a deviation this explains.
@@ -102,15 +102,17 @@ def _values(found: Calibration, episodes: Tensor) -> dict[str, Any]:
         inside = ((ranks - 0.5).abs() <= LEVELS[-1] / 2).double()
         each = [mean_interval(column, episodes) for column in inside.T]
         codes[name] = {
-            "held": {_key(level): held(ranks, level, episodes)._asdict() for level in LEVELS},
-            "held_informed": {_key(level): held(_informed(found, name), level, episodes)._asdict() for level in LEVELS},
+            "coverage": {_key(level): coverage(ranks, level, episodes)._asdict() for level in LEVELS},
+            "coverage_informed": {
+                _key(level): coverage(_informed(found, name), level, episodes)._asdict() for level in LEVELS
+            },
             "informed": int((found.contraction[name] > ACTIVE_CONTRACTION).sum()),
             "dimensions": ranks.shape[1],
-            "held_by_dimension": [one._asdict() for one in each],
+            "coverage_by_dimension": [one._asdict() for one in each],
             "contraction": found.contraction[name].tolist(),
             "spread": found.spread[name].tolist(),
         }
-    joint = {_key(level): held_jointly(found.joint, level, episodes)._asdict() for level in LEVELS}
+    joint = {_key(level): joint_coverage(found.joint, level, episodes)._asdict() for level in LEVELS}
     return {"codes": codes, "joint": joint}
 
 
@@ -119,11 +121,11 @@ def _key(level: float) -> str:
 
 
 def _verdict(values: dict[str, Any], codes: tuple[str, ...], episodes: Tensor) -> Verdict:
-    ninety = [values["program"]["codes"][name]["held_informed"]["90"] for name in codes]
+    ninety = [values["program"]["codes"][name]["coverage_informed"]["90"] for name in codes]
     ninety.append(values["program"]["joint"]["90"])
     level = worst(within(one["low"], one["high"], good=GOOD, bad=BAD) for one in ninety)
     rule = (
-        "What 90 % intervals hold, of the informed dimensions of each code and jointly: good if the 95 % interval "
+        "What 90 % intervals cover, of the informed dimensions of each code and jointly: good if the 95 % interval "
         f"over episodes lies within {GOOD[0]:.0%} to {GOOD[1]:.0%}, bad if it lies outside of {BAD[0]:.0%} to "
         f"{BAD[1]:.0%}."
     )
@@ -139,17 +141,17 @@ def _findings(values: dict[str, Any], found: dict[str, Calibration]) -> list[str
     for variant in found:
         for name, one in values[variant]["codes"].items():
             contraction = found[variant].contraction[name]
-            worst_held = min(entry["mean"] for entry in one["held_by_dimension"])
+            worst = min(entry["mean"] for entry in one["coverage_by_dimension"])
             sentences.append(
-                f"{SYMBOLS[name]}, {VARIANTS[variant]}: 90 % intervals hold {as_percent(one['held']['90'])} over all "
-                f"dimensions and {as_percent(one['held_informed']['90'])} over the {one['informed']} informed ones of "
-                f"{one['dimensions']} (worst dimension {worst_held:.0%}); 50 % intervals hold "
-                f"{as_percent(one['held_informed']['50'])} of these. Contraction given s is "
+                f"{SYMBOLS[name]}, {VARIANTS[variant]}: 90 % intervals cover {as_percent(one['coverage']['90'])} over "
+                f"all dimensions and {as_percent(one['coverage_informed']['90'])} over the {one['informed']} informed "
+                f"ones of {one['dimensions']} (worst dimension {worst:.0%}); 50 % intervals cover "
+                f"{as_percent(one['coverage_informed']['50'])} of these. Contraction given s is "
                 f"{contraction.max().item():.2f} at most."
             )
         joint = values[variant]["joint"]
         sentences.append(
-            f"Jointly, {VARIANTS[variant]}: the 90 % region holds {as_percent(joint['90'])}, the 50 % region "
+            f"Jointly, {VARIANTS[variant]}: the 90 % region covers {as_percent(joint['90'])}, the 50 % region "
             f"{as_percent(joint['50'])}."
         )
     return sentences
@@ -159,19 +161,19 @@ def _tables(values: dict[str, Any], found: dict[str, Calibration]) -> list[Table
     rows: list[list[Any]] = []
     for variant in found:
         for name, one in values[variant]["codes"].items():
-            cells = [end for level in LEVELS for end in one["held_informed"][_key(level)].values()]
+            cells = [end for level in LEVELS for end in one["coverage_informed"][_key(level)].values()]
             rows.append([f"{SYMBOLS[name]}, {VARIANTS[variant]}", one["informed"], *cells])
         cells = [end for level in LEVELS for end in values[variant]["joint"][_key(level)].values()]
         rows.append([f"jointly, {VARIANTS[variant]}", None, *cells])
     header = [
         "codes",
         "informed",
-        *(f"{_key(level)} %{end}" for level in LEVELS for end in (" holds", ", low", ", high")),
+        *(f"{_key(level)} %{end}" for level in LEVELS for end in (" covered", ", low", ", high")),
     ]
     single = [
         [
             f"{SYMBOLS[name]}[{number}]",
-            *Interval(**one["held_by_dimension"][number]),
+            *Interval(**one["coverage_by_dimension"][number]),
             one["contraction"][number],
             one["spread"][number],
         ]
@@ -179,5 +181,5 @@ def _tables(values: dict[str, Any], found: dict[str, Calibration]) -> list[Table
         for number in range(one["dimensions"])
         if one["contraction"][number] > ACTIVE_CONTRACTION
     ]
-    names = ["informed dimension", "90 % holds", "low", "high", "contraction", "RMS z-score"]
+    names = ["informed dimension", "90 % covered", "low", "high", "contraction", "RMS z-score"]
     return [Table(header, rows), Table(names, single)]

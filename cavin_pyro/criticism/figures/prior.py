@@ -16,16 +16,16 @@ STYLES = {"codes": "-", "first push": "--"}
 
 
 def draw_prior(tests: Mapping[str, ClassifierTest], curves: Mapping[str, Mapping[str, Tensor]]) -> Figure:
-    """Shares of pairs told apart by source, and expected coverage by space and source."""
+    """AUC by source, and expected coverage by space and source."""
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     shares, coverage = figure.subplots(1, 2)
     for place, (source, test) in enumerate(tests.items()):
-        mean, low, high = test.told_apart
+        mean, low, high = test.auc
         shares.errorbar(
             [place], [mean], [[max(0.0, mean - low)], [max(0.0, high - mean)]], fmt="o", capsize=4, color=COLORS[source]
         )
     shares.axhline(0.5, color="#9A9A9A", linestyle="--", linewidth=1.0)
-    shares.set(xlim=(-0.6, 1.6), ylim=(0.3, 1.02), ylabel="share of pairs told apart")
+    shares.set(xlim=(-0.6, 1.6), ylim=(0.3, 1.02), ylabel="AUC of a classifier")
     shares.set_xticks(range(len(tests)), [NAMES[source] for source in tests])
     for space, found in curves.items():
         for source, curve in found.items():

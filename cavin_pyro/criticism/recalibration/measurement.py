@@ -12,7 +12,7 @@ from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.statistics.clusters import mean_interval
 from cavin_pyro.criticism.statistics.codes import SYMBOLS
 from cavin_pyro.criticism.statistics.elbo import TOTAL, terms_by_window
-from cavin_pyro.criticism.statistics.inference.simulation import calibrate, held, held_jointly, simulate
+from cavin_pyro.criticism.statistics.inference.simulation import calibrate, coverage, joint_coverage, simulate
 from cavin_pyro.criticism.statistics.intervals import as_percent
 from cavin_pyro.criticism.statistics.predictions import (
     has_subgoals,
@@ -38,10 +38,10 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int, repeats:
         repeats: windows that are simulated from each first state.
 
     Returns:
-        `windows`, `simulated`, `episodes`; of simulated windows the coverage of 90 % intervals, by code: `held` over
-        all dimensions, `held_informed` over those that learn from the window (`informed` of `dimensions`), `held_worst`
-        in the dimension of least coverage, and `joint`, of the region of highest density. Of real windows
-        `minus_elbo`, in nats, and `subgoal_held`, the coverage of the centres that moved by 90 % intervals of h's
+        `windows`, `simulated`, `episodes`; of simulated windows the coverage of 90 % intervals, by code: `coverage`
+        over all dimensions, `coverage_informed` over those that learn from the window (`informed` of `dimensions`),
+        `coverage_worst` in the dimension of least coverage, and `joint`, of the region of highest density. Of real
+        windows `minus_elbo`, in nats, and `subgoal_coverage`, of the centres that moved by 90 % intervals of h's
         predictions with codes of the guide; None without h, or if nothing moved.
     """
     window, episodes = context.held_out(windows)
@@ -52,11 +52,13 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int, repeats:
     by_code = {}
     for name, ranks in found.ranks.items():
         informed = found.contraction[name] > ACTIVE_CONTRACTION
-        each = [held(column, LEVEL, simulated_from) for column in ranks.T]
+        each = [coverage(column, LEVEL, simulated_from) for column in ranks.T]
         by_code[SYMBOLS[name]] = {
-            "held": held(ranks, LEVEL, simulated_from)._asdict(),
-            "held_informed": held(ranks[:, informed] if informed.any() else ranks, LEVEL, simulated_from)._asdict(),
-            "held_worst": min(each, key=lambda one: one.mean)._asdict(),
+            "coverage": coverage(ranks, LEVEL, simulated_from)._asdict(),
+            "coverage_informed": coverage(
+                ranks[:, informed] if informed.any() else ranks, LEVEL, simulated_from
+            )._asdict(),
+            "coverage_worst": min(each, key=lambda one: one.mean)._asdict(),
             "informed": int(informed.sum()),
             "dimensions": ranks.shape[1],
             "contraction": found.contraction[name].max().item(),
@@ -76,9 +78,9 @@ def measure_guide(context: CheckContext, *, windows: int, samples: int, repeats:
         "simulated": len(simulated_from),
         "episodes": len(episodes.unique()),
         "codes": by_code,
-        "joint": held_jointly(found.joint, LEVEL, simulated_from)._asdict(),
+        "joint": joint_coverage(found.joint, LEVEL, simulated_from)._asdict(),
         "minus_elbo": mean_interval(terms[TOTAL], episodes)._asdict(),
-        "subgoal_held": decoded,
+        "subgoal_coverage": decoded,
     }
 
 
@@ -89,17 +91,17 @@ def sentences(before: Measured, after: Measured) -> list[str]:
     for symbol, code in before["codes"].items():
         now = after["codes"][symbol]
         lines += [
-            f"90 % intervals of {symbol} hold {percent(code['held'])}, now {percent(now['held'])}; of informed "
-            f"dimensions ({code['informed']}, now {now['informed']}) {percent(code['held_informed'])}, "
-            f"now {percent(now['held_informed'])}; of the worst dimension {percent(code['held_worst'])}, "
-            f"now {percent(now['held_worst'])}"
+            f"90 % intervals of {symbol} cover {percent(code['coverage'])}, now {percent(now['coverage'])}; of "
+            f"informed dimensions ({code['informed']}, now {now['informed']}) {percent(code['coverage_informed'])}, "
+            f"now {percent(now['coverage_informed'])}; of the worst dimension {percent(code['coverage_worst'])}, "
+            f"now {percent(now['coverage_worst'])}"
         ]
-    lines.append(f"90 % regions of all codes hold {percent(before['joint'])}, now {percent(after['joint'])}")
+    lines.append(f"90 % regions of all codes cover {percent(before['joint'])}, now {percent(after['joint'])}")
     elbo, now = (one["minus_elbo"]["mean"] for one in (before, after))
     lines.append(f"real windows: -ELBO {elbo:.2f} nats, now {now:.2f}")
-    if before["subgoal_held"]:
+    if before["subgoal_coverage"]:
         lines.append(
-            f"real windows: 90 % intervals of h's centres that moved hold {percent(before['subgoal_held'])}, "
-            f"now {percent(after['subgoal_held'])}"
+            f"real windows: 90 % intervals of h's centres that moved cover {percent(before['subgoal_coverage'])}, "
+            f"now {percent(after['subgoal_coverage'])}"
         )
     return lines

@@ -23,8 +23,8 @@ GLOSSARY = {
     "intervals must cover the codes at their nominal rate.",
     "coverage": "how often an interval contains the truth: 90 % of the time for a correct 90 % interval.",
     "contraction": "the fraction by which the posterior reduces the prior's variance, given s.",
-    "told apart": "share of pairs (one code from the guide, one from the prior) that a classifier orders correctly; "
-    "0.5 by chance.",
+    "AUC": "area under the ROC curve of a classifier: the share of pairs (one code from the guide, one from the prior) "
+    "that it orders correctly; 0.5 by chance.",
     "expected coverage": "TARP: the share of samples nearer to a reference point than the truth, which must be "
     "uniform.",
     "PIT": "where the truth lies among the samples of a prediction, from 0 to 1; uniform if the prediction is right.",

@@ -83,13 +83,13 @@ def calibrate(
     return Calibration(ranks, joint, contraction, spread)
 
 
-def held(ranks: Tensor, level: float, episodes: Tensor) -> Interval:
+def coverage(ranks: Tensor, level: float, episodes: Tensor) -> Interval:
     """Coverage of central intervals of a level, by ranks `[B, D]` or `[B]`: the mean over dimensions."""
     inside = ((ranks - 0.5).abs() <= level / 2).double()
     return mean_interval(inside.flatten(1).mean(1) if inside.dim() > 1 else inside, episodes)
 
 
-def held_jointly(joint: Tensor, level: float, episodes: Tensor) -> Interval:
+def joint_coverage(joint: Tensor, level: float, episodes: Tensor) -> Interval:
     """Coverage of the region of highest density of a level, by `Calibration.joint`."""
     return mean_interval((joint <= level).double(), episodes)
 

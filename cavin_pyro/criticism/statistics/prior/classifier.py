@@ -27,7 +27,7 @@ DROPOUT = 0.5  # of the inputs, against overfitting
 class ClassifierTest(NamedTuple):
     """Outcome of a test."""
 
-    told_apart: Interval  # share of held-out pairs whose row from the first sample gets the higher logit; 0.5 by chance
+    auc: Interval  # share of held-out pairs whose row from the first sample gets the higher logit; 0.5 by chance
     accuracy: Interval  # of single rows; 0.5 by chance
     p_value: float  # of the share, with the two rows of all pairs of an episode exchanged at once
     divergence: Interval  # nats; a lower bound on KL(first | second), given what both have in common

@@ -19,9 +19,9 @@ def test_a_prior_that_is_right_passes_and_one_of_other_scenes_fails(scenes: Simp
     assert right.verdict is not None and right.verdict.level == "good", right.findings
     assert wrong.verdict is not None and wrong.verdict.level == "bad"
     apart = wrong.values["classifier"]["prior"]
-    assert apart["told_apart"]["low"] > 0.8 and apart["p_value"] == 1 / 100
+    assert apart["auc"]["low"] > 0.8 and apart["p_value"] == 1 / 100
     # The control is what the shuffled prior is: a test that could not see it would prove nothing.
-    assert right.values["classifier"]["shuffled"]["told_apart"]["low"] > 0.8
+    assert right.values["classifier"]["shuffled"]["auc"]["low"] > 0.8
     # Heaps of codes without their states look alike, so the marginal test must not be asked.
     marginal = assess_aggregate(scenes.context(scenes.guide(), shuffled=True), permutations=99)
     assert marginal.values["effect_code"]["all_dimensions"]["p_value"] > 0.05

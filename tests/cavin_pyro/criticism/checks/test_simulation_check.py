@@ -20,7 +20,7 @@ def test_the_posterior_is_calibrated_and_contracts_as_theory_says(scenes: Simple
     assert found["codes"]["motion_code"]["contraction"] == pytest.approx([12 / 13] * 4, abs=0.03)
     assert found["codes"]["effect_code"]["spread"] == pytest.approx([1.0] * 3, abs=0.1)
     for level in (50, 90):
-        for one in (found["joint"], *(code["held"] for code in found["codes"].values())):
+        for one in (found["joint"], *(code["coverage"] for code in found["codes"].values())):
             assert one[str(level)]["mean"] == pytest.approx(level / 100, abs=0.05)
 
 
@@ -30,7 +30,7 @@ def test_a_guide_too_narrow_or_too_wide_is_found(stretch: float, level: str, sce
     assert section.verdict is not None and section.verdict.level == level
     expected = math.erf(1.645 * stretch / math.sqrt(2))
     for code in section.values["program"]["codes"].values():
-        assert code["held"]["90"]["mean"] == pytest.approx(expected, abs=0.04)
+        assert code["coverage"]["90"]["mean"] == pytest.approx(expected, abs=0.04)
 
 
 def test_what_a_model_generates_carries_what_theory_gives(scenes: SimpleNamespace) -> None:

@@ -29,7 +29,7 @@ def test_only_the_guide_changes_and_the_checkpoint_says_so(
     line = [f"checkpoint={trained}", f"data={pushes}", "output=out", *OPTIONS]
     done = shell.run_command("calibrate", *line, folder=tmp_path)
     assert done.status == 0, done.errors
-    assert "90 % intervals of c hold" in done.output and "real windows: -ELBO" in done.output
+    assert "90 % intervals of c cover" in done.output and "real windows: -ELBO" in done.output
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "calibration.json",
         "checkpoint.safetensors",

@@ -130,12 +130,12 @@ def test_measurements_tell_narrow_guides_and_what_they_cost(scenes: SimpleNamesp
         stretch: measure_guide(scenes.context(scenes.guide(stretch)), windows=600, samples=40) for stretch in (0.5, 1.0)
     }
     for code in found[1.0]["codes"].values():
-        assert code["held_informed"]["mean"] == pytest.approx(0.9, abs=0.03)
-        assert code["held"]["mean"] - 0.05 < code["held_worst"]["mean"] <= code["held"]["mean"]
+        assert code["coverage_informed"]["mean"] == pytest.approx(0.9, abs=0.03)
+        assert code["coverage"]["mean"] - 0.05 < code["coverage_worst"]["mean"] <= code["coverage"]["mean"]
     for code in found[0.5]["codes"].values():
-        assert code["held_informed"]["mean"] == pytest.approx(math.erf(0.5 * 1.645 / math.sqrt(2)), abs=0.04)
+        assert code["coverage_informed"]["mean"] == pytest.approx(math.erf(0.5 * 1.645 / math.sqrt(2)), abs=0.04)
     # log q of a guide half as wide is larger by log 2 and loses (1 - 1/4) / 2, for each of seven dimensions
     cost = found[0.5]["minus_elbo"]["mean"] - found[1.0]["minus_elbo"]["mean"]
     assert cost == pytest.approx(7 * (math.log(2) - 0.375), abs=0.3)
     lines = sentences(found[0.5], found[1.0])
-    assert lines[0].startswith("90 % intervals of c hold 5") and lines[-2].startswith("real windows: -ELBO")
+    assert lines[0].startswith("90 % intervals of c cover 5") and lines[-2].startswith("real windows: -ELBO")

@@ -11,20 +11,20 @@ def normals(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_rows_of_one_distribution_are_not_told_apart() -> None:
+def test_rows_of_one_distribution_are_not_auc() -> None:
     state = normals(400, 2, seed=2)
     rows = [torch.cat((state, state + normals(400, 2, seed=seed)), -1) for seed in (0, 1)]
     found = classifier_test(*rows, torch.arange(400) // 4, permutations=99)
-    assert found.told_apart.low < 0.5 < found.told_apart.high and found.p_value > 0.05
+    assert found.auc.low < 0.5 < found.auc.high and found.p_value > 0.05
     assert found.divergence.low < 0.02
 
 
-def test_codes_of_other_states_are_told_apart_though_the_heaps_are_equal() -> None:
+def test_codes_of_other_states_are_auc_though_the_heaps_are_equal() -> None:
     state = normals(400, 2, seed=2)
     code = state + 0.3 * normals(400, 2)
     rows = [torch.cat((state, one, one - state), -1) for one in (code, code.roll(4, 0))]
     found = classifier_test(*rows, torch.arange(400) // 4, permutations=99)
-    assert found.told_apart.low > 0.9 and found.p_value == 1 / 100 and found.divergence.mean > 0.5
+    assert found.auc.low > 0.9 and found.p_value == 1 / 100 and found.divergence.mean > 0.5
 
 
 def test_a_classifier_that_knows_the_episode_learns_nothing_from_it() -> None:
@@ -32,7 +32,7 @@ def test_a_classifier_that_knows_the_episode_learns_nothing_from_it() -> None:
     sign = (torch.randint(0, 2, (40,), generator=torch.Generator().manual_seed(1)) * 2.0 - 1).repeat_interleave(10)
     rows = [sign.unsqueeze(-1) * direction + 0.01 * normals(400, 1, seed=5) for direction in (1, -1)]
     found = classifier_test(*rows, torch.arange(400) // 10, permutations=99)
-    assert found.p_value > 0.02 and found.told_apart.high - found.told_apart.low > 0.15
+    assert found.p_value > 0.02 and found.auc.high - found.auc.low > 0.15
 
 
 def test_the_bound_stays_below_the_divergence() -> None:
