@@ -1,4 +1,4 @@
-"""What networks, data and planner bring: `python benchmarks/factors.py docs/measurements/factors-episodes.parquet`.
+"""What networks, data and planner bring: `python benchmarks/factors.py docs/measurements/reproduction/factors.parquet`.
 
 Two of each, so eight ways to play the same scenes: a row per way with its rate of success (95 % interval, Wilson) and
 its mean pushes (a failed episode counts as the 60 that it may have); then a row per factor. Its effects are
@@ -144,7 +144,7 @@ def lines(rows: Sequence[Row], criterion: str) -> Iterator[str]:
         points = interval(tuple(100 * value for value in effect(each)))  # type: ignore[arg-type]
         fewer = interval(effect(list(pairs(taken[number], place))))
         shown = [f"{one}, {other} ({next(tests):.2g})" for one, other in (alone(*pair) for pair in each)]
-        yield f"| {FACTORS[place]}, `{after}` after `{before}` | {number} | {points} | {fewer} | {'; '.join(shown)} |"
+        yield f"| {FACTORS[place]}, `{after}` instead of `{before}` | {number} | {points} | {fewer} | {'; '.join(shown)} |"
 
 
 def main() -> None:

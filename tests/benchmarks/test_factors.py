@@ -60,7 +60,7 @@ def test_the_factor_that_matters_is_named_and_the_one_that_does_not_is_zero(tabl
     networks = next(line for line in ended.output.splitlines() if line.startswith("| networks, `contact`"))
     assert "+66.7 (" in networks and "0, 20 (4.6e-05)" in networks  # 24 * 2 / 2^20
     assert "| -33.3 (" in networks  # two thirds of the scenes: 10 pushes instead of 60
-    data = next(line for line in ended.output.splitlines() if line.startswith("| data, `many` after `few`"))
+    data = next(line for line in ended.output.splitlines() if line.startswith("| data, `many` instead of `few`"))
     assert "+0.0 (+0.0 to +0.0)" in data and "0, 0 (1)" in data
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from cavin_pyro.reproduction.results import PAGE, write_results
-from cavin_pyro.reproduction.table import TABLE, Row, read_table
+from cavin_pyro.reproduction.table import CRITERIA, TABLE, Row, read_table
+from tests.benchmarks.loading import load
 from tests.docs.pages import ROOT
 
 PUBLISHED = ROOT / "docs" / "measurements" / "reproduction"
@@ -61,3 +62,11 @@ def test_the_explanation_of_the_reports_quotes_rows_of_the_measurements() -> Non
     rows = [line for line in explanation.splitlines() if line.startswith("| ")]
     assert len(rows) > 30
     assert not [row for row in rows if row not in measured.splitlines()]
+
+
+def test_the_page_shows_what_the_table_of_factors_says() -> None:
+    factors, page = load("factors"), (PUBLISHED.parent / "reproduction.md").read_text().splitlines()
+    rows = factors.stored(PUBLISHED / "factors.parquet")
+    shown = [line for criterion in CRITERIA for line in factors.lines(rows, criterion)]
+    assert len(shown) == 2 * (10 + 1 + 8) and set(shown) - {""} <= set(page)
+    assert len({(row["data"], row["method"], row["planner"], row["objects"], row["seed"]) for row in rows}) == len(rows)
