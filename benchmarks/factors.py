@@ -144,7 +144,8 @@ def lines(rows: Sequence[Row], criterion: str) -> Iterator[str]:
         points = interval(tuple(100 * value for value in effect(each)))  # type: ignore[arg-type]
         fewer = interval(effect(list(pairs(taken[number], place))))
         shown = [f"{one}, {other} ({next(tests):.2g})" for one, other in (alone(*pair) for pair in each)]
-        yield f"| {FACTORS[place]}, `{after}` instead of `{before}` | {number} | {points} | {fewer} | {'; '.join(shown)} |"
+        title = f"{FACTORS[place]}, `{after}` instead of `{before}`"
+        yield f"| {title} | {number} | {points} | {fewer} | {'; '.join(shown)} |"
 
 
 def main() -> None:
