@@ -51,6 +51,9 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             if "--version" in sys.argv[1:]:
                 print(f"cavin_pyro {__version__}")
                 return
+            # Torch, not imported yet, reads it. Several threads wait for one another after each of many small products:
+            # where another program uses a core, plans would take fifty times as long, and training would stand still.
+            os.environ.setdefault("OMP_NUM_THREADS", "1")
             guarded(check_packages)
             with without_collections():  # importing the parts takes longer than all else here
                 line, composed = guarded(lambda: _check(name))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -63,3 +64,15 @@ def test_freed_memory_is_kept_however_often_that_is_asked_for() -> None:
     before, once, twice = json.loads(done.stdout)
     assert before > 10_000
     assert once < before / 100 and twice < before / 100
+
+
+@pytest.mark.parametrize(("given", "threads"), [(None, 1), ("2", 2)])
+def test_a_command_computes_in_one_thread_unless_the_environment_says_otherwise(
+    given: str | None, threads: int, tmp_path: Path
+) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    environment |= {} if given is None else {"OMP_NUM_THREADS": given}
+    script = "import cavin_pyro.plan as plan; plan.main(); import torch; print(torch.get_num_threads())"
+    command = [sys.executable, "-c", script, "--cfg", "job"]
+    shown = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert shown.stdout.splitlines()[-1] == str(threads)
