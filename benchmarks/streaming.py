@@ -22,7 +22,7 @@ import torch
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.parts import build_guide, build_model
-from cavin_pyro.data.dataset import write_metadata, write_shard
+from cavin_pyro.data.dataset import shard_digest, write_metadata, write_shard
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.storage.digests import tensors_digest
@@ -76,7 +76,8 @@ def write_random(folder: Path, files: int, pointnet: PointNet) -> Path:
         write_shard(folder / f"episodes-{number:05d}.h5", arrays)
         features = generator.normal(size=(*states, 64)).astype(np.float32)
         features /= np.linalg.norm(features, axis=-1, keepdims=True)
-        write_shard(beside / f"episodes-{number:05d}.h5", {"features": features})
+        digest = np.frombuffer(bytes.fromhex(shard_digest(folder / f"episodes-{number:05d}.h5")), np.uint8)
+        write_shard(beside / f"episodes-{number:05d}.h5", {"features": features, "shard_digest": digest})
     counts = {"shards": files, "episodes": files * EPISODES, "transitions": files * EPISODES * STEPS}
     write_metadata(folder, {"configuration": {"steps": STEPS}, **counts})
     return folder

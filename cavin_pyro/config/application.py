@@ -32,8 +32,8 @@ from cavin_pyro.config.imports import without_collections
 PACKAGES = ("models", "guides", "planning", "envs")
 REPEATING_SECONDS = 1.0
 RESENDING_SECONDS = 0.05  # for a signal whose exception was dropped
-_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EFBIG, errno.EIO}
-_DISK_ERRORS |= {errno.ENAMETOOLONG}
+_REFUSALS = ("ENOSPC", "EDQUOT", "EACCES", "EPERM", "EROFS", "EFBIG", "EIO", "ENAMETOOLONG")
+_DISK_ERRORS = {getattr(errno, name) for name in _REFUSALS}
 
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "calculation overflowed")  # torch's words
 

@@ -20,7 +20,8 @@ from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.data.world import collecting_world
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
-from cavin_pyro.storage.digests import file_digest, tensors_digest
+from cavin_pyro.storage.digests import tensors_digest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import check_fit, geometry_of
 from cavin_pyro.storage.models import model_of
 from cavin_pyro.storage.provenance import provenance

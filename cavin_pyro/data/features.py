@@ -1,8 +1,7 @@
 """Geometric features of a dataset, computed once and stored beside it: `features-FINGERPRINT/episodes-NNNNN.h5`.
 
-A file of features tells the SHA-256 of the shard that they were made from (`shard_digest`), so those of another shard
-under the same name are never used: they are made again. Files of older versions lack it. Their features are compared
-with those of a few clouds of the shard; if these fit, the file is kept and told its shard.
+A file of features holds the SHA-256 of the shard that they were computed from (`shard_digest`). Those of another shard
+under the same name are computed again, and so are files of older versions, which lack it.
 """
 
 from __future__ import annotations
@@ -11,10 +10,9 @@ import hashlib
 import inspect
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +20,6 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import (
-    Arrays,
     check_distinct,
     read_metadata,
     read_shard,
@@ -36,7 +33,6 @@ from cavin_pyro.storage.files import clear_abandoned
 from models.networks.geometry import Geometry
 
 BATCH = 4096  # clouds
-COMPARED, TOLERANCE = 64, 1e-3  # clouds whose features must be those that an older version stored, up to rounding
 ABANDONED_SECONDS = 3600.0  # a file that another training writes there is younger
 
 
@@ -71,14 +67,11 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
     shard, metadata = shard_path(folder, number), read_metadata(folder)
     path = folder / f"features-{fingerprint}" / shard.name
     digest = np.frombuffer(bytes.fromhex(shard_digest(shard)), np.uint8)
-    stored = _read_stored(path, metadata)
-    if "shard_digest" in stored and np.array_equal(stored["shard_digest"], digest):
-        return stored["features"]
-    clouds = read_shard(shard, ("clouds",), metadata=metadata)["clouds"]
-    if "features" in stored and "shard_digest" not in stored and _fit(stored["features"], clouds, geometry):
-        features = stored["features"]
-    else:
-        features = cloud_features(geometry, clouds)
+    with suppress(UserError):  # there are none, or damaged ones, which is no loss
+        stored = read_shard(path, BESIDE, metadata=metadata)
+        if np.array_equal(stored["shard_digest"], digest):
+            return stored["features"]
+    features = cloud_features(geometry, read_shard(shard, ("clouds",), metadata=metadata)["clouds"])
     with suppress(OSError):  # a dataset on a read-only or full disk can still be trained on
         path.parent.mkdir(exist_ok=True)
         clear_abandoned(path.parent, older_than=ABANDONED_SECONDS)
@@ -95,27 +88,6 @@ def delete_features(folder: Path) -> None:
                 for path in beside.glob("episodes-*.h5"):
                     path.unlink(missing_ok=True)
                 beside.rmdir()
-
-
-def _read_stored(path: Path, metadata: Mapping[str, Any]) -> Arrays:
-    """What a file of features holds: nothing if there is none or if it is damaged, which is no loss."""
-    for names in (BESIDE, ("features",)):  # the second as older versions wrote it
-        with suppress(UserError):
-            return read_shard(path, names, metadata=metadata)
-    return {}
-
-
-def _fit(features: NDArray[np.float32], clouds: NDArray[np.floating], geometry: Geometry) -> bool:
-    """Whether features [..., F] are those of clouds [..., P, 3], as far as some clouds throughout them tell."""
-    if features.shape[:-1] != clouds.shape[:-2]:
-        return False
-    flat = clouds.reshape(-1, *clouds.shape[-2:])
-    real = np.flatnonzero(flat.any(axis=(1, 2)))  # padding is the same in all shards
-    chosen = real[np.linspace(0, len(real) - 1, min(COMPARED, len(real))).astype(int)]
-    if not len(chosen):
-        return True
-    again, held = cloud_features(geometry, flat[chosen]), features.reshape(-1, features.shape[-1])[chosen]
-    return again.shape == held.shape and np.allclose(again, held, rtol=0.0, atol=TOLERANCE)
 
 
 def sample_clouds(

@@ -13,9 +13,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import flat_options
 from cavin_pyro.evaluation.rows import violation, with_current_names
 from cavin_pyro.evaluation.statistics import mcnemar
-from cavin_pyro.storage.run_directory import flat_options, stored_options
+from cavin_pyro.storage.run_directory import stored_options
 
 SAME_SCENES = (
     "task",

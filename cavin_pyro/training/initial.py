@@ -15,7 +15,7 @@ from cavin_pyro.config.options import shown
 from cavin_pyro.config.parts import preset_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.storage.checkpoint import BUILT_SECTIONS, find_checkpoint, load_checkpoint
-from cavin_pyro.storage.digests import file_digest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import geometry_of
 from guides.guide import Guide
 from models.model import Model

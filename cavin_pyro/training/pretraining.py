@@ -62,11 +62,11 @@ def pretrain(
     begun, running, rate = 0, 0.0, learning_rate
     digest = hashlib.sha256(clouds.tobytes()).hexdigest()
     if resume is not None and resume.exists():
-        with resuming(resume) as (tensors, state, whole):
+        with resuming(resume) as (tensors, state):
             if state["clouds"] != digest:
                 raise ValueError("it was made with other clouds")
             autoencoder.load_state_dict(section(tensors, "autoencoder"))
-            load_optimizer(optimizer, tensors, complete=not whole)
+            load_optimizer(optimizer, tensors)
             generator.bit_generator.state = state["generator"]
             rate = float(state["rate"])
             rows = [(int(step), float(loss), float(validated)) for step, loss, validated in state["rows"]]

@@ -31,10 +31,8 @@ def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, 
 
 
 @contextmanager
-def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any], bool]]:
-    """Yield the tensors and the state of a resume file, and whether its digest shows that it is whole.
-
-    Whatever does not fit within the block is a damaged file.
+def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
+    """Yield the tensors and the state of a resume file; whatever does not fit within the block is a damaged file.
 
     Raises:
         UserError: the file is truncated, changed or of another training.
@@ -43,12 +41,11 @@ def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any], bo
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        digest = header.get("sha256")  # older versions wrote none
-        if digest not in (None, tensors_digest(tensors)):
+        if header.get("sha256") != tensors_digest(tensors):
             raise ValueError("its tensors are not those that were saved")
         if odd := [name for name, value in tensors.items() if not bool(value.isfinite().all())]:
             raise ValueError(f"{odd[0]} is not finite")
-        yield tensors, json.loads(header.get("state", "{}")), digest is not None
+        yield tensors, json.loads(header.get("state", "{}"))
     except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         line = " ".join(str(error).split())[:200]
         raise UserError(
@@ -65,17 +62,14 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, part: str = "adam") -> d
     }
 
 
-def load_optimizer(
-    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], part: str = "adam", *, complete: bool = True
-) -> None:
-    """Take over the moments that `optimizer_tensors` gave after at least one step.
+def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], part: str = "adam") -> None:
+    """Take over the moments that `optimizer_tensors` gave.
 
-    Args:
-        complete: every weight must have moments. False for a file that is known to be whole: weights that no gradient
-            has reached (of a network that the model does not use) have none, and their moments begin at zero.
+    Weights that no gradient has reached (of a network that the model does not use) have none; theirs begin at zero.
 
     Raises:
-        ValueError: some are missing, of another shape, or of no weight; the line names one.
+        ValueError: a weight has only some of its moments, they have another shape, or belong to no weight; the line
+            names one.
     """
     moments: dict[int, dict[str, Tensor]] = {}
     for name, value in section(tensors, part).items():
@@ -85,10 +79,8 @@ def load_optimizer(
     if unknown := [number for number in moments if not 0 <= number < len(parameters)]:
         raise ValueError(f"{part}.{unknown[0]} belongs to no weight")
     for number, parameter in enumerate(parameters):
-        if number not in moments and not complete:
-            continue
-        for entry in ENTRIES[part]:
-            moment = moments.get(number, {}).get(entry)
+        for entry in ENTRIES[part] if number in moments else ():
+            moment = moments[number].get(entry)
             if moment is None:
                 raise ValueError(f"{part}.{number}.{entry} is missing")
             if moment.shape != (() if entry in NUMBERS else parameter.shape):

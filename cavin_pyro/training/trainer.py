@@ -218,11 +218,11 @@ class Trainer:
         """
         if self.step or not self.resume_path.exists():
             return
-        with resuming(self.resume_path) as (tensors, _, whole):
+        with resuming(self.resume_path) as (tensors, _):
             for part, module in (("model", self.model), ("guide", self.guide)):
                 module.load_state_dict(section(tensors, part))
             for part, optimizer in self._optimizers.items():
-                load_optimizer(optimizer, tensors, part, complete=not whole)
+                load_optimizer(optimizer, tensors, part)
             step, best, best_step, stale = tensors["counters"].tolist()
             if not (math.isfinite(best) and 1 <= best_step <= step and stale >= 0):
                 raise ValueError("its counters contradict one another")

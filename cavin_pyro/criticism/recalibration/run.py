@@ -16,8 +16,7 @@ from cavin_pyro.criticism.recalibration.sleep import sleep
 from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.dataset import content_records
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, find_checkpoint
-from cavin_pyro.storage.digests import file_digest
-from cavin_pyro.storage.files import atomic_write, write_json
+from cavin_pyro.storage.files import atomic_write, file_digest, write_json
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.run import place
 from cavin_pyro.training.trainer import unchecked_programs

@@ -9,9 +9,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.config.options import flat_options
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.digests import tensors_digest
-from cavin_pyro.storage.run_directory import flat_options
 
 RANGED = ("objects", "maximum_steps", "generated.tiles")  # options of a scene with a range
 FREE = (  # options that change neither plans nor scenes, but for rounding

@@ -17,7 +17,7 @@ from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path
 from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.storage.checkpoint import find_checkpoint
-from cavin_pyro.storage.digests import file_digest
+from cavin_pyro.storage.files import file_digest
 from envs.objects.sampling import WHOLE_TABLE, ObjectRanges
 from envs.observation import Observation
 from envs.scene import Scene

@@ -19,7 +19,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.storage import checkpoint as storage
 from cavin_pyro.storage.checkpoint import load_checkpoint, shipped_folder
-from cavin_pyro.storage.digests import MANIFEST, file_digest, read_manifest, update_manifest
+from cavin_pyro.storage.digests import MANIFEST, read_manifest, update_manifest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import load_pointnet
 from tests.cavin_pyro.storage.test_checkpoint import rewritten
 

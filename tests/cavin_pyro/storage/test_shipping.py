@@ -17,7 +17,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_model
 from cavin_pyro.storage import shipping
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint, save_checkpoint
-from cavin_pyro.storage.digests import file_digest, read_manifest
+from cavin_pyro.storage.digests import read_manifest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.shipping import main, ship, ship_guide, ship_models
 
 LOSSES = {0: -3.0, 1: -7.5, 2: -5.0}  # by training seed

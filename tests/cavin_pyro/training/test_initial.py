@@ -11,7 +11,7 @@ import torch
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint
-from cavin_pyro.storage.digests import file_digest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.training.run import train
 
 PARTS = ("geometry=outline", "dynamics=contact", "scales=predicted")

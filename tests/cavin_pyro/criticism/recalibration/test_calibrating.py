@@ -13,7 +13,7 @@ import torch
 from cavin_pyro.criticism.loading import load_programs
 from cavin_pyro.data.dataset import shard_path
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
-from cavin_pyro.storage.digests import file_digest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import geometry_of
 from tests.cavin_pyro.conftest import WINDOWS
 

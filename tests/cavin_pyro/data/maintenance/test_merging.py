@@ -15,7 +15,7 @@ import torch
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.loading import compare_data
+from cavin_pyro.criticism.training_data import compare_data
 from cavin_pyro.data.collection import collect
 from cavin_pyro.data.dataset import check_distinct, read_metadata, shard_path, write_metadata
 from cavin_pyro.data.windows import load_windows
