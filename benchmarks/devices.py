@@ -4,6 +4,7 @@ Steps of training per second for batches of 64 and 1,024 windows (the cascade wi
 made-up windows; in the device's memory, and on a GPU also copied batch by batch as data larger than memory are), and
 milliseconds per plan with 1,024 and 65,536 samples (`planner=cavin` with its defaults, crossing, sparse, 3 objects,
 horizon 30, the shipped checkpoint, the first images of some episodes, from a state on the device to pushes on the CPU).
+On a GPU both with CUDA graphs and without.
 Wall time, medians, after a warm-up; a plan's noise is sampled on the CPU for every device. Set OMP_NUM_THREADS for the
 number of the CPU's threads. Prints tables in Markdown.
 """
@@ -61,7 +62,7 @@ def made_up_windows() -> WindowTable:
     return table
 
 
-def steps_per_second(device: torch.device, batch: int, steps: int, *, resident: bool) -> float:
+def steps_per_second(device: torch.device, batch: int, steps: int, *, resident: bool, graphs: bool) -> float:
     table = made_up_windows()
     if device.type != "cpu":
         table.move(device, free_memory(device) if resident else 0)
@@ -69,7 +70,9 @@ def steps_per_second(device: torch.device, batch: int, steps: int, *, resident: 
     model = CascadedModel()
     guide = CascadedGuide(model).to(device)
     model.to(device)
-    config = TrainerConfig(steps=2 * steps, batch_size=batch, validate_every=steps, validation_windows=64)
+    config = TrainerConfig(
+        steps=2 * steps, batch_size=batch, validate_every=steps, validation_windows=64, cuda_graphs=graphs
+    )
     with tempfile.TemporaryDirectory() as folder:
         objective = Objective(Trace_ELBO(max_plate_nesting=1))
         run = Trainer(model, guide, objective, table, Path(folder), lambda step, row: None, config)
@@ -79,15 +82,18 @@ def steps_per_second(device: torch.device, batch: int, steps: int, *, resident: 
 
 def train_rows(batches: Sequence[int], steps: int) -> Iterator[list[str]]:
     for device in devices():
-        for resident in (True, False) if device.type != "cpu" else (True,):
-            speeds = [f"{steps_per_second(device, batch, steps, resident=resident):.1f}" for batch in batches]
-            yield [f"{name_of(device)}{'' if resident else ', copied batch by batch'}", *speeds]
+        gpu = {"": (True, True), ", without graphs": (True, False), ", copied batch by batch": (False, True)}
+        for what, (resident, graphs) in (gpu if device.type == "cuda" else {"": (True, False)}).items():
+            speeds = [steps_per_second(device, batch, steps, resident=resident, graphs=graphs) for batch in batches]
+            yield [f"{name_of(device)}{what}", *(f"{speed:.1f}" for speed in speeds)]
 
 
-def milliseconds(device: torch.device, samples: int, scenes: int) -> float:
+def milliseconds(device: torch.device, samples: int, scenes: int, *, graphs: bool) -> float:
     words = ["task=crossing", "objects=3", f"planner.samples={samples}", f"device={device.type}"]
+    words += [f"planner.compile={str(graphs).lower()}"]
     runner = make_runner(compose("evaluate", *words))
-    states = [observed_state(runner.env.reset(seed=seed)[0], runner.geometry, device) for seed in (0, *range(scenes))]
+    seeds = [*range(10_000, 10_000 + scenes)]  # for tuning
+    states = [observed_state(runner.env.reset(seed=seed)[0], runner.geometry, device) for seed in seeds[:1] + seeds]
     runner.env.close()
     times = []
     for seed, state in enumerate(states):
@@ -99,7 +105,11 @@ def milliseconds(device: torch.device, samples: int, scenes: int) -> float:
 
 def plan_rows(samples: Sequence[int], scenes: int) -> Iterator[list[str]]:
     for device in devices():
-        yield [name_of(device), *(f"{milliseconds(device, count, scenes):.1f}" for count in samples)]
+        for what, graphs in (
+            {", eager": False, ", CUDA graphs": True} if device.type == "cuda" else {"": False}
+        ).items():
+            times = [milliseconds(device, count, scenes, graphs=graphs) for count in samples]
+            yield [f"{name_of(device)}{what}", *(f"{time:.1f}" for time in times)]
 
 
 def table(title: str, columns: Sequence[str], rows: Iterator[list[str]]) -> None:

@@ -62,8 +62,11 @@ class Scales:
 
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
-        each = (torch.as_tensor(scale, dtype=mean.dtype, device=mean.device) for scale in (self.start, self.motion))
-        return distributions.Normal(mean, torch.stack(tuple(each)).repeat_interleave(2)).to_event(2)
+        # Filled where the means are: a copy from the CPU would let a GPU wait in every step.
+        start, motion = (
+            scale if isinstance(scale, Tensor) else mean.new_full((), scale) for scale in (self.start, self.motion)
+        )
+        return distributions.Normal(mean, torch.stack((start, start, motion, motion))).to_event(2)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,8 @@ class CavinPlanner(SearchingPlanner):
     guidance: our addition to lines 7 and 10: `layout` prefers, among plans that miss the goal, those that leave the
         shortest way to it along allowed places; `none` in the paper.
     compile: true runs the inner functions as native code, which takes minutes once and is cached on disk; `auto` loads
-        what is cached and runs the rest eagerly. Both sample noise, from which codes follow, as a warm start does.
+        what is cached and runs the rest eagerly; `cuda_graphs` captures them on the GPU where the model is. All sample
+        noise, from which codes follow, as a warm start does.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
     `reward_at`, limits out of order, and a weight or a distance that is negative or not finite.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from models.state import State
 from planning.backends.compiled import Compiled
+from planning.backends.cuda_graphs import CudaGraphs
 from planning.backends.eager import Backend, eager
 from planning.extensions.guidance import check_guidance, distance_to_goal_of, guided_return
 from planning.extensions.idle_pushes import IDLE_DISTANCE, idle_last
@@ -35,6 +36,7 @@ from planning.rollouts.segment import Objective, SearchSpace
 
 ROBUSTNESS = PerturbedRollouts()
 AUTO = "auto"  # value of `compile`: native code where it is cached; never compiles
+GRAPHS = "cuda_graphs"  # value of `compile`: for models on a GPU
 
 
 class SearchingPlanner:
@@ -72,10 +74,7 @@ class SearchingPlanner:
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward, self.guidance = model, reward, guidance
         self.reward_at, self.stride_limits = reward_at, stride_limits
-        if not isinstance(compile, bool) and compile != AUTO:
-            raise ValueError(f"compile must be true, false or {AUTO}, not {compile}")
-        tracing = model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext
-        self.backend: Backend = Compiled(tracing=tracing, make=compile is True) if compile else eager
+        self.backend = _backend(compile, model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext)
         self.reparameterized = warm_start or bool(compile)
         if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
             raise ValueError("robustness.outcomes=sampled needs a model that samples f: it has no sampled_next_state")
@@ -160,6 +159,14 @@ class SearchingPlanner:
         return idle_last(
             actions, path, state, self.segment_length, self.idle_distance, observed, self.touchdown_distance
         )
+
+
+def _backend(compile: bool | str, tracing: Callable[[], AbstractContextManager[None]]) -> Backend:
+    if not isinstance(compile, bool) and compile not in (AUTO, GRAPHS):
+        raise ValueError(f"compile must be true, false, {AUTO} or {GRAPHS}, not {compile}")
+    if compile == GRAPHS:
+        return CudaGraphs(tracing)
+    return Compiled(tracing=tracing, make=compile is True) if compile else eager
 
 
 def summary(

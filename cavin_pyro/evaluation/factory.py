@@ -94,7 +94,7 @@ def check_options(config: DictConfig, device: torch.device) -> None:
     """
     check_world(config.env)
     check_largest("planner", config.planner)
-    check_native_code(config, device)
+    check_native_code(config)
     if device.type != "cpu" and config.get("launcher") == "ray":
         raise UserError(
             f"launcher=ray runs episodes on processors, and device={config.device} plans on {device.type}: "

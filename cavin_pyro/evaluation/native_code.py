@@ -1,4 +1,4 @@
-"""Whether a planner runs native code: the option `planner.compile`."""
+"""Whether a planner runs native code, or on a GPU CUDA graphs: the option `planner.compile`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from cavin_pyro.config.world import task_of
 from envs.layouts import GENERATED, RANDOM
 from models.model import Model
 from models.priors.flow import FlowPrior
-from planning.searching import AUTO, SearchingPlanner
+from planning.searching import AUTO, GRAPHS, SearchingPlanner
 
 
-def check_native_code(config: DictConfig, device: torch.device) -> None:
+def check_native_code(config: DictConfig) -> None:
     """Refuse unknown values of `planner.compile`, and true with options that keep plans from being compiled.
 
     Raises:
@@ -26,13 +26,13 @@ def check_native_code(config: DictConfig, device: torch.device) -> None:
     chosen = config.planner.get("compile", False)
     if not isinstance(chosen, bool) and chosen != AUTO:
         raise UserError(f"planner.compile must be true, false or {AUTO}, not {shown(chosen)}")
-    if chosen is True and (why := _obstacle(config, device)):
-        other = "" if device.type == "cpu" else " or device=cpu"
-        raise UserError(f"planner.compile=true {why}: choose planner.compile=false{other}")
+    if chosen is True and (why := _obstacle(config)):
+        raise UserError(f"planner.compile=true {why}: choose planner.compile=false")
 
 
 def argument_compile(config: DictConfig, device: torch.device, model: Model, path: Path) -> bool | str:
-    """The planner's argument `compile`: the option's value, but false where `auto` could give other plans or nothing.
+    """The planner's argument `compile`: the option's value, but false where `auto` could give other plans or nothing,
+    and `GRAPHS` on a GPU where there would be native code on the CPU.
 
     Native code in float32 makes the plans that eager functions make, up to rounding, if both sample noise rather than
     codes, as they do for warm starts. With products of bfloat16 it rounds at other places.
@@ -51,7 +51,9 @@ def argument_compile(config: DictConfig, device: torch.device, model: Model, pat
             "choose planner.compile=false"
         )
     equal = config.matmul_precision == "float32" and config.planner.get("warm_start") is True
-    return chosen if chosen != AUTO or (equal and not flows and _obstacle(config, device) is None) else False
+    if chosen == AUTO and (flows or not equal or _obstacle(config)):
+        return False
+    return GRAPHS if chosen and device.type == "cuda" else chosen
 
 
 def searches(planner: DictConfig) -> bool:
@@ -60,10 +62,8 @@ def searches(planner: DictConfig) -> bool:
     return isinstance(found, type) and issubclass(found, SearchingPlanner)
 
 
-def _obstacle(config: DictConfig, device: torch.device) -> str | None:
+def _obstacle(config: DictConfig) -> str | None:
     """What in the options keeps plans from being compiled, to follow `planner.compile=true`; None if nothing does."""
-    if device.type != "cpu":
-        return f"makes native code for the CPU, and device={config.device} plans on {device.type}"
     if config.layout == RANDOM or (config.layout == GENERATED and config.generated.seed is None):
         return f"compiles for one layout, and layout={config.layout} samples another in every episode"
     if task_of(config)[0].goal_varies:

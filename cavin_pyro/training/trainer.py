@@ -25,6 +25,7 @@ from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import ScalarLog, progress_bar
+from cavin_pyro.training.cuda_graphs import CapturedLoss, capturable
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, term_counts
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.optimizers import make_optimizers
@@ -33,6 +34,7 @@ from cavin_pyro.training.reflection import reflect
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
 from guides.guide import Guide
 from models.model import Model
+from models.state import Window
 
 VALIDATION_BATCH = 1024  # windows at once, which bounds the memory
 
@@ -69,6 +71,7 @@ class Trainer:
         if self._fixed is not None:
             guide(windows.batch(self._fixed))  # makes its parameters
         self._objective, self._loss = objective, objective.bind(model, guide)
+        self._captured: CapturedLoss | None = None
         self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
         trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
         self._optimizers = make_optimizers(config.optimizer, trained, config.learning_rate)
@@ -113,8 +116,11 @@ class Trainer:
 
     def _check_programs(self) -> None:
         """Let Pyro validate model and guide once, instead of in every step."""
+        window = self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed)
         with forked(self.windows.device):  # with gradients, which TraceEnum_ELBO demands
-            self._loss(self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed), self.step)
+            self._loss(window, self.step)
+        if self.config.cuda_graphs and self.windows.device.type == "cuda" and capturable(self._loss, window):
+            self._captured = CapturedLoss(self._loss)
 
     def _update(self) -> float:
         config = self.config
@@ -128,17 +134,31 @@ class Trainer:
         for optimizer in self._optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = config.rate(self.step)
-            optimizer.zero_grad(set_to_none=True)
-        loss = self._loss(window, self.step) / len(numbers)
-        if not math.isfinite(loss.item()):
-            self._stop_at(first_nonfinite(elbo_terms(self.model, self.guide, window)) or "loss")
-        loss.backward()
+        loss = self._gradients(window)
         norm = nn.utils.clip_grad_norm_(self._loss.parameters(), config.clip_norm)
         if not math.isfinite(norm.item()):
             self._stop_at("gradient")
         for optimizer in self._optimizers.values():
             optimizer.step()
-        return loss.item()
+        return loss
+
+    def _gradients(self, window: Window) -> float:
+        """The mean loss of a batch, with its gradients in the parameters."""
+        if self._captured is not None:
+            try:
+                loss = self._captured(window)
+            except RuntimeError as error:  # the base class of CUDA's errors
+                self._captured = None
+                print(f"steps run eagerly, since none can be captured as a CUDA graph: {str(error).splitlines()[0]}")
+        if self._captured is None:
+            for optimizer in self._optimizers.values():
+                optimizer.zero_grad(set_to_none=True)
+            loss = self._loss(window, self.step) / len(window.sequence_mask)
+        if not math.isfinite(value := loss.item()):
+            self._stop_at(first_nonfinite(elbo_terms(self.model, self.guide, window)) or "loss")
+        if self._captured is None:
+            loss.backward()
+        return value
 
     def _stop_at(self, term: str) -> None:
         kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"

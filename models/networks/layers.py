@@ -26,7 +26,9 @@ def relative_positions(centers: Tensor) -> Tensor:
     Raw coordinates of about 0.6 m differ by only a few centimetres; centring and scaling makes such differences visible
     to a network.
     """
-    return (centers - centers.new_tensor(TABLE_CENTER)) / POSITION_UNIT
+    # Filled where the centres are: a copy from the CPU would let a GPU wait, and CUDA graphs have none.
+    origin = torch.cat([centers.new_full((1,), coordinate) for coordinate in TABLE_CENTER])
+    return (centers - origin) / POSITION_UNIT
 
 
 def unit(values: Tensor) -> Tensor:

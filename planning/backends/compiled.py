@@ -26,6 +26,7 @@ from planning.backends.cache import VARIABLE, CodeCache, UnsafeFolderError, defa
 from planning.backends.eager import Item, Result, eager
 from planning.backends.fingerprint import UnknownValueError, fingerprint
 from planning.backends.library import PROXY_EXECUTOR, Library
+from planning.backends.signature import flatten, unflatten
 
 COMPILING = {
     "freezing": True,  # weights become constants, packed for the matrix products
@@ -102,7 +103,7 @@ class Compiled:
         rounded = torch.get_float32_matmul_precision() != "highest"
         tensors: list[Tensor] = []
         signature: list[Any] = [function, rounded]
-        _flatten(arguments, tensors, signature)
+        flatten(arguments, tensors, signature)
         version = tuple(signature)
         if version not in self._versions:
             self._first(version, _FlatFunction(function, rounded, arguments), tensors)
@@ -189,7 +190,7 @@ class _Native:
         self._form = form
 
     def __call__(self, tensors: list[Tensor]) -> Any:
-        return _unflatten(self._form, iter(self._code(tensors)))
+        return unflatten(self._form, iter(self._code(tensors)))
 
 
 def _announce(where: str) -> None:
@@ -261,12 +262,12 @@ class _FlatFunction(nn.Module):
         self._arguments = arguments
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        arguments = _unflatten(self._arguments, iter(tensors))
+        arguments = unflatten(self._arguments, iter(tensors))
         with torch.autocast(tensors[0].device.type, torch.bfloat16, enabled=self._rounded):
             result = records.apply(self._function(*arguments), _in_float32)
         self._last.result = result
         results: list[Tensor] = []
-        _flatten(result, results, [])
+        flatten(result, results, [])
         return tuple(results)
 
     def form(self) -> Any:
@@ -283,33 +284,6 @@ def _distributions_unchecked() -> Iterator[None]:
         yield
     finally:
         Distribution.set_default_validate_args(before)
-
-
-def _flatten(value: Any, tensors: list[Tensor], signature: list[Any]) -> None:
-    """Append the tensors of a value to `tensors`, in order, and all but their contents to `signature`.
-
-    A whole number becomes a tensor, so one version serves every segment of a plan.
-    """
-    if isinstance(value, tuple):
-        signature.append(type(value))
-        for part in value:
-            _flatten(part, tensors, signature)
-        return
-    if isinstance(value, int) and not isinstance(value, bool):
-        value = torch.tensor(value)
-    if isinstance(value, Tensor):
-        tensors.append(value)
-        value = value.dtype, value.shape, value.stride()
-    signature.append(value)
-
-
-def _unflatten(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """The inverse of `_flatten`, with other tensors; whole numbers return as the tensors that they became."""
-    if isinstance(value, tuple):
-        parts = [_unflatten(part, tensors) for part in value]
-        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-    counted = isinstance(value, int) and not isinstance(value, bool)
-    return next(tensors) if counted or isinstance(value, Tensor) else value
 
 
 def _in_float32(value: Any) -> Any:

@@ -72,7 +72,9 @@ class HeuristicPushes:
         normal = torch.stack([-direction[..., 1], direction[..., 0]], -1)
         distance = BEFORE[0] + (BEFORE[1] - BEFORE[0]) * before
         start = target - distance.unsqueeze(-1) * direction + ASIDE * aside.unsqueeze(-1) * normal
-        low, high = start.new_tensor(self.box.low), start.new_tensor(self.box.high)
+        low, high = (
+            torch.cat([start.new_full((1,), one) for one in corner]) for corner in (self.box.low, self.box.high)
+        )
         motion = (direction + JITTER * _uniform(own[..., 3:5])).clamp(-1.0, 1.0)
         return torch.cat([(2.0 * (start - low) / (high - low) - 1.0).clamp(-1.0, 1.0), motion], -1)
 

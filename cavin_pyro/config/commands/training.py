@@ -43,6 +43,9 @@ class TrainerConfig:
         choices="cavin_pyro.config.numerics.MATMUL_PRECISIONS",
         group="trainer",
     )
+    cuda_graphs: bool = option(
+        True, "on a GPU, replay each step's loss and gradients as one CUDA graph", group="trainer"
+    )
     clip_norm: float = option(
         250.0,
         "largest norm of the gradient of the mean loss per window; published: 25 on a loss ten times smaller",

@@ -13,7 +13,7 @@ from models.networks.contact.moments import turned_moments
 from models.networks.contact.objects import PAIR_MEASURES, pair_contact
 from models.networks.contact.reach import in_reach
 from models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
-from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, ToolContact, endpoints
+from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, REACH, ToolContact, endpoints
 from models.networks.dynamics import PushOutcome
 from models.networks.layers import fully_connected, relative_positions
 from models.networks.outline import (
@@ -61,6 +61,7 @@ class ContactDynamics(PushOutcome):
 
     typical: Tensor  # [2 K + 1]
     spread: Tensor
+    reach: Tensor  # [2, 2] metres
     still_scale: Tensor  # [2] logarithms, of centres and of features, as the layers predict them
 
     geometry = Outline
@@ -105,6 +106,7 @@ class ContactDynamics(PushOutcome):
         nn.init.zeros_(self.shape_head.bias)
         for name, values in (("typical", TYPICAL), ("spread", SPREAD)):
             self.register_buffer(name, values[:PER_OUTLINE].clone(), persistent=False)
+        self.register_buffer("reach", REACH.clone(), persistent=False)
         if reach_margin is None:
             self.register_buffer("still_scale", torch.zeros(2), persistent=False)  # of padding, which is not read
         else:
@@ -123,7 +125,9 @@ class ContactDynamics(PushOutcome):
     def _predict(self, state: State, action: Tensor) -> tuple[State, Rows, Tensor]:
         """The mean `[...]`, what was computed, and logarithms of its scales `[2, R, ...]`."""
         # In here components come first and objects second, [C, M, ...]: loops then run over candidates.
-        start, motion = (values.movedim(-1, 0).contiguous().unsqueeze(1) for values in endpoints(action))  # [2, 1, ...]
+        start, motion = (
+            values.movedim(-1, 0).contiguous().unsqueeze(1) for values in endpoints(action, self.reach)
+        )  # [2, 1, ...]
         length = motion.square().sum(0, keepdim=True).clamp_min(1e-8).sqrt()
         direction = motion / length
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import torch
 from torch import Tensor, nn
 
@@ -40,9 +38,11 @@ class EveryRow(Rows):
         objects = self.shape[0]
         if objects < 2:
             return None
-        order = list(permutations(range(objects), 2))
-        exchanged = [order.index((j, i)) for i, j in order]
-        first, second, exchanged = torch.tensor([*zip(*order, strict=True), exchanged], device=self._counting.device)
+        # Counted where the objects are: numbers from the CPU would be a copy in every call, and CUDA graphs have none.
+        number = torch.arange(objects * (objects - 1), device=self._counting.device)
+        first, second = number // (objects - 1), number % (objects - 1)
+        second = second + (second >= first)  # of the others in their order
+        exchanged = second * (objects - 1) + first - (first > second).long()
         real = self._counting.index_select(0, second)
         return Pairs(first, second, exchanged, real if near is None else real & of_each_pair(near, first, second))
 

@@ -12,8 +12,9 @@ def turned_moments(heights: Tensor, cosine: Tensor, sine: Tensor, *, differences
     """Heights with their means of x x, y y and x y in axes that are turned by an angle, components first.
 
     `heights: [12, ...]`, less their mean, over their spread; `cosine, sine: [...]` of twice the angle of the new x
-    axis. `differences`: of such heights, from which no mean was taken.
+    axis; leading dimensions broadcast. `differences`: of such heights, from which no mean was taken.
     """
+    heights = heights.expand(-1, *torch.broadcast_shapes(heights.shape[1:], cosine.shape))
     before, moments, after = heights.split((PRODUCT - 2, 3, 1))
     offsets = [0.0, 0.0, 0.0] if differences else HEIGHT_MEANS[PRODUCT - 2 : PRODUCT + 1]
     spreads = HEIGHT_SPREADS[PRODUCT - 2 : PRODUCT + 1]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from models.networks.outline import DIRECTIONS, OUTLINE_UNIT, PER_OUTLINE, series
 
 REACH_LOW, REACH_HIGH = (0.30, -0.55), (0.80, 0.55)  # metres; where starts and ends of pushes may lie
-_REACH = torch.tensor((REACH_LOW, REACH_HIGH), dtype=torch.float64)
+REACH = torch.tensor((REACH_LOW, REACH_HIGH), dtype=torch.float64)
 PUSH_UNIT = 0.1  # metres, maximum motion of the tool along an axis
 DISPLACEMENT_UNIT = 0.05  # metres, a typical motion of an object
 TOOL_RADIUS = 0.01  # metres
@@ -78,9 +78,12 @@ class ToolContact(nn.Module):
         return torch.stack(measures) * self.units.view(-1, *ones)
 
 
-def endpoints(action: Tensor) -> tuple[Tensor, Tensor]:
-    """Start and motion `[..., 2]` metres of normalised pushes `[..., 4]`, as the robot executes them."""
-    low, high = _REACH.to(action)
+def endpoints(action: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """Start and motion `[..., 2]` metres of normalised pushes `[..., 4]`, as the robot executes them.
+
+    `reach`: `REACH`, on the device of the pushes.
+    """
+    low, high = reach.to(action)
     action = action.clamp(-1.0, 1.0)
     start = low + (action[..., :2] + 1.0) * ((high - low) / 2.0)
     end = torch.add(start, action[..., 2:], alpha=PUSH_UNIT).clamp(low, high)

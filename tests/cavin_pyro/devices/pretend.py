@@ -27,6 +27,16 @@ from torch.utils._pytree import tree_iter, tree_map_only
 NAME = "pretend"
 UNASKED = [torch.ops.aten.empty_strided.default, torch.ops.aten.copy_.default]
 COPIES = {torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default}
+# Operations whose result the host reads, or whose shape depends on values, so that it waits for a GPU.
+WAITS = {
+    torch.ops.aten._local_scalar_dense.default,
+    torch.ops.aten.equal.default,
+    torch.ops.aten.is_nonzero.default,
+    torch.ops.aten.masked_select.default,
+    torch.ops.aten.nonzero.default,
+    torch.ops.aten.repeat_interleave.Tensor,
+}
+INDEXING = {torch.ops.aten.index.Tensor, torch.ops.aten.index_put.default, torch.ops.aten.index_put_.default}
 PLENTY = 2**40  # bytes
 
 
@@ -89,6 +99,7 @@ class PretendTensor(torch.Tensor):
 
 class PretendDevice(TorchDispatchMode):
     """Within the block, `device="pretend"` works. `copies`: the tensors that went from one device to the other.
+    `waits`: the operations for which the host waits, by name. A CUDA graph may have neither.
 
     Inference mode, which knows no tensors of Python's, is `torch.no_grad` there.
     """
@@ -96,24 +107,35 @@ class PretendDevice(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.copies: list[Tensor] = []
+        self.waits: list[str] = []
         self._inference = torch.inference_mode.__enter__, torch.inference_mode.__exit__
 
     def __enter__(self) -> PretendDevice:
         torch.inference_mode.__enter__ = torch.no_grad.__enter__  # type: ignore[assignment, method-assign]
         torch.inference_mode.__exit__ = torch.no_grad.__exit__  # type: ignore[method-assign]
+        _open.append(self)
         return super().__enter__()
 
     def __exit__(self, *error: Any) -> None:
         torch.inference_mode.__enter__, torch.inference_mode.__exit__ = self._inference  # type: ignore[method-assign]
+        _open.remove(self)
         super().__exit__(*error)
 
     def __torch_dispatch__(self, operation: OpOverload, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = _run(operation, args, kwargs or {})
+        ours = [one for one in tree_iter((args, kwargs)) if isinstance(one, PretendTensor)]
+        if ours and (
+            operation in WAITS or (operation in INDEXING and any(one.dtype == torch.bool for one in ours[1:]))
+        ):
+            self.waits.append(str(operation))
         if operation in COPIES:
             source = args[1] if operation is torch.ops.aten.copy_.default else args[0]
             if isinstance(source, PretendTensor) != isinstance(result, PretendTensor):
                 self.copies.append(source)
         return result
+
+
+_open: list[PretendDevice] = []
 
 
 def register() -> torch.device:
@@ -159,6 +181,8 @@ def _run(operation: OpOverload, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _directly(operation: OpOverload, *args: Any, **kwargs: Any) -> Any:
+    if operation is torch.ops.aten.copy_.default and _open:  # as `new_tensor` copies
+        _open[-1].copies.append(args[1])
     return _run(operation, args, kwargs)
 
 

@@ -20,6 +20,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.evaluation.factory import make_runner
 from planning.backends.compiled import Compiled
+from planning.backends.cuda_graphs import CudaGraphs
 from tests.cavin_pyro.devices.conftest import broken_after, episode, tensors, trained
 from tests.cavin_pyro.shell import ENVIRONMENT, NO_NATIVE_CODE, ROOT
 
@@ -29,7 +30,8 @@ without_gpu = pytest.mark.skipif(GPU, reason="says what happens without a GPU, a
 
 
 @pytest.mark.parametrize(
-    ("chosen", "least"), [("found or mistake or paper or default", 10), pytest.param("", 40, marks=pytest.mark.soak)]
+    ("chosen", "least"),
+    [("found or mistake or paper or default or contact", 18), pytest.param("", 60, marks=pytest.mark.soak)],
 )
 def test_everything_works_on_a_device_that_is_not_the_cpu(chosen: str, least: int) -> None:
     """`test_on_pretend_device.py`, in a process of its own: the device would stay in this one."""
@@ -88,7 +90,7 @@ def test_auto_takes_a_gpu_where_there_is_one(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["planner.compile=true"], "planner.compile=true makes native code for the CPU, and device=cuda plans on cuda"),
+        (["planner.compile=true", "layout=random"], "planner.compile=true compiles for one layout, and layout=random"),
         (["launcher=ray"], "launcher=ray runs episodes on processors, and device=cuda plans on cuda: choose"),
     ],
 )
@@ -123,13 +125,17 @@ def test_matrix_products_of_a_gpu_are_rounded_as_the_option_says(name: str, roun
 @needs_gpu
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_a_gpu_predicts_what_the_cpu_predicts(precision: str) -> None:
-    """Of the same noise; the chosen plan may differ where two are nearly as good, so the best return is compared."""
-    options = ["task=crossing", "planner.samples=256", f"matmul_precision={precision}"]
+    """Of the same noise; the chosen plan may differ where two are nearly as good, so the best return is compared.
+
+    Without replacement: one candidate whose failure rounding decides would change what all later ones are copies of.
+    """
+    options = ["task=crossing", "planner.samples=256", "planner.optimizer.replacement=false"]
+    options.append(f"matmul_precision={precision}")
     here, there = (episode(*options, f"device={name}").plan_records[0].plan for name in ("cpu", "cuda"))
     assert all(tensor.device.type == "cpu" for tensor in tensors(there))
     tolerance = 1e-3 if precision == "float32" else 2e-2  # metres, after ten segments
     close = (here.candidate_centers - there.candidate_centers).abs().amax((-3, -2, -1)) < tolerance
-    assert close.float().mean() > 0.9  # candidates whose failure rounding decides become copies of others
+    assert close.float().mean() > 0.9  # the others fail in one and go on in the other
     torch.testing.assert_close(here.expected_return, there.expected_return, rtol=0, atol=2.0)
 
 
@@ -149,6 +155,68 @@ def test_a_gpu_trains_as_the_cpu_does(options: list[str], data: Path, tmp_path: 
     for name, value in here.items():
         if name.startswith("model."):
             torch.testing.assert_close(there[name], value, rtol=0, atol=2e-3)
+
+
+@needs_gpu
+@pytest.mark.parametrize("options", [["task=crossing"], ["task=clearing", "reward=dense", "planner.guidance=layout"]])
+def test_graphs_plan_what_eager_functions_plan(options: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    """Up to rounding, since they compute objects that eager functions leave out."""
+    options = [*options, "device=cuda", "planner.samples=256", "maximum_steps=4"]
+    one, other = (episode(*options, f"planner.compile={value}").plan_records for value in ("false", "true"))
+    assert "runs eagerly" not in capfd.readouterr().err
+    close = (one[0].plan.candidate_centers - other[0].plan.candidate_centers).abs().amax((-3, -2, -1)) < 1e-3
+    assert close.float().mean() > 0.95
+    torch.testing.assert_close(one[0].plan.expected_return, other[0].plan.expected_return, rtol=0, atol=0.5)
+    again = episode(*options, "planner.compile=true").plan_records
+    assert all(mine.plan.actions.equal(theirs.plan.actions) for mine, theirs in zip(again, other, strict=True))
+
+
+@needs_gpu
+def test_what_waits_for_the_gpu_is_no_graph(capfd: pytest.CaptureFixture[str]) -> None:
+    def waiting(numbers: torch.Tensor) -> torch.Tensor:
+        return numbers * numbers.sum().item()
+
+    backend, numbers = CudaGraphs(), torch.arange(3.0, device="cuda")
+    for _ in range(2):
+        assert backend(waiting, numbers).tolist() == [0.0, 3.0, 6.0]
+    assert re.fullmatch(
+        r"waiting runs eagerly, since it cannot be captured as a CUDA graph: .+\n", capfd.readouterr().err
+    )
+    assert backend(torch.neg, numbers).tolist() == [0.0, -1.0, -2.0]  # the next one is captured all the same
+    assert backend(torch.neg, numbers + 1).tolist() == [-1.0, -2.0, -3.0]
+
+
+CONTACT = ["geometry=outline", "dynamics=contact", "dynamics.reach_margin=0.015", "scales=predicted", "prior=mixture"]
+
+
+@needs_gpu
+@pytest.mark.parametrize(
+    "options",
+    [[], [*CONTACT, "objective=rollout"], [*CONTACT, "objective=consistent"], ["model=flat", "guide=flat"]],
+)
+def test_graphs_train_as_eager_steps_do(
+    options: list[str], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the same random numbers of codes."""
+    options = ["device=cuda", *options]
+    one, other = (
+        trained(data, tmp_path / value, f"trainer.cuda_graphs={value}", *options) for value in ("false", "true")
+    )
+    assert "run eagerly" not in capsys.readouterr().out
+    assert one["random_cuda"].equal(other["random_cuda"])
+    for name, value in one.items():
+        if name.startswith(("model.", "guide.")):
+            torch.testing.assert_close(other[name], value, rtol=0, atol=2e-3)
+
+
+@needs_gpu
+def test_a_run_with_graphs_resumes_exactly(data: Path, tmp_path: Path) -> None:
+    expected = trained(data, tmp_path / "unbroken", "device=cuda")
+    with broken_after(3):
+        trained(data, tmp_path / "broken", "device=cuda")
+    found = trained(data, tmp_path / "broken", "device=cuda")
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=0, atol=1e-5)
 
 
 @needs_gpu

@@ -12,7 +12,7 @@ from models.networks.contact.chosen_rows import ChosenRows
 from models.networks.contact.dynamics import ContactDynamics
 from models.networks.contact.every_row import EveryRow
 from models.networks.contact.reach import CARRIED, in_reach
-from models.networks.contact.tool import TOOL_RADIUS, endpoints
+from models.networks.contact.tool import REACH, TOOL_RADIUS, endpoints
 from models.networks.outline import Outline, mean_extent
 from models.networks.shapes import fixed_shapes
 from models.state import State
@@ -43,7 +43,7 @@ def crowd(*batch: int, objects: int = 4, real: int | None = None) -> tuple[State
 
 def reached_by_hand(state: State, action: torch.Tensor, margin: float) -> list[int]:
     """Numbers of the objects within reach, of one scene, from a thousand places along the ways."""
-    start, motion = endpoints(action)
+    start, motion = endpoints(action, REACH)
     length = float(motion.norm())
     forward = motion / length
     radii = mean_extent(state.features)

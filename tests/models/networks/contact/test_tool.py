@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 
 from envs.robots import STICK_RADIUS
 from envs.workspace import push_endpoints
-from models.networks.contact.tool import DISPLACEMENT_UNIT, PUSH_UNIT, TOOL_RADIUS, ToolContact, endpoints
+from models.networks.contact.tool import DISPLACEMENT_UNIT, PUSH_UNIT, REACH, TOOL_RADIUS, ToolContact, endpoints
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1.5, 1.5), min_size=4, max_size=4))
 def test_pushes_start_and_stop_where_the_robot_starts_and_stops(action: list[float]) -> None:
-    start, motion = endpoints(torch.tensor(action, dtype=torch.float64))
+    start, motion = endpoints(torch.tensor(action, dtype=torch.float64), REACH)
     expected = push_endpoints(np.array(action))
     assert np.allclose(start, expected[0], atol=1e-7)
     assert np.allclose(start + motion, expected[1], atol=1e-7)

@@ -1,0 +1,100 @@
+"""Planning's inner functions as CUDA graphs: a GPU replays hundreds of small operations in one launch."""
+
+from __future__ import annotations
+
+import sys
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from planning import records
+from planning.backends.capture import capture
+from planning.backends.eager import Item, Result, eager
+from planning.backends.signature import flatten, unflatten
+
+MOST = (
+    64  # graphs, each with its own results in the GPU's memory; those that were not used for the longest time go first
+)
+
+
+class CudaGraphs:
+    """Each function is captured when it is first called with its constants and shapes, and replayed from then on.
+
+    A graph calls the operations that the function called, with the same numbers, so results are those of eager
+    execution; but shapes must not depend on values, so a model computes what it would otherwise leave out
+    (`planning.protocol.FixedShapes`). Graphs read the weights where they are: they may change, but not move.
+
+    A function that cannot be captured, because it waits for the GPU (a reward that calls `item()`, say), runs eagerly
+    from then on, which is said in one line.
+
+    Tensors must be on a GPU; whole numbers are copied there. All graphs share one pool of memory, which is safe because
+    they run one after the other, and results are copied out of it. Not for several threads at once.
+    """
+
+    native = False
+
+    def __init__(self, tracing: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
+        """`tracing`: opened while functions are captured, to tell models that shapes must not depend on values."""
+        self._graphs: OrderedDict[Any, _Graph | None] = OrderedDict()  # None runs eagerly
+        self._tracing = tracing
+        self._pool: Any = None
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """See `Backend`."""
+        tensors: list[Tensor] = []
+        signature: list[Any] = [function, torch.get_float32_matmul_precision(), torch.is_inference_mode_enabled()]
+        flatten(arguments, tensors, signature)
+        version = tuple(signature)
+        if version not in self._graphs:
+            self._graphs[version] = self._captured(function, arguments, tensors)
+            if len(self._graphs) > MOST:
+                self._graphs.popitem(last=False)
+        self._graphs.move_to_end(version)
+        graph = self._graphs[version]
+        return function(*arguments) if graph is None else graph(tensors)
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        """See `Backend`."""
+        return eager.each(function, items)
+
+    def _captured(
+        self, function: Callable[..., Any], arguments: tuple[Any, ...], tensors: list[Tensor]
+    ) -> _Graph | None:
+        if self._pool is None:
+            self._pool = torch.cuda.graph_pool_handle()
+        try:
+            with self._tracing():
+                return _Graph(function, arguments, tensors, self._pool)
+        except RuntimeError as error:  # the base class of CUDA's errors
+            why = str(error).splitlines()[0]
+            print(
+                f"{function.__name__} runs eagerly, since it cannot be captured as a CUDA graph: {why}",
+                file=sys.stderr,
+                flush=True,
+            )
+            return None
+
+
+class _Graph:
+    """One function, for one signature of its arguments, which is not checked again."""
+
+    def __init__(
+        self, function: Callable[..., Any], arguments: tuple[Any, ...], tensors: list[Tensor], pool: Any
+    ) -> None:
+        device = next((tensor.device for tensor in tensors if tensor.device.type != "cpu"), tensors[0].device)
+        with torch.inference_mode(False):  # tensors that may be written in any mode
+            self._inputs = [torch.empty_like(tensor, device=device) for tensor in tensors]
+        for own, tensor in zip(self._inputs, tensors, strict=True):
+            own.copy_(tensor)
+        given = unflatten(arguments, iter(self._inputs))
+        self._graph, self._result = capture(lambda: function(*given), device, pool)
+
+    def __call__(self, tensors: list[Tensor]) -> Any:
+        for own, tensor in zip(self._inputs, tensors, strict=True):
+            own.copy_(tensor, non_blocking=True)
+        self._graph.replay()
+        return records.apply(self._result, lambda value: value.clone() if isinstance(value, Tensor) else value)
