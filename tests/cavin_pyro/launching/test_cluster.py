@@ -6,6 +6,7 @@ import builtins
 import itertools
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -127,22 +128,50 @@ def _waiting_on_node(job: tuple[str, str, int]) -> str:
     return node
 
 
+@pytest.mark.parametrize("episodes", [8, pytest.param(40, marks=pytest.mark.soak)])
 def test_episodes_are_those_of_this_process_also_when_a_node_is_lost(
-    ray: Launcher, cluster: Any, spare: Any, configure: Callable[..., DictConfig]
+    ray: Launcher, cluster: Any, spare: Any, configure: Callable[..., DictConfig], episodes: int
 ) -> None:
-    config = configure("planner=random", "episodes=8")
-    jobs = [(config, seed) for seed in range(8)]
+    config = configure("planner=random", f"episodes={episodes}")
+    jobs = [(config, seed) for seed in range(episodes)]
     local = dict(run_jobs(jobs, 1))
     found, third = {}, spare
     with closing(run_jobs(jobs, ray)) as finished:
         for number, row in finished:
             found[number] = row
-            if third is not None:
+            if third is not None and len(found) > episodes // 10:
                 cluster.remove_node(third, allow_graceful=False)
                 third = None
-    assert sorted(found) == list(range(8))
+    assert third is None
+    assert sorted(found) == list(range(episodes))
     for number, row in found.items():
         assert {**row, "planning_ms": 0} == {**local[number], "planning_ms": 0}
+
+
+@pytest.mark.soak
+def test_five_thousand_transitions_lose_nothing_when_a_node_is_lost(
+    ray: Launcher, cluster: Any, spare: Any, small: Any, tmp_path: Path
+) -> None:
+    """The bytes are those of local processes, which collect them first."""
+    there, here = tmp_path / "ray", tmp_path / "local"
+    there.mkdir(), here.mkdir()
+    collect(small.pushes, here, transitions=5000, workers=2)
+
+    def lose() -> None:
+        while len(list(there.glob("episodes-*.h5"))) < 20:
+            time.sleep(0.5)
+        cluster.remove_node(spare, allow_graceful=False)
+
+    losing = threading.Thread(target=lose)
+    losing.start()
+    collect(small.pushes, there, transitions=5000, workers=ray)
+    losing.join(timeout=60)
+    assert not losing.is_alive()
+    expected, found = contents(here), contents(there)
+    shards = {name for name in expected if name.endswith(".h5")} | {"metadata.json"}
+    assert len(shards) > 200
+    assert shards == {name for name in found if name.endswith(".h5")} | {"metadata.json"}
+    assert all(found[name] == expected[name] for name in shards)
 
 
 def test_no_cluster_at_an_address_is_one_line() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def shipped() -> ContactDynamics:
     return f.double()
 
 
-def settled(**options: bool) -> ContactDynamics:
+def settled(**options: Any) -> ContactDynamics:
     """Untrained, with motions and changes of shape as small as trained ones."""
     torch.manual_seed(0)
     f = ContactDynamics(object_width=16, pair_width=8, **options).double()

@@ -17,7 +17,7 @@ from models.networks.outline import Outline, mean_extent
 from models.networks.shapes import fixed_shapes
 from models.state import State
 from tests.models.networks.contact import by_hand
-from tests.models.networks.contact.test_contact_dynamics import doubled, scene, shipped
+from tests.models.networks.contact.test_contact_dynamics import doubled, scene, settled, shipped
 
 MARGIN = 0.01
 
@@ -114,6 +114,18 @@ def test_predictions_do_not_depend_on_whether_shapes_are_fixed(batch: tuple[int,
         torch.testing.assert_close(chosen, every, rtol=1e-7, atol=1e-10)
     moved = (found[False][0] - state.centers).abs().amax(-1) > 0
     assert 0.1 < moved.double().mean() < 0.9  # some are within reach, and some are not
+
+
+def test_pushes_broadcast_over_one_state_with_fixed_shapes_too() -> None:
+    """As planners call an equivariant f, whose turned moments are the push's own."""
+    f = settled(equivariant=True, reach_margin=MARGIN)
+    state, actions = crowd(2, 7)
+    one = state.map(lambda field: field[:1, :1])
+    expected = f(one.expand((2, 7)), None, actions)
+    with fixed_shapes():
+        found = f(one, None, actions)
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-7, atol=1e-10)
 
 
 def test_a_push_that_reaches_nothing_changes_nothing() -> None:
