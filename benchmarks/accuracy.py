@@ -1,11 +1,12 @@
 """How far predictions are off, beside what nobody could predict: `python benchmarks/accuracy.py CHECKPOINT ...`.
 
-New episodes are collected by the heuristic (--episodes, --seed: of the collection), in the default world. For every
-object it prints the distance between the predicted and the observed centre, after one push, after three (f reads its
-own predictions), and for h with the code that the guide infers from the three pushes' outcome. Objects that moved more
-than a centimetre by the simulator stand apart from those that moved less than 2 mm, and among the latter those of which
-f says that they move more than 2 cm; these once more by pushes that the robot began alone: a push that would touch down
-on an object is not begun, and nothing moves. By number of objects, by object, and by the kind of push:
+New episodes are collected by the heuristic (--episodes, --seed: of the collection), in the default world or in another
+(--object-set, --assets, --camera). For every object it prints the distance between the predicted and the observed
+centre, after one push, after three (f reads its own predictions), and for h with the code that the guide infers from
+the three pushes' outcome. Objects that moved more than a centimetre by the simulator stand apart from those that moved
+less than 2 mm, and among the latter those of which f says that they move more than 2 cm; these once more by pushes that
+the robot began alone: a push that would touch down on an object is not begun, and nothing moves. By number of objects,
+by object, and by the kind of push:
 
 hit     the tool's path passes within half of the object's half-width (across the path) from its middle
 graze   within all of it and the tool's radius
@@ -38,6 +39,7 @@ from numpy.typing import NDArray
 from pyro import poutine
 
 from cavin_pyro.config.commands.collection import POLICIES
+from cavin_pyro.config.commands.world import WorldConfig
 from cavin_pyro.criticism.loading import load_programs
 from cavin_pyro.data.collection import CollectionConfig, check_policy, clutter_area, open_scene, pushing_policy
 from cavin_pyro.data.features import cloud_features
@@ -311,11 +313,15 @@ def main() -> None:
     parser.add_argument("--neighbours", type=int, nargs="+", default=(None,))
     parser.add_argument("--policy", choices=POLICIES, default="heuristic", help="what chooses the pushes")
     parser.add_argument("--pusher", help="the checkpoint of --policy model")
+    parser.add_argument("--object-set", default=WorldConfig.objects, help="as env.objects (%(default)s)")
+    parser.add_argument("--assets", default=WorldConfig.assets, help="as env.assets")
+    parser.add_argument("--camera", default=WorldConfig.camera, help="as env.camera (%(default)s)")
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     fewest, most = arguments.objects
     chooser = {"policy": arguments.policy, "checkpoint": arguments.pusher}
-    config = CollectionConfig(seed=arguments.seed, minimum_objects=fewest, maximum_objects=most, **chooser)
+    world = {name: getattr(arguments, name) for name in ("object_set", "assets", "camera")}
+    config = CollectionConfig(seed=arguments.seed, minimum_objects=fewest, maximum_objects=most, **chooser, **world)
     check_policy(config)
     episodes = []
     with (

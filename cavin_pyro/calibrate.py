@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from omegaconf import DictConfig
 
 from cavin_pyro.config.application import command
@@ -9,12 +11,21 @@ from cavin_pyro.config.application import command
 
 @command("calibrate")
 def main(config: DictConfig) -> None:
-    """Fit a trained guide to windows that its model generates, so that its intervals have their nominal coverage."""
+    """Calibrate a trained guide, or the scales that f predicts, so that intervals have their nominal coverage.
+
+    The guide is fitted to windows that its model generates, the scales to held-out windows.
+    """
     import pyro
 
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.criticism.recalibration.measurement import measure_guide, sentences
-    from cavin_pyro.criticism.recalibration.run import calibrate_guide, load_calibration, write_calibrated
+    from cavin_pyro.criticism.recalibration.run import (
+        calibrate_f,
+        calibrate_guide,
+        load_calibration,
+        write_calibrated,
+    )
+    from cavin_pyro.criticism.recalibration.scales import scale_sentences
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
@@ -25,13 +36,18 @@ def main(config: DictConfig) -> None:
         check_same_run(folder, config, ignore=("output", "device"))
         loaded, context = load_calibration(config)
         write_config(folder, config)
-        sizes = {name: config[name] for name in ("windows", "samples", "repeats")}
-        before = measure_guide(context, **sizes)
-        losses = calibrate_guide(config, loaded, device)
-        after = measure_guide(context, **sizes)
-        print("\n".join(sentences(before, after)))
-        path = write_calibrated(folder, config, loaded, before=before, after=after, losses=losses)
-        print(f"written: {path}")
+        measured: dict[str, Any] = {}
+        if "scales" in config.parts:
+            measured["scales"] = found = calibrate_f(context, config.windows)
+            print("\n".join(scale_sentences(found["before"], found["after"], found["factor"])))
+        if "guide" in config.parts:
+            sizes = {name: config[name] for name in ("windows", "samples", "repeats")}
+            before = measure_guide(context, **sizes)
+            losses = calibrate_guide(config, loaded, device)
+            after = measure_guide(context, **sizes)
+            measured |= {"before": before, "after": after, "losses": losses}
+            print("\n".join(sentences(before, after)))
+        print(f"written: {write_calibrated(folder, config, loaded, measured)}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Ship checkpoints out of a reproduction: `python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ...]`.
 
 With `--models` instead of methods: all of its trainings, for `reproduce models=checkpoints/reproduction`.
-`python -m cavin_pyro.storage.shipping --guide FILE NAME`: the shipped checkpoint NAME with the guide that `calibrate`
-has written to FILE.
+`python -m cavin_pyro.storage.shipping --calibrated FILE NAME`: the shipped checkpoint NAME as `calibrate` has written
+it to FILE.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write
 BASELINES = ("sectar", "cvae_mpc", "mpc")
 PARTS = ("model", "guide", "pointnet", "geometry")
 PRETRAINED = re.compile(r"output=(.+)/pretrain\b")
+SCALES = "model.dynamics.head.bias"  # of `dynamics=contact`, whose last number is the logarithm of the scale
 PUBLIC_HOME = "runs/reproduce"  # in shipped files, instead of the folder of the machine that trained
 
 
@@ -68,11 +69,11 @@ def ship_models(home: Path, to: Path) -> list[Path]:
     return shipped
 
 
-def ship_guide(calibrated: Path, shipped: Path) -> None:
-    """Replace a shipped checkpoint by the result of its calibration, which differs in the guide alone.
+def ship_calibrated(calibrated: Path, shipped: Path) -> None:
+    """Replace a shipped checkpoint by the result of its calibration, which differs in what was calibrated alone.
 
     Raises:
-        UserError: it was not calibrated from this file, or something else than the guide differs.
+        UserError: it was not calibrated from this file, or something else than the guide or f's scales differs.
     """
     before, after = load_checkpoint(shipped), load_checkpoint(calibrated)
     records = after.provenance.get("calibrated")
@@ -85,8 +86,12 @@ def ship_guide(calibrated: Path, shipped: Path) -> None:
         or name not in after.tensors
         or not torch.equal(before.tensors[name], after.tensors[name])
     }
-    if other := sorted(name for name in changed if not name.startswith("guide.")):
-        raise UserError(f"{calibrated} differs from {shipped} in {other[0]}, not in the guide alone")
+    parts = records[-1].get("parts", ["guide"])
+    allowed = {name for name in changed if name.startswith("guide.") and "guide" in parts}
+    if "scales" in parts and SCALES in changed and before.tensors[SCALES][:-1].equal(after.tensors[SCALES][:-1]):
+        allowed.add(SCALES)
+    if other := sorted(changed - allowed):
+        raise UserError(f"{calibrated} differs from {shipped} in {other[0]}, which was not calibrated")
     if after.config != before.config:
         raise UserError(f"{calibrated} has another configuration than {shipped}")
     _write(shipped, after)
@@ -178,15 +183,15 @@ def _write(path: Path, checkpoint: Checkpoint) -> None:
 def main() -> None:
     """Ship what the command line names, by default the three baselines of a run folder."""
     arguments, to = sys.argv[1:], shipped_folder()
-    guide = len(arguments) == 3 and arguments[0] == "--guide"
-    if not guide and (not arguments or arguments[0].startswith("-")):
+    calibrated = len(arguments) == 3 and arguments[0] == "--calibrated"
+    if not calibrated and (not arguments or arguments[0].startswith("-")):
         raise SystemExit(
             "usage: python -m cavin_pyro.storage.shipping RUN_FOLDER [METHOD ... | --models]\n"
-            "       python -m cavin_pyro.storage.shipping --guide FILE NAME"
+            "       python -m cavin_pyro.storage.shipping --calibrated FILE NAME"
         )
     try:
-        if guide:
-            ship_guide(Path(arguments[1]), to / f"{arguments[2]}.safetensors")
+        if calibrated:
+            ship_calibrated(Path(arguments[1]), to / f"{arguments[2]}.safetensors")
             update_manifest(to)
             return
         if arguments[1:] == ["--models"]:

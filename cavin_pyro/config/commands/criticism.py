@@ -45,6 +45,9 @@ class CheckConfig:
     env: WorldConfig = field(default_factory=collection_world)
 
 
+CALIBRATED = ("guide", "scales")
+
+
 @dataclass
 class CalibrateConfig(DeviceOptions):
     """Options of `python -m cavin_pyro.calibrate`."""
@@ -56,6 +59,9 @@ class CalibrateConfig(DeviceOptions):
         group="model",
     )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
+    parts: list[str] = option(
+        ["guide"], f"what to calibrate, {' or '.join(CALIBRATED)}: parts=[guide,scales] does both", group="model"
+    )
     data: Any = option("data/pushes", f"{DATA}; the model's training data", group="data")
     output: str | None = option(None, "folder for the checkpoint; by default runs/calibrate, or beside it", group="run")
     seed: int = seed_option(group="run")

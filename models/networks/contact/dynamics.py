@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -121,6 +122,11 @@ class ContactDynamics(PushOutcome):
         mean, rows, scales = self._predict(state, action)
         still = _scales(self.still_scale.unsqueeze(1)).T.expand(state.objects, -1)
         return mean, rows.write(still, _scales(scales))
+
+    @torch.no_grad()
+    def widen(self, factor: float) -> None:
+        """See `PushOutcome`; scales are clamped to the range that training allows."""
+        self.head.bias[3] += math.log(factor)
 
     def _predict(self, state: State, action: Tensor) -> tuple[State, Rows, Tensor]:
         """The mean `[...]`, what was computed, and logarithms of its scales `[2, R, ...]`."""

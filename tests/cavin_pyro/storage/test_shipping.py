@@ -19,7 +19,7 @@ from cavin_pyro.storage import shipping
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint, save_checkpoint
 from cavin_pyro.storage.digests import read_manifest
 from cavin_pyro.storage.files import file_digest
-from cavin_pyro.storage.shipping import main, ship, ship_guide, ship_models
+from cavin_pyro.storage.shipping import main, ship, ship_calibrated, ship_models
 
 LOSSES = {0: -3.0, 1: -7.5, 2: -5.0}  # by training seed
 
@@ -179,7 +179,7 @@ def test_a_calibrated_guide_is_shipped_with_the_model_as_it_was(
 ) -> None:
     before, calibrated = load_checkpoint(shipped), tmp_path / "calibrated.safetensors"
     calibrate_by_hand(small, shipped, calibrated, part="guide")
-    monkeypatch.setattr(sys, "argv", ["shipping", "--guide", str(calibrated), "cavin"])
+    monkeypatch.setattr(sys, "argv", ["shipping", "--calibrated", str(calibrated), "cavin"])
     main()
     after = load_checkpoint(shipped)
     changed = {name for name, value in before.tensors.items() if not torch.equal(value, after.tensors[name])}
@@ -193,13 +193,35 @@ def test_a_guide_with_another_model_or_of_another_file_is_not_shipped(
 ) -> None:
     digest, calibrated = file_digest(shipped), tmp_path / "calibrated.safetensors"
     calibrate_by_hand(small, shipped, calibrated, part="model")
-    with pytest.raises(UserError, match=r"differs from .* in model\..*, not in the guide alone"):
-        ship_guide(calibrated, shipped)
+    with pytest.raises(UserError, match=r"differs from .* in model\..*, which was not calibrated"):
+        ship_calibrated(calibrated, shipped)
     calibrate_by_hand(small, shipped, calibrated, part="guide", seed=5)
     with pytest.raises(UserError, match="has another configuration"):
-        ship_guide(calibrated, shipped)
+        ship_calibrated(calibrated, shipped)
     assert file_digest(shipped) == digest
     calibrate_by_hand(small, shipped, calibrated, part="guide")
-    ship_guide(calibrated, shipped)
+    ship_calibrated(calibrated, shipped)
     with pytest.raises(UserError, match="is no calibration of"):  # of the file as it was before
-        ship_guide(calibrated, shipped)
+        ship_calibrated(calibrated, shipped)
+
+
+def test_calibrated_scales_are_shipped_and_nothing_else_of_f(
+    small: SimpleNamespace, shipped: Path, tmp_path: Path
+) -> None:
+    """One number of one bias; the fixed scales of `cavin` have none, so it gets one here."""
+    name, calibrated = shipping.SCALES, tmp_path / "calibrated.safetensors"
+    content = load_checkpoint(shipped)
+    tensors = {**{key: value.clone() for key, value in content.tensors.items()}, name: torch.zeros(4)}
+    shipped.write_bytes(checkpoint_bytes(tensors, content.config, content.provenance))
+
+    def calibrate(bias: list[float], parts: list[str]) -> None:
+        about = {**content.provenance, "calibrated": [{"parts": parts, "checkpoint": file_digest(shipped)}]}
+        calibrated.write_bytes(checkpoint_bytes({**tensors, name: torch.tensor(bias)}, content.config, about))
+
+    for bias, parts in (([0.0, 0.0, 0.0, 0.3], ["guide"]), ([0.0, 0.1, 0.0, 0.3], ["scales"])):
+        calibrate(bias, parts)
+        with pytest.raises(UserError, match=f"differs from .* in {name}, which was not calibrated"):
+            ship_calibrated(calibrated, shipped)
+    calibrate([0.0, 0.0, 0.0, 0.3], ["scales"])
+    ship_calibrated(calibrated, shipped)
+    assert load_checkpoint(shipped).tensors[name].tolist() == pytest.approx([0.0, 0.0, 0.0, 0.3])
