@@ -4,9 +4,9 @@ Steps of training per second for batches of 64 and 1,024 windows (the cascade wi
 made-up windows; in the device's memory, and on a GPU also copied batch by batch as data larger than memory are), and
 milliseconds per plan with 1,024 and 65,536 samples (`planner=cavin` with its defaults, crossing, sparse, 3 objects,
 horizon 30, the shipped checkpoint, the first images of some episodes, from a state on the device to pushes on the CPU).
-On a GPU both with CUDA graphs and without.
-Wall time, medians, after a warm-up; a plan's noise is sampled on the CPU for every device. Set OMP_NUM_THREADS for the
-number of the CPU's threads. Prints tables in Markdown.
+On a GPU both with CUDA graphs and without. Wall time after a warm-up, of a plan the median over episodes. A plan's
+noise is sampled on the CPU for every device. Set OMP_NUM_THREADS for the number of the CPU's threads. Prints tables in
+Markdown.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
+from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from models.model import Model
@@ -41,11 +42,11 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     count = len(state.mask)
     here = state.expand_plans(1)
     with torch.no_grad():
-        effect_code = model.effect_prior(state).sample().unsqueeze(-2)  # [b, 1, C]
+        effect_code = _sample(model.effect_prior(state)).unsqueeze(-2)  # [b, 1, C]
         subgoal = model.subgoal(here, effect_code)
     prior = model.motion_prior(here, effect_code).expand((count, motions))
     with torch.no_grad():
-        motion_code = prior.sample()
+        motion_code = _sample(prior)
         pushes = model.actions(here, effect_code=effect_code.expand(-1, motions, -1), motion_code=motion_code)
         ends, _ = predict_states(model, here, pushes)
         density = _log_density(ends, subgoal)
@@ -53,6 +54,11 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     # The second factor is 1: it only has the gradient of the prior's density.
     each = (density + log_prior - log_prior.detach()).logsumexp(-1) - math.log(motions)
     return -each.sum() * (len(window.sequence_mask) / count)
+
+
+def _sample(prior: TorchDistribution) -> Tensor:
+    """A sample; `sample` of torch's normal distributions waits for a GPU, to check their scales."""
+    return prior.rsample() if prior.has_rsample else prior.sample()
 
 
 def _log_density(end: State, subgoal: State) -> Tensor:

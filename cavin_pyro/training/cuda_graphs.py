@@ -16,7 +16,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from cavin_pyro.training.elbo import elbo_terms
-from cavin_pyro.training.objectives import BoundObjective
+from cavin_pyro.training.objectives import BoundObjective, Objective
 from cavin_pyro.training.randomness import forked
 from models.networks.shapes import fixed_shapes
 from models.state import Window
@@ -28,9 +28,12 @@ def capturable(loss: BoundObjective, window: Window) -> bool:
     """Whether a graph has the value and the gradients of this loss.
 
     The bound must be `Trace_ELBO` with one particle, whose loss for codes that are reparameterised is the sum of
-    `elbo_terms` (Pyro's own method waits for the GPU at every site), and no weight may change from step to step.
+    `elbo_terms` (Pyro's own method waits for the GPU at every site), without weights of KL terms and a counterfactual
+    term. A subclass of the objective may do anything else.
     """
     objective = loss.objective
+    if type(objective) is not Objective or type(loss) is not BoundObjective:
+        return False
     if type(objective.elbo) is not Trace_ELBO or objective.elbo.num_particles != 1 or not loss.guide.amortized:
         return False
     weighted = objective.warm_up_steps or any(weight != 1.0 for weight in objective.weights(0).values())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -35,6 +36,7 @@ from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resumi
 from guides.guide import Guide
 from models.model import Model
 from models.state import Window
+from planning.backends.capture import first_line
 
 VALIDATION_BATCH = 1024  # windows at once, which bounds the memory
 
@@ -149,7 +151,8 @@ class Trainer:
                 loss = self._captured(window)
             except RuntimeError as error:  # the base class of CUDA's errors
                 self._captured = None
-                print(f"steps run eagerly, since none can be captured as a CUDA graph: {str(error).splitlines()[0]}")
+                why = f"since the loss cannot be captured as a CUDA graph: {first_line(error)}"
+                print(f"from step {self.step} on, steps run eagerly, {why}", file=sys.stderr, flush=True)
         if self._captured is None:
             for optimizer in self._optimizers.values():
                 optimizer.zero_grad(set_to_none=True)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
+from torch.distributions import Distribution
 
 Result = TypeVar("Result")
 
@@ -15,28 +18,60 @@ def capture(function: Callable[[], Result], device: torch.device, pool: Any) -> 
     """A graph of all that `function` does on the device, and its result, which every replay writes anew.
 
     The function is called twice: once so that libraries allocate what they need, which no graph may do. Random numbers
-    that it draws from the device's generator are drawn anew in every replay, and not used up here. `pool`: of memory.
+    that it draws from the device's generator are drawn anew in every replay, and not used up here. Distributions do not
+    check their arguments, for which they would wait.
+
+    Args:
+        pool: memory that graphs share, of `torch.cuda.graph_pool_handle`.
 
     Raises RuntimeError, as torch does, for a function that waits for the device or copies something to it. The first
-    call finds that out: a capture that fails leaves the device's generator unusable.
+    call finds most of these; a capture that fails can leave the device's generator unusable.
     """
-    here, stream = torch.cuda.current_stream(device), torch.cuda.Stream(device)
-    stream.wait_stream(here)
-    with torch.cuda.stream(stream), torch.random.fork_rng([device]), _no_waiting():
-        function()
-    here.wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, pool=pool, stream=stream):
-        result = function()
+    here, stream = torch.cuda.current_stream(device), _stream(device)
+    with unchecked_distributions():
+        stream.wait_stream(here)
+        try:
+            with torch.cuda.stream(stream), torch.random.fork_rng([device]), _no_waiting():
+                function()
+        finally:
+            here.wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        # Inside of `here`, which is then current again also if the capture fails.
+        with torch.cuda.stream(here), torch.cuda.graph(graph, pool=pool, stream=stream):
+            result = function()
     return graph, result
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, of which torch's have many."""
+    return (str(error).splitlines() or [repr(error)])[0]
+
+
+@contextmanager
+def unchecked_distributions() -> Iterator[None]:
+    """Disable torch's validation of distributions: it branches on values, which neither graphs nor native code can."""
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
+
+
+@cache
+def _stream(device: torch.device) -> torch.cuda.Stream:
+    """One stream for all captures: graphs of other streams would share no memory."""
+    return torch.cuda.Stream(device)
 
 
 @contextmanager
 def _no_waiting() -> Iterator[None]:
     """Operations for which the host waits raise RuntimeError."""
     before = torch.cuda.get_sync_debug_mode()
-    torch.cuda.set_sync_debug_mode("error")
     try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch, that this mode is a prototype
+            torch.cuda.set_sync_debug_mode("error")
         yield
     finally:
         torch.cuda.set_sync_debug_mode(before)

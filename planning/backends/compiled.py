@@ -7,9 +7,9 @@ import platform
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -18,11 +18,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.distributions import Distribution
 
 from planning import records
 from planning.backends import passes
 from planning.backends.cache import VARIABLE, CodeCache, UnsafeFolderError, default_folder
+from planning.backends.capture import unchecked_distributions
 from planning.backends.eager import Item, Result, eager
 from planning.backends.fingerprint import UnknownValueError, fingerprint
 from planning.backends.library import PROXY_EXECUTOR, Library
@@ -122,7 +122,7 @@ class Compiled:
             torch.set_num_threads(threads)  # setting it in a worker thread also changes it here
 
     def _first(self, version: Any, function: _FlatFunction, tensors: list[Tensor]) -> None:
-        with self._compiling, _distributions_unchecked(), self._tracing():
+        with self._compiling, unchecked_distributions(), self._tracing():
             if version not in self._versions:  # another thread may have made it
                 try:
                     self._versions[version] = self._make(version, function, tensors)
@@ -273,17 +273,6 @@ class _FlatFunction(nn.Module):
     def form(self) -> Any:
         """The last result, without its numbers."""
         return records.apply(self._last.result, lambda value: torch.empty(0) if isinstance(value, Tensor) else value)
-
-
-@contextmanager
-def _distributions_unchecked() -> Iterator[None]:
-    """Disable torch's validation of distributions: it branches on values, which compiled code cannot."""
-    before = Distribution._validate_args
-    Distribution.set_default_validate_args(False)
-    try:
-        yield
-    finally:
-        Distribution.set_default_validate_args(before)
 
 
 def _in_float32(value: Any) -> Any:

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from planning import records
-from planning.backends.capture import capture
+from planning.backends.capture import capture, first_line
 from planning.backends.eager import Item, Result, eager
 from planning.backends.signature import flatten, unflatten
 
-MOST = (
-    64  # graphs, each with its own results in the GPU's memory; those that were not used for the longest time go first
-)
+# Graphs, each with its own results in the GPU's memory; those that were not used for the longest time go first.
+MOST = 64
+DEVICE = "cuda"
 
 
 class CudaGraphs:
@@ -28,11 +28,11 @@ class CudaGraphs:
     execution; but shapes must not depend on values, so a model computes what it would otherwise leave out
     (`planning.protocol.FixedShapes`). Graphs read the weights where they are: they may change, but not move.
 
-    A function that cannot be captured, because it waits for the GPU (a reward that calls `item()`, say), runs eagerly
-    from then on, which is said in one line.
+    A function that cannot be captured, because it waits for the GPU (a reward that calls `item()`, say), runs eagerly,
+    which is said in one line, once for each function.
 
-    Tensors must be on a GPU; whole numbers are copied there. All graphs share one pool of memory, which is safe because
-    they run one after the other, and results are copied out of it. Not for several threads at once.
+    Whole numbers are copied to the GPU. All graphs share one pool of memory, which is safe because they run one after
+    the other, and results are copied out of it. Not for several threads at once.
     """
 
     native = False
@@ -42,9 +42,10 @@ class CudaGraphs:
         self._graphs: OrderedDict[Any, _Graph | None] = OrderedDict()  # None runs eagerly
         self._tracing = tracing
         self._pool: Any = None
+        self._refused: set[str] = set()  # names of functions, which were said
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """See `Backend`."""
+        """See `Backend`. Raises ValueError for tensors that are all on the CPU."""
         tensors: list[Tensor] = []
         signature: list[Any] = [function, torch.get_float32_matmul_precision(), torch.is_inference_mode_enabled()]
         flatten(arguments, tensors, signature)
@@ -64,18 +65,22 @@ class CudaGraphs:
     def _captured(
         self, function: Callable[..., Any], arguments: tuple[Any, ...], tensors: list[Tensor]
     ) -> _Graph | None:
+        device = next((tensor.device for tensor in tensors if tensor.device.type == DEVICE), None)
+        if device is None:
+            raise ValueError(
+                f"compile=cuda_graphs needs a model and a state on a GPU, and {function.__name__} got tensors on the "
+                "CPU: choose compile=true, or plan on a GPU"
+            )
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
         try:
             with self._tracing():
-                return _Graph(function, arguments, tensors, self._pool)
+                return _Graph(function, arguments, tensors, device, self._pool)
         except RuntimeError as error:  # the base class of CUDA's errors
-            why = str(error).splitlines()[0]
-            print(
-                f"{function.__name__} runs eagerly, since it cannot be captured as a CUDA graph: {why}",
-                file=sys.stderr,
-                flush=True,
-            )
+            if function.__name__ not in self._refused:
+                self._refused.add(function.__name__)
+                why = f"runs eagerly, since it cannot be captured as a CUDA graph: {first_line(error)}"
+                print(f"{function.__name__} {why}", file=sys.stderr, flush=True)
             return None
 
 
@@ -83,9 +88,13 @@ class _Graph:
     """One function, for one signature of its arguments, which is not checked again."""
 
     def __init__(
-        self, function: Callable[..., Any], arguments: tuple[Any, ...], tensors: list[Tensor], pool: Any
+        self,
+        function: Callable[..., Any],
+        arguments: tuple[Any, ...],
+        tensors: list[Tensor],
+        device: torch.device,
+        pool: Any,
     ) -> None:
-        device = next((tensor.device for tensor in tensors if tensor.device.type != "cpu"), tensors[0].device)
         with torch.inference_mode(False):  # tensors that may be written in any mode
             self._inputs = [torch.empty_like(tensor, device=device) for tensor in tensors]
         for own, tensor in zip(self._inputs, tensors, strict=True):

@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 
 
 class Backend(Protocol):
-    """Runs functions: `eager`, or `planning.backends.compiled.Compiled`."""
+    """Runs functions: `eager`, `planning.backends.compiled.Compiled`, or `planning.backends.cuda_graphs.CudaGraphs`."""
 
     @property
     def native(self) -> bool:

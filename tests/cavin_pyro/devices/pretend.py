@@ -33,7 +33,10 @@ WAITS = {
     torch.ops.aten.equal.default,
     torch.ops.aten.is_nonzero.default,
     torch.ops.aten.masked_select.default,
+    torch.ops.aten.multinomial.default,
     torch.ops.aten.nonzero.default,
+    torch.ops.aten.normal.Tensor_Tensor,
+    torch.ops.aten.normal.float_Tensor,
     torch.ops.aten.repeat_interleave.Tensor,
 }
 INDEXING = {torch.ops.aten.index.Tensor, torch.ops.aten.index_put.default, torch.ops.aten.index_put_.default}

@@ -19,6 +19,8 @@ from cavin_pyro.config.device import choose_device, send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.evaluation.factory import make_runner
+from cavin_pyro.training.cuda_graphs import CapturedLoss
+from models.state import Window
 from planning.backends.compiled import Compiled
 from planning.backends.cuda_graphs import CudaGraphs
 from tests.cavin_pyro.devices.conftest import broken_after, episode, tensors, trained
@@ -186,23 +188,58 @@ def test_what_waits_for_the_gpu_is_no_graph(capfd: pytest.CaptureFixture[str]) -
     assert backend(torch.neg, numbers + 1).tolist() == [-1.0, -2.0, -3.0]
 
 
+@needs_gpu
+def test_graphs_read_weights_where_they_are() -> None:
+    backend, layer = CudaGraphs(), torch.nn.Linear(2, 2, device="cuda").requires_grad_(False)
+
+    def layered(inputs: torch.Tensor) -> torch.Tensor:
+        return layer(inputs)
+
+    inputs = torch.randn(3, 2, device="cuda")
+    before = backend(layered, inputs)
+    layer.weight.mul_(2.0)
+    assert not backend(layered, inputs).equal(before)
+    torch.testing.assert_close(backend(layered, inputs), layer(inputs))
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Filled with the number of windows of every step whose loss is a graph's."""
+    found: list[int] = []
+    usual = CapturedLoss.__call__
+
+    def call(loss: CapturedLoss, window: Window) -> torch.Tensor:
+        value = usual(loss, window)
+        found.append(len(window.actions))
+        return value
+
+    monkeypatch.setattr(CapturedLoss, "__call__", call)
+    return found
+
+
 CONTACT = ["geometry=outline", "dynamics=contact", "dynamics.reach_margin=0.015", "scales=predicted", "prior=mixture"]
 
 
 @needs_gpu
 @pytest.mark.parametrize(
     "options",
-    [[], [*CONTACT, "objective=rollout"], [*CONTACT, "objective=consistent"], ["model=flat", "guide=flat"]],
+    [
+        [],
+        [*CONTACT, "objective=rollout"],
+        [*CONTACT, "objective=consistent"],
+        ["prior=conditional", "objective=consistent"],
+        ["model=flat", "guide=flat"],
+    ],
 )
 def test_graphs_train_as_eager_steps_do(
-    options: list[str], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], data: Path, tmp_path: Path, replayed: list[int], capfd: pytest.CaptureFixture[str]
 ) -> None:
     """With the same random numbers of codes."""
     options = ["device=cuda", *options]
-    one, other = (
-        trained(data, tmp_path / value, f"trainer.cuda_graphs={value}", *options) for value in ("false", "true")
-    )
-    assert "run eagerly" not in capsys.readouterr().out
+    one = trained(data, tmp_path / "eager", "trainer.cuda_graphs=false", *options)
+    assert not replayed
+    other = trained(data, tmp_path / "graphs", *options)
+    assert len(replayed) == 4 and "run eagerly" not in capfd.readouterr().err
     assert one["random_cuda"].equal(other["random_cuda"])
     for name, value in one.items():
         if name.startswith(("model.", "guide.")):
@@ -210,11 +247,14 @@ def test_graphs_train_as_eager_steps_do(
 
 
 @needs_gpu
-def test_a_run_with_graphs_resumes_exactly(data: Path, tmp_path: Path) -> None:
+def test_a_run_with_graphs_resumes_exactly(
+    data: Path, tmp_path: Path, replayed: list[int], capfd: pytest.CaptureFixture[str]
+) -> None:
     expected = trained(data, tmp_path / "unbroken", "device=cuda")
     with broken_after(3):
         trained(data, tmp_path / "broken", "device=cuda")
     found = trained(data, tmp_path / "broken", "device=cuda")
+    assert len(replayed) == 4 + 3 + 2 and "run eagerly" not in capfd.readouterr().err
     for name, value in expected.items():
         torch.testing.assert_close(found[name], value, rtol=0, atol=1e-5)
 

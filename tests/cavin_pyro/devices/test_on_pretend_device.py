@@ -201,7 +201,7 @@ def test_what_a_cuda_graph_would_refuse_is_found(
     assert what in str(watched(["task=crossing", "checkpoint=cavin"], device, monkeypatch).found)
 
 
-@pytest.mark.parametrize("name", ["default", "contact", "baselines", "flat", "dynamics"])
+@pytest.mark.parametrize("name", ["default", "contact", "consistent", "baselines", "flat", "dynamics"])
 def test_steps_of_training_are_as_cuda_graphs_need_them(
     name: str, device: torch.device, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -238,6 +238,7 @@ TRAININGS = {
     "renyi": ["objective=renyi", "guide=joint"],
     "graph": ["objective=trace_graph_elbo", "guide=mean_field"],
     "counterfactual": ["objective=counterfactual"],
+    "consistent": ["prior=conditional", "objective=consistent"],
 }
 
 

@@ -42,7 +42,10 @@ def test_evaluations_have_the_folders_that_they_had() -> None:
         ("layout=generated generated.seed=3", CPU, "auto"),
         ("planner.compile=true", CPU, True),
         ("planner.compile=false", CPU, False),
-        ("", GPU, False),
+        ("", GPU, "cuda_graphs"),
+        ("planner.compile=true", GPU, "cuda_graphs"),
+        ("planner.compile=false", GPU, False),
+        ("layout=random", GPU, False),
         ("layout=random", CPU, False),
         ("layout=generated", CPU, False),
         ("task=rearrange", CPU, False),
@@ -52,7 +55,7 @@ def test_evaluations_have_the_folders_that_they_had() -> None:
         ("planner.warm_start=false planner.compile=true", CPU, True),
     ],
 )
-def test_auto_is_false_where_native_code_would_change_plans(
+def test_auto_is_false_where_other_plans_could_come_of_it(
     overrides: str, device: torch.device, chosen: bool | str
 ) -> None:
     config = compose("plan", *overrides.split())

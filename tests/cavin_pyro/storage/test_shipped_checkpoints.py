@@ -19,7 +19,7 @@ CALIBRATED = {  # SHA-256 of the file as trained, and of its weights without the
     ),
     "contact": (
         "bfacefda07de10b0e2a6021967597a837cbb57d5dd42768d5cadf89b3ada0bc3",
-        "d002b3fafd22d24d056d5db78ce6b962d96da8adbb155b0fc89153d7789ebc1c",  # its f was trained on afterwards
+        "f5eb6cf9a11a91cb5d11b617f14eb86006ac5609dc9febb93bc4f4643bba2bfc",  # its f was trained on, and its scales were calibrated
     ),
     "sectar": (
         "b5993e55f856ec1c2d1bcea18a11df7f46f8488c9a7947aec6f92e479ff671fe",
@@ -73,7 +73,8 @@ def test_calibration_has_left_the_model_as_it_was_trained(name: str) -> None:
 
 @pytest.mark.parametrize("name", CALIBRATED)
 def test_a_calibrated_guide_tells_what_its_intervals_hold(name: str) -> None:
-    (record,) = load_checkpoint(default_checkpoint().with_stem(name)).provenance["calibrated"]
+    record, *others = load_checkpoint(default_checkpoint().with_stem(name)).provenance["calibrated"]
+    assert [other["parts"] for other in others] == ([["scales"]] if name == "contact" else [])
     assert record["command"].startswith("python -m cavin_pyro.calibrate ")
     assert {"revision", "date", "packages", "data", "steps", "wake_weight", "seed"} <= set(record)
     if name != "contact":  # whose guide had been calibrated before its prior of motions and f were trained on
@@ -82,3 +83,9 @@ def test_a_calibrated_guide_tells_what_its_intervals_hold(name: str) -> None:
         for dimensions in ("held", "held_informed"):
             held = after[dimensions]
             assert 0.86 <= held["low"] <= held["mean"] <= held["high"] <= 0.94, (code, dimensions)
+
+
+def test_calibrated_scales_hold_nine_tenths_of_what_moved() -> None:
+    _, record = load_checkpoint(default_checkpoint().with_stem("contact")).provenance["calibrated"]
+    before, after = (record["scales"][when]["moved"]["0.9"]["mean"] for when in ("before", "after"))
+    assert before < 0.85 < 0.88 < after < 0.92 and record["scales"]["factor"] > 1.2

@@ -40,6 +40,7 @@ def captured(monkeypatch: pytest.MonkeyPatch) -> list[Callable[[], Any]]:
         return SimpleNamespace(replay=replay), result
 
     monkeypatch.setattr(cuda_graphs, "capture", capture)
+    monkeypatch.setattr(cuda_graphs, "DEVICE", "cpu")
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: None)
     return functions
 
@@ -99,11 +100,16 @@ def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(
 
     monkeypatch.setattr(cuda_graphs, "capture", refuse)
     backend = CudaGraphs()
-    for by in (1, 2):
-        assert backend(shifted, torch.zeros(2), by, 1.0).first.tolist() == [by, by]
+    for count in (1, 2):
+        assert backend(shifted, torch.zeros(count), 1, 1.0).first.tolist() == count * [1.0]
     assert capsys.readouterr().err == (
         "shifted runs eagerly, since it cannot be captured as a CUDA graph: called a synchronizing CUDA operation\n"
     )
+
+
+def test_tensors_on_the_cpu_are_refused() -> None:
+    with pytest.raises(ValueError, match="compile=cuda_graphs needs a model and a state on a GPU, and shifted got"):
+        CudaGraphs()(shifted, torch.zeros(2), 1, 1.0)
 
 
 def test_models_are_told_that_shapes_must_not_depend_on_values(captured: list[Callable[[], Any]]) -> None:
