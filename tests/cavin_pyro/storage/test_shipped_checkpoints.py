@@ -19,7 +19,7 @@ CALIBRATED = {  # SHA-256 of the file as trained, and of its weights without the
     ),
     "contact": (
         "bfacefda07de10b0e2a6021967597a837cbb57d5dd42768d5cadf89b3ada0bc3",
-        "f5eb6cf9a11a91cb5d11b617f14eb86006ac5609dc9febb93bc4f4643bba2bfc",  # its f was trained on, and its scales were calibrated
+        "f5eb6cf9a11a91cb5d11b617f14eb86006ac5609dc9febb93bc4f4643bba2bfc",  # f trained on, scales calibrated
     ),
     "sectar": (
         "b5993e55f856ec1c2d1bcea18a11df7f46f8488c9a7947aec6f92e479ff671fe",
