@@ -7,7 +7,7 @@ import torch
 from cavin_pyro.training.reflection import reflect
 from envs.sensors.camera import Camera
 from envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
-from models.networks.contact.tool import endpoints
+from models.networks.contact.tool import REACH, endpoints
 from models.networks.outline import Outline
 from models.networks.pointnet import PointNet
 from models.state import State, Window
@@ -35,7 +35,7 @@ def test_a_mirrored_window_is_what_mirrored_clouds_give_and_others_stay() -> Non
     torch.testing.assert_close(found.states.centers, expected.states.centers)
     torch.testing.assert_close(found.states.features, expected.states.features, atol=1e-5, rtol=0)
     assert not torch.allclose(found.states.features[0], recorded.states.features[0], atol=1e-2)
-    for one, other in zip(endpoints(found.actions), endpoints(recorded.actions), strict=True):
+    for one, other in zip(endpoints(found.actions, REACH), endpoints(recorded.actions, REACH), strict=True):
         torch.testing.assert_close(one, torch.where(which[:, None, None], other * MIRROR[:2], other))
 
 
