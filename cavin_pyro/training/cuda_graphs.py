@@ -6,7 +6,6 @@ long as the GPU needs for them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -20,8 +19,8 @@ from cavin_pyro.training.objectives import BoundObjective, Objective
 from cavin_pyro.training.randomness import forked
 from models.networks.shapes import fixed_shapes
 from models.state import Window
-from planning.backends.capture import capture
-from planning.backends.signature import flatten, unflatten
+from planning.backends.capture import Graph
+from planning.backends.signature import flatten
 
 
 def capturable(loss: BoundObjective, window: Window) -> bool:
@@ -53,7 +52,7 @@ class CapturedLoss:
     def __init__(self, loss: BoundObjective) -> None:
         self._loss = loss
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
-        self._graphs: dict[Any, Callable[[list[Tensor]], tuple[Tensor, list[Tensor | None]]]] = {}
+        self._graphs: dict[Any, Graph[tuple[Tensor, list[Tensor | None]]]] = {}
         self._pool = torch.cuda.graph_pool_handle()
 
     def __call__(self, window: Window) -> Tensor:
@@ -66,27 +65,12 @@ class CapturedLoss:
         flatten(window, tensors, signature)
         version = tuple(signature)
         if version not in self._graphs:
-            self._graphs[version] = self._capture(window, tensors)
+            with fixed_shapes():
+                self._graphs[version] = Graph(self._gradients, (window,), tensors, window.actions.device, self._pool)
         value, gradients = self._graphs[version](tensors)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         return value
-
-    def _capture(
-        self, window: Window, tensors: list[Tensor]
-    ) -> Callable[[list[Tensor]], tuple[Tensor, list[Tensor | None]]]:
-        inputs = [tensor.clone() for tensor in tensors]
-        given: Window = unflatten(window, iter(inputs))
-        with fixed_shapes():
-            graph, results = capture(lambda: self._gradients(given), window.actions.device, self._pool)
-
-        def replay(tensors: list[Tensor]) -> tuple[Tensor, list[Tensor | None]]:
-            for own, tensor in zip(inputs, tensors, strict=True):
-                own.copy_(tensor, non_blocking=True)
-            graph.replay()
-            return results
-
-        return replay
 
     def _gradients(self, window: Window) -> tuple[Tensor, list[Tensor | None]]:
         loss = loss_of(self._loss, window) / len(window.sequence_mask)

@@ -83,13 +83,6 @@ class PushOutcome(nn.Module, ABC):
         """The mean: `state: [...]`, its features `encoded: [..., M, 3 * width]`, `action: [..., 4]` -> `[...]`."""
         return self.outcome(state, encoded, action)[0]
 
-    def widen(self, factor: float) -> None:
-        """Multiply the scales of centres by `factor`, those of objects that no push can move excepted.
-
-        Raises `NotImplementedError` unless it `predicts_scales`.
-        """
-        raise NotImplementedError(f"{type(self).__name__} predicts no scales")
-
     @abstractmethod
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor | None]:
         """The mean, and if `predicts_scales` the scales `[..., M, 2]` of its centres (metres) and features."""

@@ -3,15 +3,47 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
+from torch import Tensor
 from torch.distributions import Distribution
 
+from planning.backends.signature import unflatten
+
 Result = TypeVar("Result")
+
+
+class Graph(Generic[Result]):
+    """A function of tensors as a CUDA graph, for one signature of its arguments, which is not checked again."""
+
+    def __init__(
+        self,
+        function: Callable[..., Result],
+        arguments: Sequence[Any],
+        tensors: Sequence[Tensor],
+        device: torch.device,
+        pool: Any,
+    ) -> None:
+        """`arguments`: of the function; `tensors`: theirs, by `signature.flatten`. For the rest see `capture`."""
+        with torch.inference_mode(False):  # tensors that may be written in any mode
+            self._inputs = [torch.empty_like(tensor, device=device) for tensor in tensors]
+        self._write(tensors)
+        given = unflatten(tuple(arguments), iter(self._inputs))
+        self._graph, self._result = capture(lambda: function(*given), device, pool)
+
+    def __call__(self, tensors: Sequence[Tensor]) -> Result:
+        """The result for other tensors, whose place the next call writes over."""
+        self._write(tensors)
+        self._graph.replay()
+        return self._result
+
+    def _write(self, tensors: Sequence[Tensor]) -> None:
+        for own, tensor in zip(self._inputs, tensors, strict=True):
+            own.copy_(tensor, non_blocking=True)
 
 
 def capture(function: Callable[[], Result], device: torch.device, pool: Any) -> tuple[torch.cuda.CUDAGraph, Result]:

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from planning import records
-from planning.backends.capture import capture, first_line
+from planning.backends.capture import Graph, first_line
 from planning.backends.eager import Item, Result, eager
-from planning.backends.signature import flatten, unflatten
+from planning.backends.signature import flatten
 
 # Graphs, each with its own results in the GPU's memory; those that were not used for the longest time go first.
 MOST = 64
@@ -39,7 +39,7 @@ class CudaGraphs:
 
     def __init__(self, tracing: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
         """`tracing`: opened while functions are captured, to tell models that shapes must not depend on values."""
-        self._graphs: OrderedDict[Any, _Graph | None] = OrderedDict()  # None runs eagerly
+        self._graphs: OrderedDict[Any, Graph[Any] | None] = OrderedDict()  # None runs eagerly
         self._tracing = tracing
         self._pool: Any = None
         self._refused: set[str] = set()  # names of functions, which were said
@@ -56,7 +56,7 @@ class CudaGraphs:
                 self._graphs.popitem(last=False)
         self._graphs.move_to_end(version)
         graph = self._graphs[version]
-        return function(*arguments) if graph is None else graph(tensors)
+        return function(*arguments) if graph is None else _copied(graph(tensors))
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """See `Backend`."""
@@ -64,7 +64,7 @@ class CudaGraphs:
 
     def _captured(
         self, function: Callable[..., Any], arguments: tuple[Any, ...], tensors: list[Tensor]
-    ) -> _Graph | None:
+    ) -> Graph[Any] | None:
         device = next((tensor.device for tensor in tensors if tensor.device.type == DEVICE), None)
         if device is None:
             raise ValueError(
@@ -75,7 +75,7 @@ class CudaGraphs:
             self._pool = torch.cuda.graph_pool_handle()
         try:
             with self._tracing():
-                return _Graph(function, arguments, tensors, device, self._pool)
+                return Graph(function, arguments, tensors, device, self._pool)
         except RuntimeError as error:  # the base class of CUDA's errors
             if function.__name__ not in self._refused:
                 self._refused.add(function.__name__)
@@ -84,26 +84,5 @@ class CudaGraphs:
             return None
 
 
-class _Graph:
-    """One function, for one signature of its arguments, which is not checked again."""
-
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        arguments: tuple[Any, ...],
-        tensors: list[Tensor],
-        device: torch.device,
-        pool: Any,
-    ) -> None:
-        with torch.inference_mode(False):  # tensors that may be written in any mode
-            self._inputs = [torch.empty_like(tensor, device=device) for tensor in tensors]
-        for own, tensor in zip(self._inputs, tensors, strict=True):
-            own.copy_(tensor)
-        given = unflatten(arguments, iter(self._inputs))
-        self._graph, self._result = capture(lambda: function(*given), device, pool)
-
-    def __call__(self, tensors: list[Tensor]) -> Any:
-        for own, tensor in zip(self._inputs, tensors, strict=True):
-            own.copy_(tensor, non_blocking=True)
-        self._graph.replay()
-        return records.apply(self._result, lambda value: value.clone() if isinstance(value, Tensor) else value)
+def _copied(result: Any) -> Any:
+    return records.apply(result, lambda value: value.clone() if isinstance(value, Tensor) else value)

@@ -7,7 +7,7 @@ objects within a push's reach are multiplied by one number, so that intervals ho
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from scipy.stats import t as student
@@ -25,15 +25,23 @@ LEVELS = (0.5, 0.8, 0.9, 0.95)
 LEVEL = 0.9  # at which the intervals are made right
 
 
+@runtime_checkable
+class AdjustableScales(Protocol):
+    """An f whose scales can be widened."""
+
+    def widen(self, factor: float) -> None:
+        """Multiply the scales of centres by `factor`."""
+
+
 def check_scales(model: Model) -> None:
-    """Refuse a model whose f predicts no scales.
+    """Refuse a model whose f predicts no scales, or none that can be widened.
 
     Raises:
         UserError: it does not.
     """
-    if not isinstance(model.scales, PredictedScales):
+    if not (isinstance(model.scales, PredictedScales) and isinstance(model.dynamics, AdjustableScales)):
         raise UserError(
-            "parts=[scales] calibrates scales that f predicts, and this model's are fixed or learned: choose "
+            "parts=[scales] calibrates scales that f predicts, and this model's cannot be widened: choose "
             "parts=[guide], or train with dynamics=contact scales=predicted"
         )
 
@@ -55,6 +63,7 @@ def calibrate_scales(model: Model, window: Window) -> float:
     if not moved.any():
         raise UserError("no object moved in the held-out windows: collect more transitions")
     factor = float(ratio[moved].flatten().quantile(LEVEL)) / _half_width(model, LEVEL)
+    assert isinstance(model.dynamics, AdjustableScales)  # see `check_scales`
     model.dynamics.widen(factor)
     return factor
 

@@ -125,7 +125,7 @@ class ContactDynamics(PushOutcome):
 
     @torch.no_grad()
     def widen(self, factor: float) -> None:
-        """See `PushOutcome`; scales are clamped to the range that training allows."""
+        """Multiply the scales of centres by `factor`, those of objects out of reach excepted, within their range."""
         self.head.bias[3] += math.log(factor)
 
     def _predict(self, state: State, action: Tensor) -> tuple[State, Rows, Tensor]:

@@ -8,15 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from safetensors.torch import load_file
 from torch import Tensor
+from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.collection import CollectionConfig, collect
+from cavin_pyro.evaluation import factory
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.evaluation.rollout import Episode
+from cavin_pyro.training import run
 from cavin_pyro.training.run import train
 from cavin_pyro.training.trainer import Trainer
+from tests.cavin_pyro.devices import pretend
 
 PUSHES = CollectionConfig(seed=5, steps=6, episodes_per_shard=10, minimum_objects=1, maximum_objects=2)
 EPISODE = ["objects=2", "maximum_steps=2"]
@@ -24,6 +29,21 @@ TRAINING = [
     *("trainer.steps=4", "trainer.validate_every=2", "trainer.batch_size=8"),
     *("windows.minimum_move=0.0", "windows.negative_fraction=1.0"),
 ]
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """The pretend device, which the commands choose within `PretendDevice`."""
+    found = pretend.register()
+    pretend.module.free = pretend.PLENTY
+    for module in (factory, run):
+        usual = module.choose_device
+        monkeypatch.setattr(
+            module,
+            "choose_device",
+            lambda name, usual=usual: found if _get_current_dispatch_mode() is not None else usual(name),
+        )
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -36,10 +36,12 @@ without_gpu = pytest.mark.skipif(GPU, reason="says what happens without a GPU, a
     [("found or mistake or paper or default or contact_crossing", 14), pytest.param("", 60, marks=pytest.mark.soak)],
 )
 def test_everything_works_on_a_device_that_is_not_the_cpu(chosen: str, least: int) -> None:
-    """`test_on_pretend_device.py`, in a process of its own: the device would stay in this one."""
+    """`test_on_pretend_device.py` and the file about graphs, in a process of their own: the device would stay here."""
     line = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", "pretend", "-k", chosen]
-    file = "tests/cavin_pyro/devices/test_on_pretend_device.py"
-    ended = subprocess.run([*line, file], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=1200)
+    files = [
+        f"tests/cavin_pyro/devices/{name}.py" for name in ("test_on_pretend_device", "test_graphs_on_pretend_device")
+    ]
+    ended = subprocess.run([*line, *files], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=1200)
     assert ended.returncode == 0, ended.stdout[-8000:]
     counted = re.search(r"(\d+) passed", ended.stdout)
     assert counted and int(counted[1]) >= least and "skipped" not in ended.stdout

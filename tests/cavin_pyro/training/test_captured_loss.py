@@ -15,12 +15,12 @@ from torch import Tensor, nn
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.parts import build_guide, build_model
-from cavin_pyro.training import cuda_graphs
 from cavin_pyro.training.cuda_graphs import CapturedLoss, capturable, loss_of
 from cavin_pyro.training.factory import build_objective
 from cavin_pyro.training.objectives import BoundObjective, Objective
 from models.networks.shapes import fixed_shapes
 from models.state import State, Window
+from planning.backends import capture as capturing
 
 CONTACT = ["geometry=outline", "dynamics=contact", "dynamics.reach_margin=0.015", "scales=predicted", "prior=mixture"]
 CHOICES = {
@@ -138,7 +138,7 @@ def test_replays_give_each_batch_its_own_loss_and_gradients(monkeypatch: pytest.
 
         return SimpleNamespace(replay=replay), (value, found)
 
-    monkeypatch.setattr(cuda_graphs, "capture", capture)
+    monkeypatch.setattr(capturing, "capture", capture)
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: None)
     step = CapturedLoss(whole)
     for seed, objects in ((0, 3), (1, 2), (2, 3), (3, 2)):

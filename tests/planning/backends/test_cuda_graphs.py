@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planning.backends import capture as capturing
 from planning.backends import cuda_graphs
 from planning.backends.cuda_graphs import CudaGraphs
 from planning.backends.signature import flatten, unflatten
@@ -39,7 +40,7 @@ def captured(monkeypatch: pytest.MonkeyPatch) -> list[Callable[[], Any]]:
 
         return SimpleNamespace(replay=replay), result
 
-    monkeypatch.setattr(cuda_graphs, "capture", capture)
+    monkeypatch.setattr(capturing, "capture", capture)
     monkeypatch.setattr(cuda_graphs, "DEVICE", "cpu")
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: None)
     return functions
@@ -98,7 +99,7 @@ def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(
     def refuse(*_: Any) -> Any:
         raise RuntimeError("called a synchronizing CUDA operation\nat great length")
 
-    monkeypatch.setattr(cuda_graphs, "capture", refuse)
+    monkeypatch.setattr(capturing, "capture", refuse)
     backend = CudaGraphs()
     for count in (1, 2):
         assert backend(shifted, torch.zeros(count), 1, 1.0).first.tolist() == count * [1.0]

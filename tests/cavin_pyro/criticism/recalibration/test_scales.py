@@ -18,7 +18,6 @@ from guides.none import NoGuide
 from models.dynamics_only import DynamicsModel
 from models.likelihoods import PredictedScales
 from models.networks.contact.dynamics import ContactDynamics
-from models.networks.dynamics import Dynamics
 from models.networks.outline import Outline
 from models.state import State, Window, stack_steps
 from tests.cavin_pyro.conftest import WINDOWS
@@ -97,8 +96,6 @@ def test_one_half_of_the_episodes_fits_and_the_other_half_tells_what_it_brought(
 def test_what_cannot_be_calibrated_is_one_line() -> None:
     with pytest.raises(UserError, match=r"parts=\[scales\] .* choose parts=\[guide\]"):
         check_scales(DynamicsModel())
-    with pytest.raises(NotImplementedError, match="Dynamics predicts no scales"):
-        Dynamics().widen(2.0)
     one = model()
     with pytest.raises(UserError, match="no object moved"):
         calibrate_scales(one, windows(one, wider=1.0, count=20, still=20))
