@@ -110,6 +110,11 @@ def expected(selections: Sequence[Values]) -> str:
     return hundredfold((one["predicted_from_subgoal"], one["from_subgoal"]))
 
 
+def expected_by_distribution(selections: Sequence[Values]) -> str:
+    one = rollout(selections, "sampled", "closest in expectation")
+    return hundredfold((one["expected_from_subgoal"], one["from_subgoal"]))
+
+
 def missed(selections: Sequence[Values]) -> str:
     prediction = rollout(selections, "sampled", "sampled")["prediction"]
     return hundredfold((prediction["error"], prediction["moved"]))
@@ -185,6 +190,12 @@ FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
         remaining("sampled", "closest"),
     ),
     ("f expects to be left; is left, cm", "consistency/selections", expected),
+    (
+        "remaining distance: sampled effect, motion closest in expectation",
+        "consistency/selections",
+        remaining("sampled", "closest in expectation"),
+    ),
+    ("f's distribution expects to be left; is left, cm", "consistency/selections", expected_by_distribution),
     (
         "remaining distance: chosen effect, closest motion",
         "consistency/selections",

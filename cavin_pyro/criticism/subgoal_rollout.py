@@ -16,20 +16,24 @@ from torch import Tensor
 
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.data.collection import clutter_area, open_scene
-from cavin_pyro.data.observed import observed_state
+from cavin_pyro.data.observed import observed_points, observed_state
 from envs.objects.sampling import ObjectRanges
 from envs.observation import Observation
 from envs.scene import Scene
 from envs.workspace import REACH_HIGH, REACH_LOW
+from models.model import Model
 from models.state import State
+from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
 from planning.rollouts import ranking
-from planning.rollouts.dynamics import predict_states
-from planning.rollouts.sampling import sample_each
+from planning.rollouts.dynamics import predict_states, sample_states
+from planning.rollouts.sampling import sample_each, uniform_each
 
 GOAL_DISTANCE = 0.15  # metres; how far a selected effect should move the target
 PHOTOGRAPH = (384, 318)  # pixels
-# How a code is obtained. CLOSEST and GIVEN are for motion codes.
-SAMPLED, CHOSEN, CLOSEST, GIVEN = "sampled", "chosen", "closest", "given"
+# How a code is obtained. CLOSEST, EXPECTED and GIVEN are for motion codes.
+SAMPLED, CHOSEN, CLOSEST, EXPECTED, GIVEN = "sampled", "chosen", "closest", "closest in expectation", "given"
+OUTCOMES = 16  # samples of f for each motion, to choose one by its expected distance
+OUTCOMES_OF_CHOSEN = 64  # other samples, for what f expects of the chosen motion
 
 
 class SegmentPlan(NamedTuple):
@@ -38,6 +42,7 @@ class SegmentPlan(NamedTuple):
     actions: NDArray[np.float32]  # [T, 4] normalised
     subgoal: NDArray[np.float32] | None  # [M, 3] metres, by h
     predicted: NDArray[np.float32]  # [M, 3] metres, by f along the actions
+    expected: NDArray[np.float32] | None = None  # [M] metres from the subgoal, the mean over samples of f
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ class SubgoalRollout:
 
 def code_selections(codes: tuple[str, ...]) -> list[tuple[str, str]]:
     """The pairs (effect, motion) of ways to obtain these codes; none for a model without codes."""
-    motions = {2: (SAMPLED, CLOSEST), 1: (GIVEN,), 0: ()}[len(codes)]
+    motions = {2: (SAMPLED, CLOSEST, EXPECTED), 1: (GIVEN,), 0: ()}[len(codes)]
     return [(effect, motion) for effect in (SAMPLED, CHOSEN) for motion in motions]
 
 
@@ -100,9 +105,10 @@ def _rollout(
     context: CheckContext, scene: Scene, number: int, selection: tuple[str, str], objects: int, samples: int
 ) -> SubgoalRollout:
     first = sample_scene(scene, context.world.ranges, context.seed, number, objects)
-    state = observed_state({"centers": first.centers, "clouds": first.clouds, "mask": first.mask}, context.geometry)
+    seen = {"centers": first.centers, "clouds": first.clouds, "mask": first.mask}
+    state, points = observed_state(seen, context.geometry), observed_points(seen)
     goal = _goal(first.centers[0], np.random.default_rng([context.seed, number, 1]))
-    plan = plan_segment(context, state, torch.from_numpy(goal), selection, [context.seed, number], samples)
+    plan = plan_segment(context, state, torch.from_numpy(goal), selection, [context.seed, number], samples, points)
     photograph = scene.photograph(scene.camera.resized(*PHOTOGRAPH))
     reports = []
     for action in plan.actions:
@@ -136,14 +142,22 @@ def _goal(target: NDArray[np.float32], generator: np.random.Generator) -> NDArra
 
 @torch.inference_mode()
 def plan_segment(
-    context: CheckContext, state: State, goal: Tensor, selection: tuple[str, str], seed: list[int], samples: int
+    context: CheckContext,
+    state: State,
+    goal: Tensor,
+    selection: tuple[str, str],
+    seed: list[int],
+    samples: int,
+    observed: ObservedPoints | None = None,
 ) -> SegmentPlan:
     """Obtain codes for one scene `state: [1]` in one of the `code_selections`, and generate the pushes.
 
     An effect code is sampled from the prior, or chosen: of N samples, the one whose subgoal (without h: the state that
     f predicts) brings object 0 closest to `goal: [2]` metres. A motion code is sampled, or it is the closest of N: the
-    one that leads f closest to the subgoal, as in planning (paper, Algorithm 1, line 10). A model with one code has the
-    motion given by the effect.
+    one that leads f closest to the subgoal, as in planning (paper, Algorithm 1, line 10); or the closest of N in
+    expectation: the one whose distance is smallest in the mean over samples of f's predictive distribution, of those
+    whose first push touches down on none of the `observed` points. A model with one code has the motion given by the
+    effect.
     """
     model, (effect, motion) = context.model, selection
     here, count = state.expand_plans(1), samples if effect == CHOSEN else 1
@@ -159,15 +173,41 @@ def plan_segment(
     code = code[:, best : best + 1]
     subgoal = model.subgoal(here, code)
     if "motion_code" in context.codes:
-        plans = state.expand_plans(samples if motion == CLOSEST else 1)
+        plans = state.expand_plans(1 if motion == SAMPLED else samples)
         code = code.expand(*plans.batch_shape, -1)
         motion_code = sample_each(model.motion_prior, [plans, code], [_generator([*seed, 3])])
         actions = model.actions(here, effect_code=code, motion_code=motion_code)
     else:
         actions = model.actions(here, effect_code=code)
     ends, _ = predict_states(model, here, actions)
-    best = int(ranking.best_of(-ranking.squared_distance(ends, subgoal), "distances of motions to the subgoal"))
-    return SegmentPlan(actions[0, best].numpy(), subgoal.centers[0, 0].numpy(), ends.centers[0, best].numpy())
+    if motion == EXPECTED:
+        scores = -expected_distances(model, here, actions, subgoal, _generator([*seed, 4]), OUTCOMES).sum(-1)
+        scores = prefer_free(scores, actions[..., 0, :], observed, TOUCHDOWN_DISTANCE)
+    else:
+        scores = -ranking.squared_distance(ends, subgoal)
+    best = int(ranking.best_of(scores, "distances of motions to the subgoal"))
+    # Other samples than those that chose it, which would tell too little.
+    expected = expected_distances(
+        model, here, actions[:, best : best + 1], subgoal, _generator([*seed, 5]), OUTCOMES_OF_CHOSEN
+    )
+    return SegmentPlan(
+        actions[0, best].numpy(), subgoal.centers[0, 0].numpy(), ends.centers[0, best].numpy(), expected[0, 0].numpy()
+    )
+
+
+def expected_distances(
+    model: Model, here: State, actions: Tensor, subgoal: State, generator: torch.Generator, outcomes: int
+) -> Tensor:
+    """Expected distance of each object from its place in the `subgoal: [1, 1]`: `[1, N, M]` metres, 0 for padding.
+
+    The mean over `outcomes` samples of f's predictive distribution along `actions: [1, N, T, 4]` from `here: [1, 1]`.
+    All actions get the same random numbers, so that their differences are not those of chance.
+    """
+    _, count, length, _ = actions.shape
+    uniform = uniform_each((outcomes, length, here.objects, 2), [generator]).repeat(1, count, 1, 1, 1)
+    ends, _ = sample_states(model, here, actions.repeat_interleave(outcomes, 1), uniform)
+    distances = (ends.centers - subgoal.centers).norm(dim=-1) * subgoal.mask
+    return distances.unflatten(1, (count, outcomes)).mean(2)
 
 
 def _distance_to_goal(states: State, goal: Tensor) -> Tensor:

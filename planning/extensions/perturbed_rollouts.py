@@ -13,7 +13,7 @@ from planning.backends.eager import Backend, eager
 from planning.inputs import check_choice, check_positive, check_weight
 from planning.protocol import DynamicsModel, RewardFunction, SampledDynamics
 from planning.rollouts import ranking, returns
-from planning.rollouts.dynamics import predict_states
+from planning.rollouts.dynamics import predict_states, sample_states
 from planning.rollouts.sampling import noise_each, uniform_each
 
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
@@ -153,11 +153,9 @@ def _sampled_costs(
     feature_weight: float,
 ) -> tuple[Tensor, Tensor]:
     """The same of rollouts that f's distributions sample, which `uniform: [B, n, T, M, 2]` determines."""
-    plans, here, steps = state.expand_plans(pushes.shape[1]), state.expand_plans(1), []
-    for push, own in zip(pushes.unbind(-2), uniform.unbind(2), strict=True):
-        here = model.sampled_next_state(here, push, own).expand(pushes.shape[:2])
-        steps.append(here.centers)
-    return _costs(reward, plans.centers, torch.stack(steps, -3), plans.mask, here, goal, feature_weight)
+    plans = state.expand_plans(pushes.shape[1])
+    here, path = sample_states(model, state.expand_plans(1), pushes, uniform)
+    return _costs(reward, plans.centers, path, plans.mask, here, goal, feature_weight)
 
 
 def _costs(

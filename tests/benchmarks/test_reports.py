@@ -49,10 +49,16 @@ def cascade() -> Report:
     statistic = {name: {"mean": {"mean": mean}} for name, mean in (("guide_means", 0.1), ("prior_means", 0.05))}
     statistic["observed"] = {"mean": {"mean": 0.15}}
     ways = [("sampled", "sampled", 0.76), ("sampled", "closest", 0.39), ("chosen", "closest", 0.48)]
+    ways += [("sampled", "closest in expectation", 0.3)]
     selections = [
         {
             **{"effect": effect, "motion": motion, "relative": left, "low": left - 0.05, "high": left + 0.05},
-            **{"predicted_from_subgoal": 0.014, "from_subgoal": 0.049, "prediction": {"error": 0.03, "moved": 0.067}},
+            **{
+                "predicted_from_subgoal": 0.014,
+                "from_subgoal": 0.049,
+                "expected_from_subgoal": 0.03,
+                "prediction": {"error": 0.03, "moved": 0.067},
+            },
         }
         for effect, motion, left in ways
     ]
@@ -166,6 +172,8 @@ def test_a_model_with_both_codes_has_every_figure(shown: dict[str, list[str]]) -
         "f is off after 1 and 10 segments, cm": "2.5, 12.7",
         "remaining distance: sampled effect, closest motion": "39 % (34 to 44)",
         "f expects to be left; is left, cm": "1.4, 4.9",
+        "remaining distance: sampled effect, motion closest in expectation": "30 % (25 to 35)",
+        "f's distribution expects to be left; is left, cm": "3.0, 4.9",
     }
     assert {label: shown[label][0] for label in expected} == expected
 

@@ -18,6 +18,7 @@ from cavin_pyro.criticism.subgoal_rollout import (
     CLOSEST,
     GIVEN,
     GOAL_DISTANCE,
+    OUTCOMES,
     SAMPLED,
     SubgoalRollout,
     subgoal_rollouts,
@@ -37,8 +38,9 @@ in PyBullet, and compares the observed state afterwards with the subgoal and wit
 An effect code is sampled from the prior, or chosen as by a planner: of many samples, the one whose subgoal brings the \
 first object closest to a point {100 * GOAL_DISTANCE:g} cm away in a random direction. A motion code is sampled from \
 the prior, or it is the closest of many: the one that leads f closest to the subgoal, which is what the planner \
-executes. Models of one code have no motion to choose; for models without h, f chooses the code and only f is compared \
-with physics.
+executes; or it is the closest in expectation: the one with the smallest mean distance over {OUTCOMES} samples of f's \
+predictive distribution, of those whose first push touches down on no observed point. Models of one code have no \
+motion to choose; for models without h, f chooses the code and only f is compared with physics.
 
 Distances are means over the objects that the subgoal moves by more than {100 * MOVING:g} cm, between centres. The \
 relative distance is 0 where the subgoal is reached and 1 where nothing moves; its 95 % interval comes from resampling \
@@ -130,11 +132,14 @@ def _findings(selection: tuple[str, str], numbers: Mapping[str, Any]) -> list[st
         ]
     if math.isnan(numbers["relative"]):
         return [f"{name}: no subgoal moves an object by more than {100 * MOVING:g} cm; {pushes}."]
+    by_f = f"{100 * numbers['predicted_from_subgoal']:.1f} cm"
+    if "expected_from_subgoal" in numbers:
+        by_f += f", and expected {100 * numbers['expected_from_subgoal']:.1f} cm by its distribution"
     low, left, high = (100 * numbers[key] for key in ("low", "relative", "high"))
     return [
         f"{name}: objects that are to move {100 * numbers['wanted']:.1f} cm end "
         f"{100 * numbers['from_subgoal']:.1f} cm from the subgoal, so that {left:.0f} % of the way is left "
-        f"({low:.0f} to {high:.0f} %); f expected {100 * numbers['predicted_from_subgoal']:.1f} cm; {pushes}."
+        f"({low:.0f} to {high:.0f} %); f predicted {by_f}; {pushes}."
     ]
 
 
@@ -146,6 +151,7 @@ def _tables(measured: Mapping[str, Mapping[str, Any]], has_subgoals: bool) -> li
         "to move, cm": lambda one: cm(one["wanted"]),
         "from the subgoal, cm": lambda one: cm(one["from_subgoal"]),
         "from the subgoal by f, cm": lambda one: cm(one["predicted_from_subgoal"]),
+        "as f expects, cm": lambda one: cm(one["expected_from_subgoal"]),
         "from f's prediction, cm": lambda one: cm(one["from_prediction"]),
         "others moved, cm": lambda one: cm(one["bystanders"]),
     }

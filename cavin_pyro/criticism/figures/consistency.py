@@ -19,7 +19,7 @@ from cavin_pyro.visualization.overlay import PREDICTION_COLOR, PUSH_COLOR, SUBGO
 from envs.sensors.camera import Camera
 from envs.workspace import push_endpoints
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 REACHED_COLOR = "#7B2FBE"
 EXAMPLES = 6
 _HALO = [withStroke(linewidth=2.6, foreground="white", alpha=0.85)]
@@ -81,20 +81,24 @@ def draw_split(named: Mapping[str, Sequence[SubgoalRollout]], threshold: float) 
 
 def draw_prediction(named: Mapping[str, Sequence[SubgoalRollout]]) -> Figure:
     """How far each object moved in physics against how far f says."""
-    figure = Figure(figsize=(2.6 * len(named) + 0.6, 3.1), layout="constrained")
-    for panel, color, (name, rollouts) in zip(
-        figure.subplots(1, len(named), squeeze=False, sharex=True, sharey=True)[0], COLORS, named.items(), strict=False
-    ):
+    columns = min(3, len(named))
+    rows = -(-len(named) // columns)
+    figure = Figure(figsize=(3.0 * columns + 0.6, 3.2 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for panel in panels.flat[len(named) :]:
+        panel.set_axis_off()
+    for panel, color, (name, rollouts) in zip(panels.flat, COLORS, named.items(), strict=False):
         finished = [rollout for rollout in rollouts if not rollout.fallen and not rollout.hidden]
         predicted_moves = [np.linalg.norm(rollout.plan.predicted - rollout.before, axis=-1) for rollout in finished]
         moved = [np.linalg.norm(rollout.reached - rollout.before, axis=-1) for rollout in finished]
         points = 100 * np.stack([np.concatenate([[], *predicted_moves]), np.concatenate([[], *moved])])
         panel.plot([0, 30], [0, 30], color="#999999", linewidth=1, linestyle="--")
         panel.scatter(*points, s=9, color=color, alpha=0.5, linewidths=0)
-        panel.set(xlim=(-0.5, 30), ylim=(-0.5, 30), aspect="equal", xlabel="by f (cm)")
-        panel.set_title(name, fontsize=9)
+        panel.set(xlim=(-0.5, 30), ylim=(-0.5, 30), aspect="equal")
+        panel.set_title(name.replace(", ", ",\n"), fontsize=9)
         _plain(panel)
-    figure.axes[0].set_ylabel("moved in physics (cm)")
+    figure.supxlabel("by f (cm)", fontsize=9)
+    figure.supylabel("moved in physics (cm)", fontsize=9)
     return figure
 
 

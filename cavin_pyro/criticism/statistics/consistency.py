@@ -28,6 +28,7 @@ def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> Measures:
         `rollouts`; shares `unsafe` and `ineffective` of the pushes, `fallen` and `hidden` of the rollouts;
         of the wanted objects: `wanted` (their mean distance to the subgoal at first, the baseline where nothing
         moves), `from_subgoal` (at the end), `predicted_from_subgoal` (f's end state; h against f),
+        `expected_from_subgoal` (the mean over samples of f; only where plans have it),
         `from_prediction` (at the end; f against physics), `relative` (`from_subgoal` over `wanted`, with `low` and
         `high`, a 95 % bootstrap over rollouts), `relative_if_executed` (where every push was), `progress` (part
         of the wanted way that was made, along it), `nearer` (share that ends nearer to the subgoal);
@@ -73,6 +74,9 @@ def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> Measures:
         "nearer": _mean((left < way)[wanted]),
         "bystanders": _mean(moved[~wanted]),
     }
+    if rollouts[0].plan.expected is not None:
+        expected = np.reshape([rollout.plan.expected for rollout in finished], shape[:2])
+        numbers["expected_from_subgoal"] = _mean(expected[wanted])
     return numbers
 
 

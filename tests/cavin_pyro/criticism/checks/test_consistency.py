@@ -21,6 +21,7 @@ from cavin_pyro.criticism.subgoal_rollout import (
     SegmentPlan,
     SubgoalRollout,
     code_selections,
+    expected_distances,
     plan_segment,
     sample_scene,
     subgoal_rollouts,
@@ -29,8 +30,10 @@ from cavin_pyro.data.collection import CollectionConfig
 from envs.objects.sampling import ObjectRanges
 from envs.policy import HeuristicPushingPolicy
 from envs.scene import Scene
+from envs.workspace import REACH_HIGH, REACH_LOW
 from models.networks.pointnet import PointNet
 from models.state import State
+from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints
 
 SCENES, OBJECTS, SEED = 3, 2, 4
 
@@ -91,6 +94,9 @@ class Oracle:
         here = state.expand(action.shape[:-1])
         return here._replace(centers=self.paths[scene][step + 1].expand_as(here.centers))
 
+    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
+        return self.next_state(state, action)  # it is certain
+
 
 @pytest.fixture(scope="module")
 def oracle() -> Oracle:
@@ -112,7 +118,7 @@ def test_a_model_whose_subgoals_are_what_physics_does_is_consistent(oracle: Orac
         assert way["relative"] < 0.08
         assert way["progress"] == pytest.approx(1.0, abs=0.05)
         assert way["from_prediction"] == pytest.approx(way["from_subgoal"])
-        assert way["predicted_from_subgoal"] == 0
+        assert way["predicted_from_subgoal"] == way["expected_from_subgoal"] == 0
         assert way["prediction"]["relative"] < 0.08
 
 
@@ -138,7 +144,8 @@ def test_a_model_whose_subgoals_move_nothing_gives_no_number_and_says_so() -> No
 
 
 def test_a_model_of_one_code_has_no_motion_to_choose(oracle: Oracle) -> None:
-    model = SimpleNamespace(**{name: getattr(oracle, name) for name in ("subgoal", "actions", "next_state")})
+    names = ("subgoal", "actions", "next_state", "sampled_next_state")
+    model = SimpleNamespace(**{name: getattr(oracle, name) for name in names})
     model.maximum_objects, model.codes, model.effect_prior = 5, ("effect_code",), standard
     selections = results(model)
     assert [(way["effect"], way["motion"]) for way in selections] == [("sampled", "given"), ("chosen", "given")]
@@ -168,11 +175,17 @@ def test_more_objects_than_the_model_knows_are_refused() -> None:
 
 
 class Linear:
-    """Object 0 goes where the code says, 0.1 m per unit; z pushes it there, a third with every action."""
+    """Object 0 goes where the code says, 0.1 m per unit; z pushes it there, a third with every action.
+
+    `risk`: m, up to which it errs along y in a push, per unit of the push in x below 0: pushes to the left are unsure.
+    """
 
     maximum_objects, codes = 5, ("effect_code", "motion_code")
     effect_prior = staticmethod(standard)
     motion_prior = staticmethod(standard)
+
+    def __init__(self, risk: float = 0.0) -> None:
+        self.risk = risk
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
         return self._moved(state, effect_code)
@@ -182,6 +195,13 @@ class Linear:
 
     def next_state(self, state: State, action: Tensor) -> State:
         return self._moved(state, action[..., :2])
+
+    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
+        error = self.risk * (-action[..., 0]).clamp_min(0.0) * (2 * uniform[..., 0, 0] - 1)
+        after = self.next_state(state, action)
+        centers = after.centers.clone()
+        centers[..., 0, 1] += error
+        return after._replace(centers=centers)
 
     def _moved(self, state: State, way: Tensor) -> State:
         shape = torch.broadcast_shapes(state.batch_shape, way.shape[:-1])
@@ -217,6 +237,42 @@ def test_chosen_effects_and_closest_motions_reach_their_goals_better_than_sample
     assert all(plan.actions.shape == (3, 4) for plan in found.values())
 
 
+def test_the_motion_closest_in_expectation_avoids_what_f_is_unsure_about(table: State) -> None:
+    goal, way, seed = torch.tensor([0.4, 0.0]), ("chosen", "closest in expectation"), [1, 2]
+    sure = plan_segment(context_of(Linear()), table, goal, way, seed, samples=1024)
+    assert sure.actions[:, 0].sum() < -0.5  # to the left, where the goal is
+    np.testing.assert_array_equal(
+        sure.actions, plan_segment(context_of(Linear()), table, goal, ("chosen", "closest"), seed, 1024).actions
+    )
+    unsure = context_of(Linear(risk=20.0))
+    careful, closest = (plan_segment(unsure, table, goal, ("chosen", name), seed, 1024) for name in (way[1], "closest"))
+    assert careful.actions[:, 0].sum() > -0.1
+    assert careful.expected is not None and closest.expected is not None
+    assert closest.expected[0] > 2 * careful.expected[0] and closest.expected[1] == 0
+    np.testing.assert_array_equal(closest.actions, sure.actions)  # line 10 looks at means only
+
+
+def test_expected_distances_are_means_over_samples_by_hand(table: State) -> None:
+    model, here = Linear(risk=3.0), table.expand_plans(1)
+    actions = torch.tensor([[[[-1.0, 0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0, 0.0]]]])
+    subgoal = here.map(torch.clone)
+    found = expected_distances(model, here, actions, subgoal, torch.Generator().manual_seed(3), outcomes=5)
+    uniform = torch.rand(5, 1, 2, 2, generator=torch.Generator().manual_seed(3))
+    by_hand = sum(math.hypot(0.1, 3.0 * (2 * float(one[0, 0, 0]) - 1)) for one in uniform) / 5
+    assert found.tolist() == [[pytest.approx([by_hand, 0.0]), pytest.approx([0.1, 0.0])]]
+
+
+def test_the_motion_closest_in_expectation_touches_down_on_no_object(table: State) -> None:
+    context, goal, way = context_of(Linear()), torch.tensor([0.6, -0.1]), ("chosen", "closest in expectation")
+    free = plan_segment(context, table, goal, way, [1, 2], samples=1024)
+    low, high = torch.tensor([REACH_LOW]), torch.tensor([REACH_HIGH])
+    start = low[0] + (torch.from_numpy(free.actions[0, :2]) + 1) / 2 * (high - low)[0]
+    occupied = ObservedPoints(start.reshape(1, 1, 2), low, high)
+    other = plan_segment(context, table, goal, way, [1, 2], 1024, occupied)
+    assert not occupied.blocked(torch.from_numpy(other.actions[None, :1]), TOUCHDOWN_DISTANCE).any()
+    assert occupied.blocked(torch.from_numpy(free.actions[None, :1]), TOUCHDOWN_DISTANCE).all()
+
+
 def test_plans_depend_on_their_seed(table: State) -> None:
     context, goal = context_of(Linear()), torch.tensor([0.6, -0.1])
     actions = [
@@ -250,7 +306,10 @@ def rollout(subgoal: list[float], reached: list[float], **changes: Any) -> Subgo
         return zero + np.array(places)[:, None] * [1, 0, 0]
 
     told = {"predicted": changes.pop("predicted", subgoal), "actions": np.zeros((3, 4))}
-    plan = SegmentPlan(told["actions"], at(subgoal), at(told["predicted"]))
+    expected = changes.pop("expected", None)
+    plan = SegmentPlan(
+        told["actions"], at(subgoal), at(told["predicted"]), None if expected is None else np.array(expected)
+    )
     flags = {"unsafe": 0, "ineffective": 0, "fallen": False, "hidden": False, **changes}
     return SubgoalRollout(
         0, "sampled", "sampled", plan, zero, at(reached), photograph=np.zeros((1, 1, 3), np.uint8), **flags
@@ -260,9 +319,9 @@ def rollout(subgoal: list[float], reached: list[float], **changes: Any) -> Subgo
 def test_measures_by_hand() -> None:
     numbers = measure(
         [
-            rollout([0.10, 0.0], [0.06, 0.01], predicted=[0.08, 0.0]),
-            rollout([0.30, 0.0], [0.00, 0.03], predicted=[0.30, 0.0], unsafe=2, ineffective=1),
-            rollout([0.20, 0.2], [0.90, 0.9], fallen=True),
+            rollout([0.10, 0.0], [0.06, 0.01], predicted=[0.08, 0.0], expected=[0.05, 0.01]),
+            rollout([0.30, 0.0], [0.00, 0.03], predicted=[0.30, 0.0], expected=[0.12, 0.0], unsafe=2, ineffective=1),
+            rollout([0.20, 0.2], [0.90, 0.9], expected=[0.9, 0.9], fallen=True),
         ],
         seed=0,
     )
@@ -273,6 +332,7 @@ def test_measures_by_hand() -> None:
     assert numbers["wanted"] == pytest.approx(0.20)
     assert numbers["from_subgoal"] == pytest.approx((0.04 + 0.30) / 2)
     assert numbers["predicted_from_subgoal"] == pytest.approx((0.02 + 0.0) / 2)
+    assert numbers["expected_from_subgoal"] == pytest.approx((0.05 + 0.12) / 2)
     assert numbers["from_prediction"] == pytest.approx((0.02 + 0.30) / 2)
     assert numbers["relative"] == pytest.approx(0.34 / 0.40)
     assert numbers["low"] == pytest.approx(0.04 / 0.10) and numbers["high"] == pytest.approx(1.0)
