@@ -23,7 +23,7 @@ from envs.scene import Scene
 from envs.workspace import REACH_HIGH, REACH_LOW
 from models.model import Model
 from models.state import State
-from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
+from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints
 from planning.rollouts import ranking
 from planning.rollouts.dynamics import predict_states, sample_states
 from planning.rollouts.sampling import sample_each, uniform_each
@@ -156,8 +156,8 @@ def plan_segment(
     f predicts) brings object 0 closest to `goal: [2]` metres. A motion code is sampled, or it is the closest of N: the
     one that leads f closest to the subgoal, as in planning (paper, Algorithm 1, line 10); or the closest of N in
     expectation: the one whose distance is smallest in the mean over samples of f's predictive distribution, of those
-    whose first push touches down on none of the `observed` points. A model with one code has the motion given by the
-    effect.
+    without a push that touches down on an `observed` point, which moves with its object as f predicts. A model with
+    one code has the motion given by the effect.
     """
     model, (effect, motion) = context.model, selection
     here, count = state.expand_plans(1), samples if effect == CHOSEN else 1
@@ -179,10 +179,12 @@ def plan_segment(
         actions = model.actions(here, effect_code=code, motion_code=motion_code)
     else:
         actions = model.actions(here, effect_code=code)
-    ends, _ = predict_states(model, here, actions)
+    ends, path = predict_states(model, here, actions)
     if motion == EXPECTED:
         scores = -expected_distances(model, here, actions, subgoal, _generator([*seed, 4]), OUTCOMES).sum(-1)
-        scores = prefer_free(scores, actions[..., 0, :], observed, TOUCHDOWN_DISTANCE)
+        if observed is not None:
+            blocked = observed.blocked_by_any(actions, path, state, TOUCHDOWN_DISTANCE)
+            scores = ranking.prefer(scores, ~blocked)
     else:
         scores = -ranking.squared_distance(ends, subgoal)
     best = int(ranking.best_of(scores, "distances of motions to the subgoal"))

@@ -34,7 +34,7 @@ def observed_state(
 
 
 def observed_points(observation: Mapping[str, NDArray[Any]], device: str | torch.device = "cpu") -> ObservedPoints:
-    """The points of real objects in an observation, a batch of one: `points: [1, P, 2]` metres."""
+    """The points of real objects in an observation, a batch of one: `points: [1, P, 2]` metres, object after object."""
     real = observation["mask"].astype(np.bool_)
     points = torch.from_numpy(observation["clouds"][real][..., :2].reshape(1, -1, 2))
     low, high = (torch.tensor([corner], dtype=points.dtype) for corner in (REACH_LOW, REACH_HIGH))

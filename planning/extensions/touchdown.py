@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from models.state import State
 from planning.rollouts.ranking import prefer
 
 TOUCHDOWN_DISTANCE = 0.015  # metres between a push's start and a point on which it would touch down
@@ -30,6 +31,29 @@ class ObservedPoints(NamedTuple):
         # Not by matrix products, in which an infinite point makes all distances NaN.
         apart = torch.cdist(starts, self.points, compute_mode="donot_use_mm_for_euclid_dist")
         return apart.amin(-1) < distance
+
+    def moved(self, shifts: Tensor) -> ObservedPoints:
+        """The points of one environment after each of N motions, which move its objects by `shifts: [N, M, 2]` metres.
+
+        Points come object after object, equally many of each of the M, as `cavin_pyro.data.observed` orders them.
+        """
+        points = self.points.unflatten(1, (shifts.shape[1], -1)) + shifts.unsqueeze(2)  # [N, M, P / M, 2]
+        return ObservedPoints(points.flatten(1, 2), self.low, self.high)
+
+    def blocked_by_any(self, pushes: Tensor, path: Tensor, state: State, distance: float) -> Tensor:
+        """`[1, N]` bool: motions `pushes: [1, N, T, 4]` of which any push starts nearer than `distance` to a point.
+
+        Before each push the points have moved with their objects, as far as f predicts: `path: [1, N, T, M, 3]` metres
+        from `state: [1]`. Turns of objects are left out.
+        """
+        if not self.points.shape[1]:
+            return torch.zeros(pushes.shape[:2], dtype=torch.bool, device=pushes.device)
+        blocked, real = self.blocked(pushes[:, :, 0], distance), state.mask[0]
+        shifts = (path - state.centers[:, None, None])[0][:, :, real, :2]  # [N, T, M, 2]
+        for step in range(1, pushes.shape[2]):
+            then = self.moved(shifts[:, step - 1])
+            blocked = blocked | then.blocked(pushes[0, :, step : step + 1], distance).T
+        return blocked
 
 
 def prefer_free(scores: Tensor, pushes: Tensor, observed: ObservedPoints | None, distance: float) -> Tensor:

@@ -39,8 +39,9 @@ An effect code is sampled from the prior, or chosen as by a planner: of many sam
 first object closest to a point {100 * GOAL_DISTANCE:g} cm away in a random direction. A motion code is sampled from \
 the prior, or it is the closest of many: the one that leads f closest to the subgoal, which is what the planner \
 executes; or it is the closest in expectation: the one with the smallest mean distance over {OUTCOMES} samples of f's \
-predictive distribution, of those whose first push touches down on no observed point. Models of one code have no \
-motion to choose; for models without h, f chooses the code and only f is compared with physics.
+predictive distribution, of those without a push that touches down on an observed point, which moves with its object \
+as f predicts. Models of one code have no motion to choose; for models without h, f chooses the code and only f is \
+compared with physics.
 
 Distances are means over the objects that the subgoal moves by more than {100 * MOVING:g} cm, between centres. The \
 relative distance is 0 where the subgoal is reached and 1 where nothing moves; its 95 % interval comes from resampling \

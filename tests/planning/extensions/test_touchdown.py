@@ -42,6 +42,24 @@ def test_infinite_points_stand_for_none_among_many() -> None:
     assert many.blocked(starts, 0.01).tolist() == padded.blocked(starts, 0.01).tolist() == [[True, False]]
 
 
+def test_a_motion_is_blocked_by_objects_where_its_own_pushes_took_them() -> None:
+    # Two objects of two points each, then padding; the second object goes 0.2 m along x in the first push.
+    points = seen((0.1, 0.0), (0.1, 0.1), (0.5, 0.0), (0.5, 0.1))
+    centers = torch.tensor([[[0.1, 0.05, 0.02], [0.5, 0.05, 0.02], [9.0, 9.0, 9.0]]])
+    state = State(centers, torch.ones(1, 3, 1), torch.tensor([[True, True, False]]))
+    path = centers[:, None, None].repeat(1, 4, 2, 1, 1)
+    path[..., 1, 0] += 0.2
+    first = {"free": 0.9, "the first object": 0.1, "where the second was": 0.5, "where it is then": 0.7}
+    second = {"free": 0.5, "the first object": 0.9, "where the second was": 0.9, "where it is then": 0.9}
+    motions = torch.tensor([[[[2 * one[name] - 1, 0.0, 0.0, 0.0] for one in (first, second)] for name in first]])
+    assert points.blocked_by_any(motions, path, state, 0.02).tolist() == [[False, True, True, False]]
+    swapped = motions.flip(2)  # each motion's second push first
+    assert points.blocked_by_any(swapped, path, state, 0.02).tolist() == [[True, True, False, True]]
+    assert points.blocked_by_any(motions[:, :, :1], path, state, 0.02).tolist() == [[False, True, True, False]]
+    nothing = ObservedPoints(torch.empty(1, 0, 2), LOW, HIGH)
+    assert not nothing.blocked_by_any(motions, path, state, 0.02).any()
+
+
 @given(st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=2))
 def test_starts_are_where_the_environment_puts_them(start: list[float]) -> None:
     place, _ = push_endpoints(np.array([*start, 0.0, 0.0]))

@@ -267,7 +267,8 @@ def test_the_motion_closest_in_expectation_touches_down_on_no_object(table: Stat
     free = plan_segment(context, table, goal, way, [1, 2], samples=1024)
     low, high = torch.tensor([REACH_LOW]), torch.tensor([REACH_HIGH])
     start = low[0] + (torch.from_numpy(free.actions[0, :2]) + 1) / 2 * (high - low)[0]
-    occupied = ObservedPoints(start.reshape(1, 1, 2), low, high)
+    # Two objects, of one point each; the second is out of the way.
+    occupied = ObservedPoints(torch.stack((start, start + 9.0)).unsqueeze(0), low, high)
     other = plan_segment(context, table, goal, way, [1, 2], 1024, occupied)
     assert not occupied.blocked(torch.from_numpy(other.actions[None, :1]), TOUCHDOWN_DISTANCE).any()
     assert occupied.blocked(torch.from_numpy(free.actions[None, :1]), TOUCHDOWN_DISTANCE).all()
