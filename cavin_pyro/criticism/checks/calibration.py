@@ -105,7 +105,7 @@ def assess_calibration(context: CheckContext, *, windows: int = 400, samples: in
         pictures=[
             Picture(
                 "calibration",
-                "PIT histograms of the planar centres (1 is uniform), and how much central intervals hold "
+                "PIT histograms of the planar centres (1 is uniform), and how much central intervals cover "
                 "against what they should.",
                 draw_calibration(
                     {

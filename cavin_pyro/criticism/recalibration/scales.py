@@ -1,7 +1,7 @@
 """Calibration of the scales that f predicts, by held-out windows (split conformal prediction).
 
 f's errors on windows that training did not see are larger than on those that its scales were fitted to. The scales of
-objects within a push's reach are multiplied by one number, so that intervals hold what they should.
+objects within a push's reach are multiplied by one number, so that intervals cover what they should.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def check_scales(model: Model) -> None:
 
 @torch.no_grad()
 def calibrate_scales(model: Model, window: Window) -> float:
-    """Widen f's scales of centres so that 90 % intervals of x and y hold 90 % of the objects that moved over 1 cm.
+    """Widen f's scales of centres so that 90 % intervals of x and y cover 90 % of the objects that moved over 1 cm.
 
     The factor is the 90 % quantile of |error| / scale in `window: [B]`, which training must not have seen, over that of
     f's Student's t; Lei and others 2018, "Distribution-free predictive inference for regression".
@@ -93,9 +93,9 @@ def scale_sentences(before: dict[str, Any], after: dict[str, Any], factor: float
     for name, what in (("moved", "that moved"), ("still", "that lay still")):
         shares = [", ".join(as_percent(one[name][f"{level:g}"]) for level in LEVELS) for one in (before, after)]
         levels = ", ".join(f"{level:.0%}" for level in LEVELS)
-        lines.append(f"intervals of {levels} hold, of objects {what}, {shares[0]}; now {shares[1]}")
+        lines.append(f"intervals of {levels} cover, of objects {what}, {shares[0]}; now {shares[1]}")
     lines.append(
-        f"{after['exactly_still']:.0%} of the latter are seen exactly where they were, which any interval holds"
+        f"{after['exactly_still']:.0%} of the latter are seen exactly where they were, which any interval covers"
     )
     return lines
 

@@ -98,7 +98,7 @@ def test_predictions_of_the_right_model_are_calibrated(right: SimpleNamespace, p
 
 
 def test_a_scale_half_as_large_as_it_should_be_is_caught(right: SimpleNamespace) -> None:
-    """Of a normal with twice the stated scale, the central 90 % interval holds what lies within 1.645 / 2 scales."""
+    """Of a normal with twice the stated scale, the central 90 % interval covers what lies within 1.645 / 2 scales."""
     pits = planar_transforms(model_of(center=0.005), right.f, "f")
     assert kstest(pits.numpy(), "uniform").pvalue < 1e-6
     assert coverage(pits, 0.9) == pytest.approx(2 * norm.cdf(norm.ppf(0.95) / 2) - 1, abs=0.03)

@@ -1,4 +1,4 @@
-"""Scales that f predicts, widened by held-out windows until intervals hold what they should."""
+"""Scales that f predicts, widened by held-out windows until intervals cover what they should."""
 
 from __future__ import annotations
 
