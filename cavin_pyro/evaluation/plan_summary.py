@@ -18,8 +18,8 @@ def plan_summary_of_episode(row: Mapping[str, Any], config: DictConfig) -> str:
     if predicts_nothing(config) or not row.get("plans"):
         return ""
     if row["plans_reaching_goal"]:
-        return f"{row['plans_reaching_goal']} of {row['plans']} plans reached the goal by the model"
-    return f"no plan reached the goal by the model, so no push was aimed at it: {_advice(config)}"
+        return f"{row['plans_reaching_goal']} of {row['plans']} plans reached the goal according to the model"
+    return f"no plan reached the goal according to the model, so no push was aimed at it: {_advice(config)}"
 
 
 def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
@@ -30,7 +30,7 @@ def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
         return ""
     reaching = sum(row["plans_reaching_goal"] for row in rows)
     without = [row for row in rows if not row["plans_reaching_goal"]]
-    line = f"{100 * reaching / plans:.1f} % of {plans} plans reached the goal by the model"
+    line = f"{100 * reaching / plans:.1f} % of {plans} plans reached the goal according to the model"
     if not without:
         return f"{line}, some in each episode"
     failed = sum(row["outcome"] != "success" for row in without)

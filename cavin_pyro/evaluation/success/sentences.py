@@ -26,7 +26,7 @@ def sentence(found: Calibration | None, probability: Probability) -> str:
     rate = found.successes / found.episodes
     base = f", {found.base:.3f} for the base rate" if 0 < found.successes < found.episodes else ""
     return (
-        f"plans gave success {100 * (rate + found.bias.value):.1f} %, {100 * rate:.1f} % of {found.episodes} episodes "
+        f"predicted success {100 * (rate + found.bias.value):.1f} %, {100 * rate:.1f} % of {found.episodes} episodes "
         f"succeeded; calibration error {bounds(found.error)}, Brier score {found.brier:.3f}{base}"
     )
 
@@ -38,7 +38,7 @@ def sentence_of_episode(row: Mapping[str, Any], probability: Probability) -> str
     told = row["success_probability"]
     if not told:
         return ""
-    return f"plans gave success {100 * told[0]:.0f} % at the start, {100 * told[-1]:.0f} % at the end"
+    return f"predicted success {100 * told[0]:.0f} % at the start, {100 * told[-1]:.0f} % at the end"
 
 
 def uncalibrated(probability: Unfitted) -> str:

@@ -153,7 +153,7 @@ def test_planning_leaves_a_table_a_picture_and_a_video(chain: SimpleNamespace) -
     assert [("planned in" in line) for line in pushes] == [number % 3 == 0 for number in range(len(pushes))]
     assert f"\ncrossing: {results['outcome']} after {results['steps']} pushes" in said
     reached = f"{results['plans_reaching_goal']} of" if results["plans_reaching_goal"] else "no plan reached"
-    assert re.search(rf"^{reached} .*the goal by the model", said, re.M)
+    assert re.search(rf"^{reached} .*the goal according to the model", said, re.M)
     for name in ("steps.csv", "plan.png", "plan-above.png", "episode.mp4"):
         assert f"episode/{name}\n" in said
 

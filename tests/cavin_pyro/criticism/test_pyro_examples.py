@@ -60,7 +60,10 @@ def test_conditioned_codes_and_intervened_actions_are_read_by_what_follows(value
 def test_importance_and_our_planner_agree_on_the_evidence_of_plans(values: dict[str, Any]) -> None:
     theirs, ours = float(values["pyro_log_z"]), values["evidence"]
     # Variances of Z, relative: of one estimate, and of a product of estimates, one for each segment.
-    variances = [1 / float(values["inferred"].get_ESS()) - 1 / 500, float((1 / ours.effective_samples - 1 / 1024).sum())]
+    variances = [
+        1 / float(values["inferred"].get_ESS()) - 1 / 500,
+        float((1 / ours.effective_samples - 1 / 1024).sum()),
+    ]
     assert max(variances) < 0.01
     assert abs(theirs - float(ours.log_evidence)) < 4 * sum(variances) ** 0.5
     assert ours.temperature.tolist() == [100.0] and ours.effective_samples.shape == (1, 3)

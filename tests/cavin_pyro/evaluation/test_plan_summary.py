@@ -15,18 +15,20 @@ def row(plans: int, reaching: int, outcome: str = "timeout") -> dict[str, Any]:
 def test_an_episode_in_which_no_plan_reached_the_goal_says_so_and_what_to_try() -> None:
     config = compose("plan", "reward=sparse")
     said = plan_summary_of_episode(row(20, 0), config)
-    assert said == f"no plan reached the goal by the model, so no push was aimed at it: {ADVICE} or reward=dense"
+    assert (
+        said == f"no plan reached the goal according to the model, so no push was aimed at it: {ADVICE} or reward=dense"
+    )
     guided = plan_summary_of_episode(row(20, 0), compose("plan", "planner.guidance=layout"))
     assert guided.endswith("horizon=30 pushes; try a longer one or reward=dense")
-    assert plan_summary_of_episode(row(20, 3), config) == "3 of 20 plans reached the goal by the model"
+    assert plan_summary_of_episode(row(20, 3), config) == "3 of 20 plans reached the goal according to the model"
 
 
 def test_an_evaluation_counts_the_episodes_without_such_a_plan_and_how_they_ended() -> None:
     config = compose("evaluate", "reward=dense")
     rows = [row(20, 0), row(20, 0, "success"), row(10, 10, "success")]
-    said = plan_summary(rows, config)
-    assert said == f"20.0 % of 50 plans reached the goal by the model; in 2 of 3 episodes none did (1 failed): {ADVICE}"
-    assert plan_summary(rows[-1:], config) == "100.0 % of 10 plans reached the goal by the model, some in each episode"
+    reached = "plans reached the goal according to the model"
+    assert plan_summary(rows, config) == f"20.0 % of 50 {reached}; in 2 of 3 episodes none did (1 failed): {ADVICE}"
+    assert plan_summary(rows[-1:], config) == f"100.0 % of 10 {reached}, some in each episode"
 
 
 def test_a_planner_that_predicts_nothing_says_nothing() -> None:

@@ -18,7 +18,7 @@ def test_an_evaluation_tells_how_predictions_and_outcomes_agree() -> None:
     found = calibration_of(ROWS)
     said = sentence(found, FITTED)
     assert said.startswith(
-        "plans gave success 60.0 %, 50.0 % of 2 episodes succeeded; calibration error 0.100 (0.000 to "
+        "predicted success 60.0 %, 50.0 % of 2 episodes succeeded; calibration error 0.100 (0.000 to "
     )
     assert said.endswith("Brier score 0.053, 0.250 for the base rate")
     plain = record(found)
@@ -27,7 +27,7 @@ def test_an_evaluation_tells_how_predictions_and_outcomes_agree() -> None:
 
 
 def test_an_episode_tells_what_its_plans_gave() -> None:
-    assert sentence_of_episode(ROWS[0], FITTED) == "plans gave success 80 % at the start, 100 % at the end"
+    assert sentence_of_episode(ROWS[0], FITTED) == "predicted success 80 % at the start, 100 % at the end"
 
 
 def test_without_a_fit_the_reason_is_told_and_no_number() -> None:
