@@ -43,6 +43,11 @@ def main(config: DictConfig) -> None:
         summary = summarize_data(folder)
         write_json(folder / "statistics.json", summary.figures())
         draw_data(folder / "statistics.png", summary)
+        if lost := metadata["episodes"] - summary.episodes:
+            raise UserError(
+                f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "
+                "run the same command with repair=true, which collects them again"
+            )
         print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
 
 

@@ -19,6 +19,7 @@ from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data.dataset import (
     Arrays,
+    CorruptShardError,
     EmptyDatasetError,
     read_metadata,
     read_shard,
@@ -334,8 +335,8 @@ def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 
     for number in range(metadata["shards"]):
         try:
             read_shard(shard_path(folder, number), metadata=metadata)
-        except UserError as error:
-            print(f"collecting again: {error}", flush=True)
+        except CorruptShardError as error:
+            print(f"collecting again: {error.defect}", flush=True)
             damaged.append(number)
     with closing(_shards(config, damaged, workers=workers)) as shards:
         for number, (arrays, _) in zip(damaged, shards, strict=True):

@@ -33,6 +33,7 @@ FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
 RENAMED = {"hold": "intent_length", "perturbed": "perturbation_rate"}  # options of a collection, by their former names
 
+COLLECT_AGAIN = "collect it again, with the same options and repair=true"
 MOST_LOST = 1000  # files; each that is missing is named when the rest is used
 
 Arrays = dict[str, NDArray[Any]]
@@ -40,6 +41,20 @@ Arrays = dict[str, NDArray[Any]]
 
 class EmptyDatasetError(UserError):
     """A dataset that holds no episode, which collect begins again."""
+
+
+class CorruptShardError(UserError):
+    """A shard that is missing or corrupt; `defect` says so without what to do about it, for who is doing that."""
+
+    def __init__(self, path: Path, said: str, *, merged: bool = False) -> None:
+        self.defect = f"shard {path} is missing or corrupt ({said})"
+        advice = (
+            "merge the datasets again of which it was made"
+            if merged  # which collect refuses to repair
+            else f"collect it again with python -m cavin_pyro.collect output={path.parent} repair=true and the other "
+            "options of that collection"
+        )
+        super().__init__(f"{self.defect}: {advice}, or train on the rest with skip_corrupt=true")
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -79,7 +94,7 @@ def read_shard(
         metadata: of the dataset, with which the numbers of episodes and of pushes must agree.
 
     Raises:
-        UserError: the file is missing, truncated, damaged or not a shard; it is named.
+        CorruptShardError: the file is missing, truncated, damaged or not a shard; it is named.
     """
     configuration = (metadata or {}).get("configuration", {})
     try:
@@ -89,10 +104,7 @@ def read_shard(
         check_values(arrays)
         return arrays
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise UserError(
-            f"shard {path} is missing or corrupt ({str(error).splitlines()[0]}): "
-            "delete it and collect again to rebuild it, or pass skip_corrupt=true to use the rest"
-        ) from error
+        raise CorruptShardError(path, str(error).splitlines()[0], merged="sources" in (metadata or {})) from error
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:
@@ -273,12 +285,12 @@ def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool =
     for number in range(metadata["shards"]):
         try:
             arrays = read_shard(shard_path(folder, number), names, metadata=metadata)
-        except UserError as error:
+        except CorruptShardError as error:
             if not skip_corrupt:
                 raise
-            print(f"left out: {error}", flush=True)
+            print(f"left out: {error.defect}", flush=True)
             continue
         whole += 1
         yield number, arrays
     if whole == 0:
-        raise UserError(f"dataset {folder} has no usable shard: collect it again")
+        raise UserError(f"dataset {folder} has no usable shard: {COLLECT_AGAIN}")

@@ -57,6 +57,11 @@ class DataSummary:
     pushed: NDArray[np.int64] = field(default_factory=_map)
     started: NDArray[np.int64] = field(default_factory=_map)
 
+    @property
+    def episodes(self) -> int:
+        """How many episodes were counted."""
+        return int(self.objects.sum())
+
     def add(self, arrays: Arrays) -> None:
         """Count the episodes of one shard, arrays as in `cavin_pyro.data.dataset`."""
         mask, centers, visible = arrays["mask"], arrays["centers"].astype(np.float64), arrays["visible"]
@@ -87,7 +92,7 @@ class DataSummary:
         pushes = max(self.pushes, 1)
         return {
             "pushes": self.pushes,
-            "episodes": int(self.objects.sum()),
+            "episodes": self.episodes,
             **{name: getattr(self, name) / pushes for name in ("unsafe", "ineffective", "fallen")},
             "objects_moved": (self.objects_moved / pushes).tolist(),
             "farthest_median": _median(self.farthest),

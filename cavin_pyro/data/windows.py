@@ -16,7 +16,15 @@ from torch import Tensor
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import Arrays, EpisodeNumbers, check_distinct, iterate_shards, read_metadata
+from cavin_pyro.data.dataset import (
+    COLLECT_AGAIN,
+    Arrays,
+    CorruptShardError,
+    EpisodeNumbers,
+    check_distinct,
+    iterate_shards,
+    read_metadata,
+)
 from cavin_pyro.data.declaration import padded
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.held_out import find_held_out
@@ -146,17 +154,17 @@ def load_windows(
             for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
                 try:
                     arrays["features"] = shard_features(folder, number, geometry, fingerprint)
-                except UserError as error:  # its clouds, which are read here alone, are corrupt
+                except CorruptShardError as error:  # its clouds, which are read here alone, are corrupt
                     if not skip_corrupt:
                         raise
-                    print(f"left out: {error}", flush=True)
+                    print(f"left out: {error.defect}", flush=True)
                     continue
                 known.add(number, arrays["episode"])
                 found.add(held_out.filter_episodes(arrays))
                 whole += 1
                 bar.update()
             if whole == 0:
-                raise UserError(f"dataset {folder} has no usable shard: collect it again")
+                raise UserError(f"dataset {folder} has no usable shard: {COLLECT_AGAIN}")
         return found.table()
 
 

@@ -148,8 +148,27 @@ def test_missing_and_damaged_files_are_collected_again(
     shard_path(own_pushes, 2).write_bytes(content[: len(content) // 2])
     assert repair(small.pushes, own_pushes, workers=workers) == 2
     assert data_of(own_pushes) == before
-    assert capsys.readouterr().out.count("collecting again: shard") == 2
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 2
+    assert all(line.startswith("collecting again: shard") and line.endswith(")") for line in said)  # without advice
     assert repair(small.pushes, own_pushes) == 0
+
+
+def test_a_collection_that_lacks_a_file_ends_in_one_line_that_says_how_to_repair_it(
+    shell: SimpleNamespace, tmp_path: Path
+) -> None:
+    overrides = ["transitions=4", "steps=2", "episodes_per_shard=1", "workers=1", "output=out"]
+    assert shell.run_command("collect", *overrides, folder=tmp_path).status == 0
+    before = data_of(tmp_path / "out")
+    shard_path(tmp_path / "out", 1).unlink()
+    answer = shell.run_command("collect", *overrides, folder=tmp_path)
+    assert answer.status == 2
+    assert answer.complaints == [
+        "error: 1 of 2 episodes in out are in files that are missing or corrupt: run the same command with "
+        "repair=true, which collects them again"
+    ]
+    assert shell.run_command("collect", *overrides, "repair=true", folder=tmp_path).status == 0
+    assert data_of(tmp_path / "out") == before
 
 
 def test_a_full_disk_leaves_whole_files_that_count_and_room_to_go_on(

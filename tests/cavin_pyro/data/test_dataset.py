@@ -72,8 +72,13 @@ def test_a_truncated_shard_is_named(share: float, own_pushes: Path) -> None:
     path = shard_path(own_pushes, 1)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(UserError, match=r"episodes-00001\.h5 is missing or corrupt .*skip_corrupt=true"):
+    with pytest.raises(UserError, match=r"episodes-00001\.h5 is missing or corrupt .*skip_corrupt=true") as found:
         read_shard(path)
+    assert f": collect it again with python -m cavin_pyro.collect output={own_pushes} repair=true and" in str(
+        found.value
+    )
+    with pytest.raises(UserError, match="merge the datasets again"):  # collect repairs no merged dataset
+        read_shard(path, metadata={"sources": []})
 
 
 def test_a_shard_that_lacks_an_array_is_named(tmp_path: Path) -> None:
@@ -112,6 +117,7 @@ def test_corrupt_shards_are_skipped_and_named(own_pushes: Path, capsys: pytest.C
     assert [number for number, _ in kept] == [0, 2]
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(f"left out: shard {path}")
+    assert line.endswith(")")  # no advice about what is being done
 
 
 def test_a_dataset_without_any_whole_shard_is_refused(own_pushes: Path) -> None:
