@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from cavin_pyro import __version__
+from cavin_pyro.config.application import guarded
 
 ORDER = (
     "demo",
@@ -25,6 +26,10 @@ ORDER = (
 
 def main() -> None:
     """List the commands."""
+    guarded(_list)
+
+
+def _list() -> None:
     if "--version" in sys.argv[1:]:
         print(f"cavin_pyro {__version__}")
         return

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import select
 import signal
 import sys
 import threading
@@ -49,7 +50,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             # Hide deprecations of third parties from users; in tests they are errors.
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             if "--version" in sys.argv[1:]:
-                print(f"cavin_pyro {__version__}")
+                guarded(lambda: print(f"cavin_pyro {__version__}"))
                 return
             # Torch, not imported yet, reads it. Several threads wait for one another after each of many small products:
             # where another program uses a core, plans would take fifty times as long, and training would stand still.
@@ -73,14 +74,19 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
 def guarded(action: Callable[[], T]) -> T:
     """Run; bad input, a disk that refuses and an interruption end in one line instead of a traceback.
 
-    SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number.
+    SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number. A reader of what is
+    printed that stops early, such as `head`, ends the command silently, with the status of SIGPIPE.
     """
     try:
         with _interruptions():
-            return action()
+            result = action()
+            print(end="", flush=True)  # here, since as it exits Python complains of a reader that has gone
+            return result
     except UserError as error:
         _stop(str(error), error.status)
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _silence_streams_without_readers():
+            raise SystemExit(128 + signal.SIGPIPE) from None
         if error.errno not in _DISK_ERRORS:
             raise
         _stop(_refusal(error), 2)
@@ -151,7 +157,24 @@ def _interruptions() -> Iterator[None]:
             signal.signal(one, signal.SIG_DFL)
 
 
+def _silence_streams_without_readers() -> bool:
+    """Let what is still printed to a pipe whose reader has gone go nowhere; returns whether there is such a pipe."""
+    found = False
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            number = stream.fileno()
+        except (AttributeError, OSError, ValueError):  # closed, or no file
+            continue
+        poll = select.poll()
+        poll.register(number, select.POLLOUT)
+        if any(event & select.POLLERR for _, event in poll.poll(0)):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+            found = True
+    return found
+
+
 def _stop(line: str, status: int) -> NoReturn:
+    _silence_streams_without_readers()  # else Python complains as it exits, and changes the status
     print(f"error: {' '.join(line.split())}", file=sys.stderr, flush=True)
     raise SystemExit(status)
 
@@ -170,15 +193,7 @@ def _check(name: str) -> tuple[CommandLine, DictConfig]:
 def _show_help(name: str, purpose: str, config: DictConfig) -> None:
     from cavin_pyro.config.help import help_page
 
-    _print_page(help_page(name, purpose, config))
-
-
-def _print_page(text: str) -> None:
-    """Print, also to a reader that stops early, such as `head`."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains as it exits
+    print(help_page(name, purpose, config))
 
 
 @dataclass(frozen=True)

@@ -293,15 +293,36 @@ def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
         assert str(caught.value).startswith(complaint)
 
 
-def test_a_page_for_a_reader_that_stops_early_is_no_bug() -> None:
+GUARDED = "from cavin_pyro.config.application import UserError, guarded"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["-m", "cavin_pyro"], 128 + signal.SIGPIPE, ""),
+        (["-m", "cavin_pyro.plan", "--help"], 128 + signal.SIGPIPE, ""),
+        (["-m", "cavin_pyro.plan", "--version"], 128 + signal.SIGPIPE, ""),
+        (["-c", f"{GUARDED}; guarded(lambda: print('a row' * 9000))"], 128 + signal.SIGPIPE, ""),
+        (
+            ["-c", f"{GUARDED}\ndef act():\n    print('a row')\n    raise UserError('bad input')\nguarded(act)"],
+            2,
+            "error: bad input\n",
+        ),
+    ],
+)
+def test_a_reader_that_stops_early_ends_a_command_silently(arguments: list[str], status: int, said: str) -> None:
     """As in `python -m cavin_pyro.plan --help | head`."""
     reading, writing = os.pipe()
     os.close(reading)
-    program = "from cavin_pyro.config.application import _print_page; _print_page('a page')"
-    line = [sys.executable, "-c", program]
-    done = subprocess.run(line, cwd=ROOT, env=ENVIRONMENT, stdout=writing, stderr=subprocess.PIPE, text=True)
+    line, env = [sys.executable, *arguments], {**ENVIRONMENT, "PYTHONUNBUFFERED": ""}
+    done = subprocess.run(line, cwd=ROOT, env=env, stdout=writing, stderr=subprocess.PIPE, text=True)
     os.close(writing)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, done.stderr) == (status, said)
+
+
+def test_a_broken_pipe_that_is_not_the_users_is_a_bug() -> None:
+    with pytest.raises(BrokenPipeError):
+        guarded(lambda: refuse(errno.EPIPE))
 
 
 def test_presets_of_a_users_own_folder_name_the_output_as_any_others_do(tmp_path: Path) -> None:
