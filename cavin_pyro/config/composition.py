@@ -20,7 +20,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, ValidationError
 
-from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.commands import COMMANDS, UNREAD
 from cavin_pyro.config.constructors import check_parts
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import check_options, kind, shown, types
@@ -82,6 +82,7 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
     with _hydra():
         try:
             _check_additions(name, overrides)
+            _check_read(name, overrides)
             config = hydra.compose(name, overrides=overrides, return_hydra_config=True)
             plain: Any = OmegaConf.to_container(config, resolve=False)
             check_parts({key: value for key, value in plain.items() if key != "hydra"})
@@ -170,6 +171,15 @@ def _check_additions(name: str, overrides: list[str]) -> None:
         parent: Any = OmegaConf.select(known, key.rpartition(".")[0]) if "." in key else None
         if not (OmegaConf.is_dict(parent) and "_target_" in parent) and OmegaConf.select(known, key) is None:
             raise UserError(_unknown(key, known))
+
+
+def _check_read(name: str, overrides: list[str]) -> None:
+    """Refuse options that only other commands read."""
+    for one in _parsed(overrides):
+        option = re.split(r"[./@]", one.key_or_group)[0]
+        if option in UNREAD.get(name, {}):
+            readers = (other for other, schema in COMMANDS.items() if option in types(schema) and other != name)
+            raise UserError(f"{one.key_or_group} is an option of {' and '.join(readers)}: {UNREAD[name][option]}")
 
 
 def _explain_choice(error: MissingConfigException) -> str:

@@ -13,7 +13,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro import __version__
-from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.commands import COMMANDS, UNREAD
 from cavin_pyro.config.options import options, shown
 
 WIDTH = 100  # columns
@@ -40,7 +40,6 @@ EXAMPLES = {
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
     "reproduce": ("scale=smoke", "scale=paper shard=2/3", "scale=paper merge=[runs/a,runs/b,runs/c]"),
 }
-UNREAD = {"demo": ("task", "tiles")}  # options and presets that a command shares with others and does not read
 HEADINGS = {  # of the groups, in the order of the page
     "task": "Task",
     "planning": "Planning",

@@ -287,6 +287,9 @@ def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
         ("train", "trainer.step=3"): "unknown override 'trainer.step': did you mean steps?",
         ("plan", "guide=flat"): "unknown override 'guide': it is an option of train; valid are checkpoint, ",
         ("plan", "objects=many"): "objects must be a whole number, not many",
+        ("demo", "task=clearing"): "task is an option of plan and evaluate: use tasks=[clearing]",
+        ("demo", "+task.goal=a.png"): "task.goal is an option of plan and evaluate: use tasks=[clearing]",
+        ("demo", "tiles.goal=[[1,2]]"): "tiles.goal is an option of plan and evaluate: leave it out, or run that",
     }.items():
         with pytest.raises(UserError) as caught:
             compose(*overrides)
