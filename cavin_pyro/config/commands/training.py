@@ -84,7 +84,7 @@ class WindowConfig:
         0.1, "share of the episodes that is held out for validation", minimum=0, maximum=1, group="windows"
     )
     maximum_step: float = option(
-        0.2, "a transition counts for f if every object moved less", unit="metres", minimum=0, group="windows"
+        0.2, "a transition counts for f if every object moved less", unit="metres", above=0, group="windows"
     )
     minimum_move: float = option(
         0.1, "a window counts for h and g if some object moved farther ...", unit="metres", minimum=0, group="windows"

@@ -116,7 +116,7 @@ def test_a_stored_section_is_checked_as_a_commands_is() -> None:
     assert configured(WindowConfig, {"maximum_step": 0.3, "of_old": 1}, "windows") == WindowConfig(maximum_step=0.3)
     for values, said in (
         ({"maximum_step": "far"}, "windows.maximum_step is of another type"),
-        ({"maximum_step": -1}, "windows.maximum_step must be at least 0 metres, not -1"),
+        ({"maximum_step": -1}, "windows.maximum_step must be a positive number, not -1"),
     ):
         with pytest.raises(UserError, match=f"^{said}"):
             configured(WindowConfig, values, "windows")
