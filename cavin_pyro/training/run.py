@@ -51,6 +51,7 @@ def train(config: DictConfig) -> Trainer:
 def _train(config: DictConfig, folder: Path) -> Trainer:
     device = choose_device(config.device)
     config.device = device.type
+    selection = _chosen_windows(config)
     torch.manual_seed(config.seed)
     model = build_model(config)
     guide = build_guide(config, model)
@@ -67,7 +68,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     windows = load_windows(
         data,
         geometry,
-        configured(WindowConfig, config.windows, "windows"),
+        selection,
         segment_length=config.model.segment_length,
         seed=config.seed,
         skip_corrupt=config.skip_corrupt,
@@ -104,6 +105,26 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
     return run
+
+
+def _chosen_windows(config: DictConfig) -> WindowConfig:
+    """The section `windows`, with which there can be windows to train on and to validate with.
+
+    Raises:
+        UserError: there can be none, however many transitions are collected.
+    """
+    chosen = configured(WindowConfig, config.windows, "windows")
+    if not 0 < chosen.validation_fraction < 1:
+        raise UserError(
+            f"windows.validation_fraction must be strictly between 0 and 1, not {chosen.validation_fraction:g}: "
+            "training and validation both need episodes"
+        )
+    if chosen.minimum_move >= chosen.maximum_move:
+        raise UserError(
+            f"windows.minimum_move must be below windows.maximum_move={chosen.maximum_move:g} metres, not "
+            f"{chosen.minimum_move:g}"
+        )
+    return chosen
 
 
 def _mirror_signs(reflect: bool, geometry: Geometry, guide: Guide) -> Tensor | None:

@@ -280,8 +280,16 @@ BAD_OPTIONS = [
     ("train", "windows.validation_fraction=2", "windows.validation_fraction must be between 0 and 1, not 2"),
     ("train", "windows.negative_fraction=-1", "windows.negative_fraction must be between 0 and 1, not -1"),
     ("train", "windows.maximum_step=0", "windows.maximum_step must be a positive number, not 0"),
-    ("train", "windows.minimum_move=9", "no training window in which an object moved more than 9 m"),
-    ("train", "windows.validation_fraction=0", "no validation window"),
+    ("train", "windows.minimum_move=9", "windows.minimum_move must be below windows.maximum_move=0.5 metres, not 9"),
+    (
+        "train",
+        "windows.minimum_move=9 windows.maximum_move=10",
+        "no training window in which an object moved more than 9 m",
+    ),
+    *(
+        ("train", f"windows.validation_fraction={end}", f"must be strictly between 0 and 1, not {end}: training and")
+        for end in (0, 1)
+    ),
     ("pretrain", "held_out_objects=[fork]", "unknown object 'fork' in held_out_objects: "),
     ("train", "windows.held_out_objects=fork", "windows.held_out_objects must be a list, not fork"),
     ("train", "windows.held_out_objects=[fork]", "unknown object 'fork' in windows.held_out_objects: "),
