@@ -105,7 +105,9 @@ class CavinPlanner(SearchingPlanner):
         check_weight("feature_weight", feature_weight)
         self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
-        self.motion_optimizer = make_optimizer(motion_optimizer or self.optimizer, samples=self.motion_samples)
+        self.motion_optimizer = make_optimizer(
+            motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
+        )
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
         if nearest_objects is not None:

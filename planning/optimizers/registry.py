@@ -25,20 +25,20 @@ OPTIMIZERS: dict[str, type[Optimizer]] = {
 ITERATIVE = (CrossEntropy, ImprovedCrossEntropy, PathIntegral, Evolution)
 
 
-def make_optimizer(optimizer: str | Optimizer, *, samples: int) -> Optimizer:
-    """The optimizer of that name, with its defaults, or the given one.
+def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer") -> Optimizer:
+    """The optimizer of that name, with its defaults, or the given one; `argument` is what errors call it.
 
     Raises ValueError, naming the valid ones, for an unknown name or for an object that is no optimizer; for a method
     `optimize` that takes other arguments; and for fewer samples than iterations.
     """
     if isinstance(optimizer, str):
         if optimizer not in OPTIMIZERS:
-            raise ValueError(f"unknown optimizer '{optimizer}': choose from {', '.join(OPTIMIZERS)}")
+            raise ValueError(f"unknown {argument} '{optimizer}': choose from {', '.join(OPTIMIZERS)}")
         optimizer = OPTIMIZERS[optimizer]()
     if isinstance(optimizer, type) or not isinstance(optimizer, Optimizer):
         raise ValueError(
-            f"optimizer must be one of {', '.join(OPTIMIZERS)}, or an object with a method optimize(problem, samples), "
-            f"not {optimizer!r}"
+            f"{argument} must be one of {', '.join(OPTIMIZERS)}, or an object with a method "
+            f"optimize(problem, samples), not {optimizer!r}"
         )
     _check_arguments(optimizer)
     if isinstance(optimizer, ITERATIVE):

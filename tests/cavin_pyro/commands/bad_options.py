@@ -207,6 +207,7 @@ BAD_OPTIONS = [
     ),
     ("plan", "planner=random planner.optimizer=cem", "unknown override 'planner.optimizer': the chosen planner has no"),
     ("plan", "planner.optimizer=cem planner.samples=3", "4 iterations need at least as many samples, not 3"),
+    ("plan", "planner.motion_optimizer=cemm", "unknown planner.motion_optimizer 'cemm': choose from shooting, cem, "),
     ("plan", "planner.feature_weight=-1", "planner.feature_weight must be zero or a positive number, not -1"),
     ("plan", "planner.motion_samples=0", "planner.motion_samples must be at least 1, not 0"),
     ("plan", "planner.idle_distance=-1", "planner.idle_distance must be zero or a positive number, not -1"),
