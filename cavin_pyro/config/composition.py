@@ -10,7 +10,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, ValidationError
 
 from cavin_pyro.config.commands import COMMANDS, UNREAD
-from cavin_pyro.config.constructors import check_parts
+from cavin_pyro.config.constructors import check_parts, constructor_options
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import check_options, kind, shown, types
 from cavin_pyro.config.registration import register
@@ -83,6 +83,7 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
         try:
             _check_additions(name, overrides)
             _check_read(name, overrides)
+            _check_nulls(name, overrides)
             config = hydra.compose(name, overrides=overrides, return_hydra_config=True)
             plain: Any = OmegaConf.to_container(config, resolve=False)
             check_parts({key: value for key, value in plain.items() if key != "hydra"})
@@ -180,6 +181,22 @@ def _check_read(name: str, overrides: list[str]) -> None:
         if option in UNREAD.get(name, {}):
             readers = (other for other, schema in COMMANDS.items() if option in types(schema) and other != name)
             raise UserError(f"{one.key_or_group} is an option of {' and '.join(readers)}: {UNREAD[name][option]}")
+
+
+def _check_nulls(name: str, overrides: list[str]) -> None:
+    """Refuse `None`, a name like any other to Hydra, for options that may be null."""
+    written = [one.key_or_group for one in _parsed(overrides) if (one.input_line or "").endswith("=None")]
+    if not written:
+        return
+    known = _defaults(name, overrides)
+    for key in written:
+        section, _, last = key.rpartition(".")
+        part: Any = OmegaConf.select(known, section) if section else None
+        target = part.get("_target_") if OmegaConf.is_dict(part) else None
+        own = constructor_options(target).get(last) if target else None
+        annotation = own.annotation if own else types(COMMANDS[name]).get(key)
+        if type(None) in get_args(annotation):
+            raise UserError(f"{key} may be null, which the command line does not write None: write {key}=null")
 
 
 def _explain_choice(error: MissingConfigException) -> str:

@@ -138,6 +138,7 @@ def _meanings(target: str | None) -> Mapping[str, str]:
     for text in map(inspect.cleandoc, filter(None, texts)):
         for names, said in re.findall(MEANING, text, re.S):
             sentence = re.split(r"(?<=[^.])\.(?:\s|$)", " ".join(said.split()))[0]
+            sentence = re.sub(r"\bNone\b", "null", sentence)  # as the command line writes it
             for name in names.split(", "):
                 meanings.setdefault(name, sentence)
     return meanings

@@ -76,6 +76,11 @@ def test_help_lists_every_option_that_the_command_reads(command: str, pages: dic
     assert page.count(f"\n  python -m cavin_pyro.{command}") == 3
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_writes_null_as_the_command_line_does(command: str, pages: dict[str, str]) -> None:
+    assert "None" not in pages[command]
+
+
 def _plain(command: str) -> dict:
     found = OmegaConf.to_container(compose(command))
     assert isinstance(found, dict)
