@@ -52,7 +52,8 @@ class CavinPlanner(SearchingPlanner):
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
     stride_limits: two distances in metres; a subgoal that moves every object less than the first, or any object more
-        than the second, ends the plan like a violation (published implementation: 0.1 and 0.3); None in the paper.
+        than the second, ends the plan like a violation (0.1 and 0.3 in the published implementation); None in the
+        paper.
     motion_horizon: `full_horizon` plans motions for all K segments and compares them with all K subgoals (paper);
         `first_segment` plans and compares only the executed segment (published implementation).
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares

@@ -53,7 +53,8 @@ class Objective:
             contains each push already, so a weight trades its density for the accuracy of rollouts.
         consistency_weight: of how likely sampled motions reach the subgoal, see `cavin_pyro.training.consistency`; it
             changes the prior of motions alone.
-        consistency_motions, consistency_windows: how many motions for each effect, and how many windows of a batch.
+        consistency_motions: how many motions of each effect the consistency term samples. consistency_windows: of how
+            many windows of a batch it is computed.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.

@@ -18,7 +18,7 @@ from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.composition import check_overrides, completed, compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.help import EXAMPLES, FACTS_OF_PRESETS, WIDTH, help_page
+from cavin_pyro.config.help import EXAMPLES, FACTS_OF_PRESETS, WIDTH, help_page, presets
 from cavin_pyro.storage import checkpoint
 from cavin_pyro.storage.checkpoint import default_checkpoint, find_checkpoint, shipped_folder
 
@@ -79,6 +79,24 @@ def test_help_lists_every_option_that_the_command_reads(command: str, pages: dic
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_writes_null_as_the_command_line_does(command: str, pages: dict[str, str]) -> None:
     assert "None" not in pages[command]
+
+
+@pytest.mark.parametrize(
+    ("command", "override"),
+    [
+        *(("plan", f"planner={name}") for name in presets("planner")),
+        *(("train", f"objective={name}") for name in presets("objective")),
+    ],
+)
+def test_help_says_of_every_option_of_a_part_a_whole_sentence_of_its_own(command: str, override: str) -> None:
+    page = help_page(command, "What it does.", check_overrides(command, [override]))
+    said = {
+        option: " ".join(text.split())
+        for option, text in re.findall(r"(?m)^  ((?:planner|objective)\.\w+)=\S*((?:.*\n(?: {34}.*\n)*))", page)
+    }
+    assert all(text.count("(") == text.count(")") for text in said.values())
+    told = [text for text in said.values() if text]
+    assert len(set(told)) == len(told)
 
 
 def _plain(command: str) -> dict:
