@@ -10,7 +10,7 @@ from cavin_pyro.config.errors import Parser
 
 def main() -> None:
     """Download, decimate, decompose and verify one kind of assets; resumes an interrupted run."""
-    guarded(_run)
+    guarded(_run, "assets")
 
 
 def _run() -> None:

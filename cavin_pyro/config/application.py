@@ -31,6 +31,7 @@ from cavin_pyro.config.errors import Parser, UserError
 from cavin_pyro.config.imports import without_collections
 
 PACKAGES = ("models", "guides", "planning", "envs")
+RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "assets")  # docs/reliability.md
 REPEATING_SECONDS = 1.0
 RESENDING_SECONDS = 0.05  # for a signal whose exception was dropped
 _REFUSALS = ("ENOSPC", "EDQUOT", "EACCES", "EPERM", "EROFS", "EFBIG", "EIO", "ENAMETOOLONG")
@@ -61,7 +62,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             if line.help:
                 guarded(lambda: _show_help(name, body.__doc__ or "", composed))
             elif _is_one_run(sys.argv[1:]):  # as usual: Hydra's application would compose the same again
-                guarded(lambda: _run(name, body, composed))
+                guarded(lambda: _run(name, body, composed), name)
             else:
                 _run_by_hydra(name, body)
 
@@ -71,11 +72,14 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
     return decorate
 
 
-def guarded(action: Callable[[], T]) -> T:
+def guarded(action: Callable[[], T], name: str | None = None) -> T:
     """Run; bad input, a disk that refuses and an interruption end in one line instead of a traceback.
 
     SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number. A reader of what is
     printed that stops early, such as `head`, ends the command silently, with the status of SIGPIPE.
+
+    Args:
+        name: of the command, if it has begun its work: an interruption says whether it resumes.
     """
     try:
         with _interruptions():
@@ -97,7 +101,8 @@ def guarded(action: Callable[[], T]) -> T:
     except KeyboardInterrupt as error:
         number = error.number if isinstance(error, Interruption) else signal.SIGINT
         by = "" if number == signal.SIGINT else f" by {number.name}"
-        _stop(f"interrupted{by}; rerun the same command to resume, if it can", 128 + number)
+        then = "to resume" if name in RESUMING else "to start again: nothing is kept of this one"
+        _stop(f"interrupted{by}{f'; rerun the same command {then}' if name else ''}", 128 + number)
 
 
 def _refusal(error: OSError) -> str:
@@ -266,7 +271,7 @@ def _run_by_hydra(name: str, body: Body) -> None:
         from cavin_pyro.config.registration import register
 
         register()  # a launcher's job is a process of its own, with no plugins but those that Hydra finds
-        guarded(lambda: body(with_output(name, resolved(config), HydraConfig.get())))
+        guarded(lambda: body(with_output(name, resolved(config), HydraConfig.get())), name)
 
     hydra.main(version_base="1.3", config_path=None, config_name=name)(job)()
 

@@ -75,8 +75,10 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
         The configuration with Hydra's own.
 
     Raises:
-        UserError: an override that does not parse, an unknown option or preset, or a value out of its range.
+        UserError: an unknown command, option or preset, an override that does not parse, or a value out of its range.
     """
+    if name not in COMMANDS:
+        raise UserError(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
     if config_dir is not None:
         overrides = [*overrides, search_path(str(Path(config_dir).resolve()))]
     with _hydra():

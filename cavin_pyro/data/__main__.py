@@ -11,7 +11,7 @@ from cavin_pyro.config.errors import Parser
 
 def main() -> None:
     """Describe, verify, merge or export datasets from collect."""
-    guarded(_run)
+    guarded(_run, "data")
 
 
 def _run() -> None:

@@ -195,6 +195,10 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
         raise UserError(f"checkpoint {path} cannot be read: {error.strerror or error}") from error
     except (SafetensorError, OSError) as error:
         raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
+    if header.get("format") != FORMAT and path.name == "resume.safetensors":
+        pretrained = path.with_name("pointnet.safetensors")
+        beside = pretrained if _is_file(pretrained) else path.with_name("checkpoint.safetensors")
+        raise UserError(f"{path} is what a training resumes from, not a checkpoint: give {beside}")
     if header.get("format") != FORMAT:
         raise UserError(f"{path} is a safetensors file of another program, not a checkpoint of cavin_pyro")
     if header.get("version") != str(FORMAT_VERSION):

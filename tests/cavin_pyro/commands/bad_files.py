@@ -13,6 +13,11 @@ BAD_FILES = [
     ("plan", "checkpoint=@beginning", "beginning is truncated or no safetensors file"),
     ("plan", "checkpoint=@noise", "noise is truncated or no safetensors file"),
     ("plan", "checkpoint=@foreign", "foreign is a safetensors file of another program"),
+    (
+        "plan",
+        "checkpoint=@resume.safetensors",
+        "resume.safetensors is what a training resumes from, not a checkpoint: give ",
+    ),
     ("plan", "checkpoint=@version", "has format version 7, this program reads 1"),
     ("plan", "checkpoint=@damaged_header", "has a damaged header"),
     ("plan", "checkpoint=@no_sections", "has a damaged header"),

@@ -60,6 +60,7 @@ def spoil_checkpoints(folder: Path, good: Path) -> None:
         save(name, config=json.dumps({**config, "model": {**config["model"], **changes}}))
 
     save_file(tensors, folder / "foreign", metadata={"format": "pt"})
+    save_file(tensors, folder / "resume.safetensors")
     save("version", version="7")
     save("nan", factor=float("nan"))
     save("damaged_header", config="{")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -94,14 +95,31 @@ def test_errors_that_are_bugs_keep_their_traceback() -> None:
         assert caught.value is error
 
 
-def test_an_interruption_is_one_line_and_its_own_status(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (None, ""),
+        ("train", "; rerun the same command to resume"),
+        ("plan", "; rerun the same command to start again: nothing is kept of this one"),
+    ],
+)
+def test_an_interruption_is_one_line_and_its_own_status(
+    name: str | None, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     def act() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(SystemExit) as stop:
-        guarded(act)
+        guarded(act, name)
     assert stop.value.code == 130
-    assert capsys.readouterr().err.startswith("error: interrupted; rerun the same command to resume")
+    assert capsys.readouterr().err == f"error: interrupted{said}\n"
+
+
+def test_interruptions_say_of_every_command_what_the_page_on_reliability_says() -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    rows = re.findall(r"(?m)^\| ((?:`[a-z ]+`(?:, )?)+) \| (nothing)?", page.partition("| command | keeps |")[2])
+    kept = {name for names, nothing in rows if not nothing for name in re.findall(r"`([a-z]+)`", names)}
+    assert {*command_module.RESUMING} == kept & {*COMMANDS, "assets", "data"}
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -126,7 +144,7 @@ def test_signals_that_end_a_command_do_so_in_one_line_once_everything_is_saved(
     finally:
         signal.signal(number, before)
     assert (stop.value.code, done) == (128 + number, ["saved"])
-    said = f"error: interrupted by {number.name}; rerun the same command to resume, if it can\n"
+    said = f"error: interrupted by {number.name}\n"
     assert capsys.readouterr() == ("", said)
 
 
@@ -291,6 +309,7 @@ def test_overrides_from_python_are_refused_as_on_the_command_line() -> None:
         ("plan", "planner.motion_samples=None"): "planner.motion_samples may be null, which the command line does not",
         ("plan", "pushes_per_plan=None"): "pushes_per_plan may be null, which the command line does not write None: ",
         ("plan", "planner.samples=None"): "planner.samples must be a whole number, not None",
+        ("pln", "seed=0"): "unknown command 'pln': choose from collect, pretrain, train, check, calibrate, plan, ",
         ("demo", "task=clearing"): "task is an option of plan and evaluate: use tasks=[clearing]",
         ("demo", "+task.goal=a.png"): "task.goal is an option of plan and evaluate: use tasks=[clearing]",
         ("demo", "tiles.goal=[[1,2]]"): "tiles.goal is an option of plan and evaluate: leave it out, or run that",
@@ -357,7 +376,7 @@ def test_a_signal_that_comes_while_python_frees_an_object_is_not_lost(capsys: py
     with pytest.raises(SystemExit) as ended:
         guarded(work)
     assert ended.value.code == 128 + signal.SIGTERM
-    assert capsys.readouterr().err == "error: interrupted by SIGTERM; rerun the same command to resume, if it can\n"
+    assert capsys.readouterr().err == "error: interrupted by SIGTERM\n"
 
 
 def test_presets_may_lie_in_a_folder_whose_name_needs_quotes(tmp_path: Path) -> None:

@@ -253,7 +253,7 @@ def test_a_killed_worker_and_sigterm_end_a_collection_in_one_line_and_keep_its_f
     folder, seen = tmp_path / "out", 0
     for workers, status, said in (
         (2, 1, "error: worker process [0-9]+ was killed by signal 9 .*: rerun the same command to resume"),
-        (1, 128 + signal.SIGTERM, "error: interrupted by SIGTERM; rerun the same command to resume, if it can"),
+        (1, 128 + signal.SIGTERM, "error: interrupted by SIGTERM; rerun the same command to resume"),
     ):
         process = shell.start_command("collect", *overrides, f"workers={workers}", folder=tmp_path)
         while process.poll() is None and counted(folder) == seen:
