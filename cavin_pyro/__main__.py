@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import shlex
 import sys
 from pathlib import Path
 
 from cavin_pyro import __version__
 from cavin_pyro.config.application import guarded
+from cavin_pyro.config.errors import UserError
 
 ORDER = (
     "demo",
@@ -30,6 +32,11 @@ def main() -> None:
 
 
 def _list() -> None:
+    if others := [word for word in sys.argv[1:] if word not in ("--version", "--help", "-h")]:
+        line = shlex.join(others)
+        meant = f"did you mean python -m cavin_pyro.{line}?" if others[0] in ORDER else ""
+        choices = f"the commands are cavin_pyro.{', cavin_pyro.'.join(ORDER)}"
+        raise UserError(f"unknown argument {others[0]!r}: {meant or choices}")
     if "--version" in sys.argv[1:]:
         print(f"cavin_pyro {__version__}")
         return

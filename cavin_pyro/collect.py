@@ -20,7 +20,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.data.collection import check_policy, collect, repair
     from cavin_pyro.data.summary import summarize_data
     from cavin_pyro.data.world import collecting_world
-    from cavin_pyro.launching.launcher import Launcher
+    from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.visualization.data_summary import draw_data
     from envs.workspace import MAXIMUM_OBJECTS
@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     )
     check_policy(collection)
     with output_folder(config.output) as folder:
-        launcher = Launcher(config.launcher, config.workers, config.address)
+        launcher = chosen_launcher(config)
         if config.repair:
             print(f"{repair(collection, folder, workers=launcher)} files collected again")
         metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)

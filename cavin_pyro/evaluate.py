@@ -21,6 +21,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.evaluation.statistics import summarize, table
     from cavin_pyro.evaluation.success.sentences import calibration_of, sentence
     from cavin_pyro.evaluation.success.sentences import record as calibration_record
+    from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import atomic_write, output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -29,7 +30,7 @@ def main(config: DictConfig) -> None:
     with output_folder(config.output) as folder:
         runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
         runner.env.close()
-        seeds_of(config)
+        seeds_of(config), chosen_launcher(config)  # likewise
         others = earlier_rows(Path(config.compare), config) if config.compare else []
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)

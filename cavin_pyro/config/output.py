@@ -10,6 +10,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import preset_defaults, search_path
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import flat_options
 
 # The folder of a run without overrides, and the options that never decide which folder it is: runs that differ only in
@@ -33,7 +34,12 @@ def with_output(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
 
     Args:
         hydra_config: of the same composition.
+
+    Raises:
+        UserError: `output` is empty.
     """
+    if config.output == "":
+        raise UserError("output must name a folder, not '': leave it for the usual one")
     pattern, _ = FOLDERS[name]
     sweep = hydra_config.mode == RunMode.MULTIRUN
     if config.output is not None and not sweep:

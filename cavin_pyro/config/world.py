@@ -71,6 +71,8 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     for name in ("names", "target"):
         if not isinstance(ranges[name], list | None):
             raise UserError(f"env.ranges.{name} must be a list of objects, not {ranges[name]}")
+        if name == "names" and ranges[name] == []:
+            raise UserError(f"env.ranges.names must name an object, or be null for all: choose from {', '.join(every)}")
         ranges[name] = tuple(ranges[name] or (every if name == "names" else ()))
         try:
             chosen(ranges[name], objects)

@@ -137,12 +137,15 @@ def check_policy(config: CollectionConfig) -> None:
     """Check that the pushes can be chosen, before anything is written.
 
     Raises:
-        UserError: the checkpoint cannot be used, or there is one for nothing.
+        UserError: the checkpoint cannot be used, or an option of the other policy is given.
     """
     if config.policy == "model":
         _pusher(config.checkpoint or PUSHER)
-    elif config.checkpoint is not None:
-        raise UserError(f"checkpoint={config.checkpoint} is of policy=model: add that, or leave checkpoint")
+        return
+    for name in ("checkpoint", "motions"):
+        value = getattr(config, name)
+        if value != getattr(CollectionOptions, name):
+            raise UserError(f"{name}={value} is of policy=model: add that, or leave {name}")
 
 
 def pushing_policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:

@@ -17,7 +17,7 @@ from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, annou
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.success.predictors import columns_of
-from cavin_pyro.launching.launcher import Launcher, as_launcher, of_shard
+from cavin_pyro.launching.launcher import Launcher, as_launcher, chosen_launcher, of_shard
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.storage.run_directory import check_same_run
@@ -38,7 +38,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     """
     rows, seeds = begin(folder), seeds_of(config)
     missing = missing_seeds(seeds, rows)
-    launcher = Launcher(config.launcher, config.workers, config.address)
+    launcher = chosen_launcher(config)
     if missing:
         announce_waiting(config)
         announce_objects(config)

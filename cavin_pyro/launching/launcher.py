@@ -6,6 +6,8 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+from omegaconf import DictConfig
+
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.launching.cluster import in_cluster
 from cavin_pyro.launching.workers import in_workers
@@ -34,6 +36,17 @@ class Launcher:
         if self.name == "ray":
             return in_cluster(function, jobs, self.address, ordered=ordered)
         return in_workers(function, jobs, self.workers, ordered=ordered)
+
+
+def chosen_launcher(config: DictConfig) -> Launcher:
+    """The launcher that the options `launcher`, `workers` and `address` name.
+
+    Raises:
+        UserError: an address that nothing would read.
+    """
+    if config.address is not None and config.launcher != "ray":
+        raise UserError(f"address={config.address} is of launcher=ray: add that, or leave address")
+    return Launcher(config.launcher, config.workers, config.address)
 
 
 def as_launcher(workers: int | Launcher) -> Launcher:

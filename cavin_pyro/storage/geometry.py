@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import Config, construct
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
@@ -41,9 +42,11 @@ def chosen_geometry(config: Config) -> tuple[Geometry, dict[str, Any]]:
     """The geometric features that the options of a training name, and their provenance.
 
     Raises:
-        UserError: they cannot be built, or there is no PointNet where `pointnet` says.
+        UserError: they cannot be built, or there is no PointNet where `pointnet` says, or it names one for nothing.
     """
     if config["geometry"].get("_target_") != POINTNET:
+        if config["pointnet"] != DEFAULT_CHECKPOINT:
+            raise UserError(f"pointnet={config['pointnet']} is of geometry=pointnet: add that, or leave pointnet")
         return _frozen(construct(config["geometry"])), {}
     path = find_checkpoint(config["pointnet"])
     return load_pointnet(path), pointnet_provenance(path)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
+from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.comparison.pairing import load_pair
 from cavin_pyro.criticism.comparison.scores import FEATURES, LABELS, better, explained_sites, window_scores
@@ -37,12 +38,14 @@ def check_pair(config: DictConfig) -> bool:
     """Whether the options `a` and `b` ask for a comparison.
 
     Raises:
-        UserError: only one of them is given, or an export, which is of one checkpoint.
+        UserError: only one of them is given, or a third checkpoint, or an export, which is of one checkpoint.
     """
     if config.a is None and config.b is None:
         return False
     if config.a is None or config.b is None:
         raise UserError("a= and b= name the two checkpoints of a comparison: give both")
+    if config.checkpoint != DEFAULT_CHECKPOINT:
+        raise UserError(f"checkpoint={config.checkpoint} is not read beside a= and b=: leave it, or leave these")
     if config.export is not None:
         raise UserError("export= writes the samples of one checkpoint: give it with checkpoint=, without a= and b=")
     return True

@@ -78,6 +78,14 @@ BAD_OPTIONS = [
     ("evaluate", "task=juggling", f"choose from {', '.join(TASKS)}"),
     ("check", "sections=[consistency,bliss]", "unknown section 'bliss': choose from "),
     ("check", "sections=[]", "sections must name at least one: choose from "),
+    # Options that the others keep from being read.
+    ("collect", "address=host:6379", "address=host:6379 is of launcher=ray: add that, or leave address"),
+    ("evaluate", "address=host:6379", "address=host:6379 is of launcher=ray: add that, or leave address"),
+    ("collect", "motions=3", "motions=3 is of policy=model: add that, or leave motions"),
+    ("check", "a=cavin b=sectar checkpoint=mpc", "checkpoint=mpc is not read beside a= and b=: leave it, or leave"),
+    ("train", "geometry=outline pointnet=nope", "pointnet=nope is of geometry=pointnet: add that, or leave pointnet"),
+    ("plan", "env.ranges.names=[]", "env.ranges.names must name an object, or be null for all: choose from sugar_box"),
+    ("plan", "output=", "output must name a folder, not ''"),
     # Unknown options.
     (
         "plan",

@@ -38,6 +38,23 @@ def test_the_package_lists_its_commands(capsys: pytest.CaptureFixture[str], monk
     assert set(listed) == {file.stem for file in folder.glob("*.py")} - {"__init__", "__main__"} | rooms
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("plan task=clearing", "'plan': did you mean python -m cavin_pyro.plan task=clearing?"),
+        ("pln", "'pln': the commands are cavin_pyro.demo, cavin_pyro.plan, "),
+    ],
+)
+def test_a_command_after_a_space_is_refused_and_the_line_that_was_meant_is_named(
+    words: str, said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["cavin_pyro", *words.split()])
+    with pytest.raises(SystemExit) as stop:
+        listing.main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith(f"error: unknown argument {said}")
+
+
 @pytest.mark.parametrize("main", [listing.main, plan.main])
 def test_every_command_knows_its_version(
     main: SimpleNamespace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
