@@ -98,12 +98,14 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
     """Read and check a checkpoint.
 
     Args:
-        trust: further modules whose classes the checkpoint may name.
+        trust: a list of further modules whose classes the checkpoint may name.
 
     Raises:
         UserError: missing, truncated, damaged or foreign file, another version, old names, or a class of an untrusted
             module.
     """
+    if isinstance(trust, str):  # a sequence too, of letters
+        raise UserError(f'trust must be a list of modules, ["{trust}"] in Python, not "{trust}"')
     path = Path(path)
     header, tensors = _read(path)
     try:

@@ -138,6 +138,8 @@ def test_a_module_that_the_user_trusts_may_be_named(
     with pytest.raises(UserError, match=r"pass trust=\[parts_of_mine\]"):
         load_checkpoint(path)
     assert "parts_of_mine" not in sys.modules  # not even imported
+    with pytest.raises(UserError, match=r'^trust must be a list of modules, \["parts_of_mine"\] in Python, not'):
+        load_checkpoint(path, trust="parts_of_mine")
     model = build_model(load_checkpoint(path, trust=["parts_of_mine"]).config)
     assert type(model.prior_of_effects).__name__ == "OwnPrior"
 
