@@ -30,7 +30,8 @@ def main(config: DictConfig) -> None:
     with output_folder(config.output) as folder:
         runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
         runner.env.close()
-        seeds_of(config), chosen_launcher(config)  # likewise
+        seeds_of(config)
+        chosen_launcher(config)
         others = earlier_rows(Path(config.compare), config) if config.compare else []
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
