@@ -46,6 +46,7 @@ from models.networks.geometry import Geometry
 TIMING_FILE = "timing.csv"
 TIMING_HEADER = "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
 PUSHER = "contact"  # the checkpoint of policy=model, without another
+OPTIONS_OF_POLICIES = {"model": ("checkpoint", "motions"), "heuristic": ("intent_length", "perturbation_rate")}
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
 
 
@@ -139,13 +140,13 @@ def check_policy(config: CollectionConfig) -> None:
     Raises:
         UserError: the checkpoint cannot be used, or an option of the other policy is given.
     """
+    for policy, names in OPTIONS_OF_POLICIES.items():
+        for name in names if policy != config.policy else ():
+            value = getattr(config, name)
+            if value != getattr(CollectionOptions, name):
+                raise UserError(f"{name}={value} is of policy={policy}: add that, or leave {name}")
     if config.policy == "model":
         _pusher(config.checkpoint or PUSHER)
-        return
-    for name in ("checkpoint", "motions"):
-        value = getattr(config, name)
-        if value != getattr(CollectionOptions, name):
-            raise UserError(f"{name}={value} is of policy=model: add that, or leave {name}")
 
 
 def pushing_policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:

@@ -82,6 +82,7 @@ BAD_OPTIONS = [
     ("collect", "address=host:6379", "address=host:6379 is of launcher=ray: add that, or leave address"),
     ("evaluate", "address=host:6379", "address=host:6379 is of launcher=ray: add that, or leave address"),
     ("collect", "motions=3", "motions=3 is of policy=model: add that, or leave motions"),
+    ("collect", "policy=model intent_length=3", "intent_length=3 is of policy=heuristic: add that, or leave intent"),
     ("check", "a=cavin b=sectar checkpoint=mpc", "checkpoint=mpc is not read beside a= and b=: leave it, or leave"),
     ("train", "geometry=outline pointnet=nope", "pointnet=nope is of geometry=pointnet: add that, or leave pointnet"),
     ("plan", "env.ranges.names=[]", "env.ranges.names must name an object, or be null for all: choose from sugar_box"),
