@@ -188,7 +188,7 @@ def plan_segment(
     else:
         scores = -ranking.squared_distance(ends, subgoal)
     best = int(ranking.best_of(scores, "distances of motions to the subgoal"))
-    # Other samples than those that chose it, which would tell too little.
+    # By other samples than those that chose it, by which the distance would look too small.
     expected = expected_distances(
         model, here, actions[:, best : best + 1], subgoal, _generator([*seed, 5]), OUTCOMES_OF_CHOSEN
     )
