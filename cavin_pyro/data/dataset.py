@@ -44,17 +44,28 @@ class EmptyDatasetError(UserError):
 
 
 class CorruptShardError(UserError):
-    """A shard that is missing or corrupt; `defect` says so without what to do about it, for who is doing that."""
+    """A shard that is missing or corrupt.
 
-    def __init__(self, path: Path, said: str, *, merged: bool = False) -> None:
-        self.defect = f"shard {path} is missing or corrupt ({said})"
+    Attributes:
+        defect: the same line without what to do about it, for commands that are doing that.
+    """
+
+    defect: str
+
+    @classmethod
+    def of(cls, path: Path, said: str, *, merged: bool = False) -> CorruptShardError:
+        """The error about one shard. merged: its dataset, which collect refuses to repair, was made of others."""
+        defect = f"shard {path} is missing or corrupt ({said})"
         advice = (
             "merge the datasets again of which it was made"
-            if merged  # which collect refuses to repair
+            if merged
             else f"collect it again with python -m cavin_pyro.collect output={path.parent} repair=true and the other "
             "options of that collection"
         )
-        super().__init__(f"{self.defect}: {advice}, or train on the rest with skip_corrupt=true")
+        # Not in a constructor of its own, with which an error could not leave the process that raised it.
+        error = cls(f"{defect}: {advice}, or train on the rest with skip_corrupt=true")
+        error.defect = defect
+        return error
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -104,7 +115,7 @@ def read_shard(
         check_values(arrays)
         return arrays
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise CorruptShardError(path, str(error).splitlines()[0], merged="sources" in (metadata or {})) from error
+        raise CorruptShardError.of(path, str(error).splitlines()[0], merged="sources" in (metadata or {})) from error
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:

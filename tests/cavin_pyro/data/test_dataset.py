@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import (
+    CorruptShardError,
     iterate_shards,
     read_metadata,
     read_shard,
@@ -72,11 +74,14 @@ def test_a_truncated_shard_is_named(share: float, own_pushes: Path) -> None:
     path = shard_path(own_pushes, 1)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(UserError, match=r"episodes-00001\.h5 is missing or corrupt .*skip_corrupt=true") as found:
+    said = r"episodes-00001\.h5 is missing or corrupt .*skip_corrupt=true"
+    with pytest.raises(CorruptShardError, match=said) as found:
         read_shard(path)
     assert f": collect it again with python -m cavin_pyro.collect output={own_pushes} repair=true and" in str(
         found.value
     )
+    in_another_process = pickle.loads(pickle.dumps(found.value))
+    assert (str(in_another_process), in_another_process.defect) == (str(found.value), found.value.defect)
     with pytest.raises(UserError, match="merge the datasets again"):  # collect repairs no merged dataset
         read_shard(path, metadata={"sources": []})
 
