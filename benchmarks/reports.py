@@ -105,14 +105,14 @@ def remaining(effect: str, motion: str) -> Callable[[Sequence[Values]], str]:
     return lambda selections: whole(rollout(selections, effect, motion), mean="relative")
 
 
-def expected(selections: Sequence[Values]) -> str:
-    one = rollout(selections, "sampled", "closest")
-    return hundredfold((one["predicted_from_subgoal"], one["from_subgoal"]))
+def promised(motion: str, by: str) -> Callable[[Sequence[Values]], str]:
+    """What f says will be left, and what is left."""
 
+    def written(selections: Sequence[Values]) -> str:
+        one = rollout(selections, "sampled", motion)
+        return hundredfold((one[by], one["from_subgoal"]))
 
-def expected_by_distribution(selections: Sequence[Values]) -> str:
-    one = rollout(selections, "sampled", "closest in expectation")
-    return hundredfold((one["expected_from_subgoal"], one["from_subgoal"]))
+    return written
 
 
 def missed(selections: Sequence[Values]) -> str:
@@ -189,13 +189,17 @@ FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
         "consistency/selections",
         remaining("sampled", "closest"),
     ),
-    ("f expects to be left; is left, cm", "consistency/selections", expected),
+    ("f expects to be left; is left, cm", "consistency/selections", promised("closest", "predicted_from_subgoal")),
     (
         "remaining distance: sampled effect, motion closest in expectation",
         "consistency/selections",
         remaining("sampled", "closest in expectation"),
     ),
-    ("f's distribution expects to be left; is left, cm", "consistency/selections", expected_by_distribution),
+    (
+        "f's distribution expects to be left; is left, cm",
+        "consistency/selections",
+        promised("closest in expectation", "expected_from_subgoal"),
+    ),
     (
         "remaining distance: chosen effect, closest motion",
         "consistency/selections",
