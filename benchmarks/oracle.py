@@ -1,17 +1,29 @@
 """What a perfect f would gain: `python benchmarks/oracle.py [--task crossing] [--objects 3] [--episodes 40]`.
 
-Algorithm 1 as in the paper (`planner=paper`, the shipped checkpoint, sparse rewards), but at line 10 the simulator
-takes the place of f: of the best motions of the first segment by f (--candidates), the one whose outcome on the table
-comes closest to the subgoal is executed. Each of them is played in a second world with the same objects, put at the
-poses of the real ones; the real episode is not touched. The same scenes without the oracle stand beside it. Episodes
-end by `criterion=published`; success by both criteria is printed, as every episode tells both. The objects' poses and
-the simulator are no part of what a robot knows: this is a bound, not a method.
-Overrides of `evaluate` may follow, for example planner.motion_horizon=first_segment.
+The same scenes twice, by the same planner: once as `evaluate` plays them, once with the simulator in the place of f at
+line 10. Of the motions that f ranks best (--candidates), each is played in a second world with the same objects, put at
+the poses of the real ones; the one whose outcome on the table is closest to the subgoals is executed. For
+`--planner cavin` an outcome along which the task fails costs `planner.robustness.failure_cost`, as in its perturbed
+rollouts, which the simulator replaces. The real episode is not touched. The objects' poses and the simulator are no
+part of what a robot knows: this is a bound, not a method.
+
+Printed are success by the episodes' criterion, which is `published` for the paper's planner and `strict` for ours
+(episodes of `criterion=published` tell both), and of the scenes that both solve the mean pushes and their ratio, with a
+95 % interval from resampling scenes. `--log FILE` keeps every episode, a
+JSON line each; a second run with the same options goes on after them, and `--workers` plays several at once.
+Overrides of `evaluate` may follow, for example pushes_per_plan=null.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -22,50 +34,72 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_environment, make_runner
 from cavin_pyro.evaluation.rollout import Episode
-from cavin_pyro.evaluation.statistics import wilson
+from cavin_pyro.evaluation.statistics import mcnemar, wilson
 from cavin_pyro.storage.progress import progress_bar
 from envs.pushing import PushingEnv
+from envs.workspace import executed_push
 from models.state import State
 from planning import PerturbedRollouts
 from planning import cavin as algorithm
 from planning.extensions.sequential_halving import MostRobust
+from planning.rollouts import returns
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.segment import actions_of
+
+LINE_10 = ("f", "simulator")
+CRITERIA = {"paper": "published", "cavin": "strict"}  # by planner, unless overridden
+COLUMNS = ("outcome", "steps"), ("strict_outcome", "strict_steps")  # of an episode's row
+RESAMPLES = 10_000
+Row = dict[str, Any]
+Job = tuple[tuple[str, ...], int, str, int]  # arguments of `episode`
 
 
 class Oracle:
     """Chooses among motions by their outcomes in a second world, which mirrors that of `env`."""
 
     def __init__(self, config: DictConfig, env: PushingEnv, candidates: int) -> None:
-        self.env, self.candidates = env, candidates
+        self.env, self.candidates, self.decimals = env, candidates, config.push_decimals
         self.twin = make_environment(config)
 
     def reset(self, seed: int) -> None:
         """Make the same objects, before the episode with this seed."""
         self.twin.reset(seed=seed)
 
-    def outcome(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Observed centres [M, 3] in metres after the pushes [T, 4], from where the real objects are now."""
+    def path(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Observed centres [T, M, 3] in metres after each of the pushes [T, 4], from where the real objects are now."""
         self.twin.scene.world.restore(self.twin.scene.bodies, self.env.scene.ground_truth())
+        centers = []
         for action in actions:
-            self.twin.scene.push(np.clip(action, -1.0, 1.0))
-        return self.twin.scene.observe().centers
+            self.twin.scene.push(executed_push(action, self.decimals))
+            centers.append(self.twin.scene.observe().centers)
+        return np.stack(centers)
 
     def choose(
-        self, robustness: object, motions: Candidates, scores: Tensor, later_cost: Tensor, *task: Any
+        self,
+        robustness: PerturbedRollouts,
+        motions: Candidates,
+        scores: Tensor,
+        later_cost: Tensor,
+        model: object,
+        reward: Any,
+        subgoals: State,
+        feature_weight: float,
     ) -> MostRobust:
         """Line 10, in the place of `planning.extensions.sequential_halving.most_robust`."""
-        subgoal: State = task[2].step(0)  # [1]
-        cost = motions.score_state.executed_cost[0]  # of the first segment, by f
-        finite = torch.isfinite(cost) & torch.isfinite(scores[0])
-        best = torch.where(finite, cost, torch.inf).topk(min(self.candidates, len(cost)), largest=False).indices
+        best = scores[0].topk(min(self.candidates, scores.shape[-1])).indices
         actions = motions.at(0, actions_of)[0, best].numpy()
-        objects = subgoal.objects
-        reached = torch.from_numpy(np.stack([self.outcome(pushes)[:objects] for pushes in actions]))
-        distance = torch.where(subgoal.mask[0], (reached - subgoal.centers[0]).square().sum(-1), 0.0).sum(-1)
-        return MostRobust(best[distance.argmin()].reshape(1), distance.new_full((1,), torch.nan))
+        here, goal = motions.problem.state, subgoals.step(0)  # [1]
+        path = torch.from_numpy(np.stack([self.path(pushes)[:, : here.objects] for pushes in actions]))
+        start, mask = here.centers.expand(len(path), -1, -1), here.mask.expand(len(path), -1)
+        failed = returns.advance(returns.start(start), reward, start, path, mask).failed
+        distance = torch.where(mask, (path[:, -1] - goal.centers[0]).square().sum(-1), 0.0).sum(-1)
+        cost = distance + later_cost[0, best] + robustness.failure_cost * failed
+        cost = torch.where(torch.isfinite(scores[0, best]), cost, torch.inf)
+        winner = cost.argmin()
+        return MostRobust(best[winner].reshape(1), failed[winner].to(cost.dtype).reshape(1))
 
 
 def play(runner: EpisodeRunner, oracle: Oracle | None, seed: int) -> Episode:
@@ -74,49 +108,131 @@ def play(runner: EpisodeRunner, oracle: Oracle | None, seed: int) -> Episode:
         return runner.rollout(seed)
     planner: Any = runner.planner
     oracle.reset(seed)
+    # Without perturbed rollouts there is no cost of a failure, but line 10 must ask `most_robust`.
     with (
-        mock.patch.object(planner, "robustness", PerturbedRollouts()),  # so that line 10 asks `most_robust`
+        mock.patch.object(planner, "robustness", planner.robustness or PerturbedRollouts(failure_cost=0.0)),
+        mock.patch.object(planner, "idle_distance", 0.0),  # pushes stay in the order that the simulator played
         mock.patch.object(algorithm, "most_robust", oracle.choose),
     ):
         return runner.rollout(seed)
+
+
+@cache
+def players(options: tuple[str, ...], candidates: int) -> tuple[EpisodeRunner, Oracle]:
+    """One of each per process."""
+    config = compose("evaluate", *options)
+    runner = make_runner(config)
+    return runner, Oracle(config, runner.env, candidates)
+
+
+def episode(options: tuple[str, ...], candidates: int, line_10: str, seed: int) -> Row:
+    """One episode as a row, in any process."""
+    torch.set_num_threads(1)
+    runner, oracle = players(options, candidates)
+    row = episode_row(play(runner, oracle if line_10 == "simulator" else None, seed))
+    return {"line_10": line_10, **{name: row[name] for name in ("seed", *COLUMNS[0], *COLUMNS[1])}}
+
+
+def episodes(jobs: Sequence[Job], workers: int) -> Iterator[Row]:
+    """Rows in any order."""
+    if workers == 1:
+        yield from (episode(*job) for job in jobs)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(episode, *job) for job in jobs]):
+            yield done.result()
+
+
+def logged(path: Path | None, what: Row) -> list[Row]:
+    """The episodes of a log that were played with the options `what`; a line that was cut off does not count."""
+    rows = []
+    for line in path.read_text().splitlines() if path and path.exists() else []:
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if all(row.get(name) == value for name, value in what.items()):
+            rows.append(row)
+    return rows
+
+
+def ratio(one: Sequence[float], other: Sequence[float]) -> tuple[float, float, float]:
+    """The mean of `one` over that of `other`, of the same scenes, and its interval from resampling scenes."""
+    pairs = np.array([one, other], dtype=float)
+    chosen = np.random.default_rng(0).integers(pairs.shape[1], size=(RESAMPLES, pairs.shape[1]))
+    means = pairs[:, chosen].mean(-1)
+    low, high = np.quantile(means[0] / means[1], (0.025, 0.975))
+    return float(pairs[0].mean() / pairs[1].mean()), float(low), float(high)
+
+
+def lines(rows: Sequence[Row], criterion: str) -> Iterator[str]:
+    """The results of scenes that were played both ways, by the criterion of the episodes.
+
+    Episodes of `criterion=published` go on where the strict one ends, so they tell both.
+    """
+    told = (
+        dict(zip(("published", "strict"), COLUMNS, strict=True))
+        if criterion == "published"
+        else {criterion: COLUMNS[0]}
+    )
+    ways = [{row["seed"]: row for row in rows if row["line_10"] == way} for way in LINE_10]
+    scenes = sorted(ways[0].keys() & ways[1].keys())
+    yield "criterion  line 10    success   rate  95 % interval    pushes, where both succeed"
+    for name, (outcome, steps) in told.items():
+        solved = [[way[seed][outcome] == "success" for seed in scenes] for way in ways]
+        both = [seed for seed, *ends in zip(scenes, *solved, strict=True) if all(ends)]
+        taken = [[way[seed][steps] for seed in both] for way in ways]
+        for way, ends, pushes in zip(LINE_10, solved, taken, strict=True):
+            rate = wilson(sum(ends), len(scenes))
+            interval = f"{rate['low']:.1%} to {rate['high']:.1%}"
+            mean = f"{np.mean(pushes):.1f} (median {np.median(pushes):.0f})" if both else "none"
+            yield f"{name:9s}  {way:9s}  {sum(ends):3d}/{len(scenes):<3d}  {rate['rate']:6.1%}  {interval:15s}  {mean}"
+        alone = [sum(one and not other for one, other in zip(*pair, strict=True)) for pair in (solved, solved[::-1])]
+        of_pushes = "{:.2f} ({:.2f} to {:.2f})".format(*ratio(*taken)) if both else "unknown"
+        yield (
+            f"{name:9s}  f behind by {100 * (alone[1] - alone[0]) / len(scenes):.1f} points ({alone[1]} scenes "
+            f"that the simulator alone solves, {alone[0]} that f alone does, p = {mcnemar(*alone):.2g}); pushes of f "
+            f"over those of the simulator: {of_pushes}"
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="crossing")
     parser.add_argument("--objects", type=int, default=3)
+    parser.add_argument("--planner", choices=("paper", "cavin"), default="paper")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0, help="of the first scene")
     parser.add_argument("--candidates", type=int, default=96, help="motions per plan that the simulator plays")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--log", type=Path, help="episodes as JSON, a line each: a second run goes on after them")
     arguments, overrides = parser.parse_known_args()
-    config = compose(
-        "evaluate",
-        "planner=paper",
-        f"task={arguments.task}",
-        f"objects={arguments.objects}",
-        "criterion=published",
-        *overrides,
+    options = (
+        *(f"planner={arguments.planner}", f"task={arguments.task}", f"objects={arguments.objects}"),
+        *(f"criterion={CRITERIA[arguments.planner]}", *overrides),
     )
-    runner = make_runner(config)
-    oracle = Oracle(config, runner.env, arguments.candidates)
-    outcomes: dict[str, list[tuple[str, str]]] = {"f": [], "simulator": []}
+    criterion = compose("evaluate", *options).criterion
+    what = {"options": list(options), "candidates": arguments.candidates}
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
-    with progress_bar("playing", total=2 * len(seeds), unit="episode") as bar:
-        for seed in seeds:
-            for name, one in (("f", None), ("simulator", oracle)):
-                episode = play(runner, one, seed)
-                outcomes[name].append((episode.outcome, episode.strict()[0]))
-                bar.update()
-    print(f"{arguments.task}, {arguments.objects} objects, scenes {seeds[0]} to {seeds[-1]}")
-    print("line 10    criterion  success   rate  95 % interval")
-    for name, pairs in outcomes.items():
-        for criterion, ends in zip(("published", "strict"), zip(*pairs, strict=True), strict=True):
-            wins = ends.count("success")
-            rate = wilson(wins, len(ends))
-            interval = f"{rate['low']:.1%} to {rate['high']:.1%}"
-            print(f"{name:9s}  {criterion:9s}  {wins:3d}/{len(ends):<3d}  {rate['rate']:6.1%}  {interval}")
-    oracle.twin.close()
-    runner.env.close()
+    rows = [row for row in logged(arguments.log, what) if row["seed"] in seeds]
+    played = {(row["line_10"], row["seed"]) for row in rows}
+    left = [
+        (options, arguments.candidates, way, seed) for seed in seeds for way in LINE_10 if (way, seed) not in played
+    ]
+    if arguments.log:
+        arguments.log.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        open(arguments.log or os.devnull, "a", encoding="utf-8") as log,
+        progress_bar("playing", total=2 * len(seeds), initial=len(played), unit="episode") as bar,
+    ):
+        for row in episodes(left, arguments.workers):
+            rows.append({**what, **row})
+            print(json.dumps(rows[-1]), file=log, flush=True)
+            bar.update()
+    print(
+        f"{arguments.task}, {arguments.objects} objects, planner={arguments.planner}, scenes {seeds[0]} to {seeds[-1]}"
+    )
+    print("\n".join(lines(rows, criterion)))
 
 
 if __name__ == "__main__":

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from envs.layouts import GENERATED, generate_task, possible_tasks
 from envs.objects.asset import plain_name
-from envs.objects.object_sets import load_object_set
+from envs.objects.object_sets import ObjectSet, load_object_set
 from envs.objects.sampling import Area, ObjectRanges
 from envs.observation import Observation
 from envs.randomness import goal_stream, layout_stream, next_scene_stream
+from envs.robots import RobotMaker
 from envs.scene import Scene
+from envs.segmentation import SegmenterMaker
 from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
 from envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
@@ -54,8 +56,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward: dense or sparse. criterion: what ends an episode as a violation, see `envs.tasks.TaskReward`. Scenes and
             observations do not depend on it.
         objects: how many, 1 to 10. ranges: object parameters.
-        robot: one of `envs.robots.ROBOTS`.
-        object_set: a key of `envs.objects.object_sets.OBJECT_SETS`.
+        robot: one of `envs.robots.ROBOTS`, or a maker of robots.
+        object_set: a key of `envs.objects.object_sets.OBJECT_SETS`, or a set.
         camera, segmentation: see `envs.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table, and the
@@ -79,14 +81,14 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         criterion: str = "strict",
         objects: int = 3,
         ranges: ObjectRanges | None = None,
-        object_set: str = "builtin",
+        object_set: str | ObjectSet = "builtin",
         assets: str | Path | None = None,
         maximum_steps: int = EPISODE_STEPS,
         camera: str | Camera | DepthSensor = "ideal",
-        segmentation: str = "mask",
+        segmentation: str | SegmenterMaker = "mask",
         render_mode: str | None = None,
         show_tiles: bool = True,
-        robot: str = "stick",
+        robot: str | RobotMaker = "stick",
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
             raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")

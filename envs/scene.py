@@ -23,8 +23,8 @@ from envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRan
 from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_sample_streams, sensor_stream
-from envs.robots import Stopped, push, robot_maker, settle
-from envs.segmentation import Pixels, segmenter_of
+from envs.robots import RobotMaker, Stopped, push, robot_maker, settle
+from envs.segmentation import Pixels, SegmenterMaker, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.sensors.camera import Camera
 from envs.workspace import OBJECT_SLOTS, push_endpoints
@@ -66,10 +66,10 @@ class Scene:
 
     Args:
         camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
-        segmentation: a name in `envs.segmentation.SEGMENTERS`.
+        segmentation: a name in `envs.segmentation.SEGMENTERS`, or a maker of segmenters.
         object_set: the set of the objects' names, by default the builtin shapes.
         on_frame: called a few times during every push, to film it.
-        robot: one of `envs.robots.ROBOTS`. assets: folder of the files that some robots need.
+        robot: one of `envs.robots.ROBOTS`, or a maker of robots. assets: folder of the files that some robots need.
         slots: M, the objects that observations have room for.
 
     Raises:
@@ -80,10 +80,10 @@ class Scene:
         self,
         *,
         camera: str | Camera | DepthSensor = "ideal",
-        segmentation: str = "mask",
+        segmentation: str | SegmenterMaker = "mask",
         object_set: ObjectSet | None = None,
         on_frame: FrameHook | None = None,
-        robot: str = "stick",
+        robot: str | RobotMaker = "stick",
         assets: str | Path | None = None,
         slots: int = OBJECT_SLOTS,
     ) -> None:

@@ -103,9 +103,24 @@ def search_path(*folders: str) -> str:
 
 
 def presets_by_name(overrides: Sequence[str]) -> list[str]:
-    """`planner.optimizer=cem` as `planner/optimizer=cem`, which brings the options of `cem` with it."""
+    """`planner.optimizer=cem` as `planner/optimizer=cem`, which brings the options of `cem` with it.
+
+    And the class of a part of the world, `env.camera._target_=my_lab.Mine +env.camera.noise=1`, as its section,
+    `env.camera={_target_: my_lab.Mine, noise: 1}`, since parts of ours have names and no section.
+    """
     named = r"^planner\.optimizer=(?!null$)(?=[A-Za-z_][\w.,]*$)"
-    return [re.sub(named, "planner/optimizer=", word) for word in overrides]
+    words = [re.sub(named, "planner/optimizer=", word) for word in overrides]
+    for part in (word.partition("._target_=")[0] for word in overrides if re.match(_OWN_PART, word)):
+        mine = re.compile(rf"\+{{0,2}}{re.escape(part.lstrip('+'))}\.([\w.]+)=(.*)", re.DOTALL)
+        found = [(place, one) for place, word in enumerate(words) if (one := mine.fullmatch(word))]
+        section = ", ".join(f"{one[1]}: {one[2]}" for _, one in found)
+        if found:
+            words[found[0][0]] = f"{part.lstrip('+')}={{{section}}}"
+            words = [word for place, word in enumerate(words) if place not in {place for place, _ in found[1:]}]
+    return words
+
+
+_OWN_PART = r"\+{0,2}env\.(robot|objects|camera|segmentation)\._target_="
 
 
 def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:

@@ -127,6 +127,8 @@ def check_value(name: str, value: Any, about: About, *, whole: bool = False) -> 
     """
     if value is None or (isinstance(value, str) and value.startswith(("${", "???"))):
         return
+    if isinstance(value, Mapping) and value.get("_target_"):
+        return  # a class of the user's, which says itself what is wrong with it
     if about.choices is not None:
         for entry in value if isinstance(value, list) else [value]:
             if entry not in (about.names or ()):

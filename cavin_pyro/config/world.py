@@ -9,11 +9,11 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.own_parts import object_set_of, robot_of
 from envs.layouts import task_class
 from envs.objects.asset import plain_name
-from envs.objects.object_sets import chosen, load_object_set
+from envs.objects.object_sets import chosen
 from envs.objects.sampling import ObjectRanges
-from envs.robots import robot_maker
 from envs.tasks import Task
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
@@ -54,7 +54,7 @@ def check_world(env: DictConfig) -> None:
         UserError: an unknown part, with the valid ones, or missing files, with the command that gets them.
     """
     with user_input():
-        robot_maker(env.robot, env.assets)
+        robot_of(env.robot, env.assets)
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:
@@ -66,7 +66,7 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     """
     ranges: Any = OmegaConf.to_container(env.ranges)
     with user_input():
-        objects = load_object_set(env.objects, env.assets)
+        objects = object_set_of(env.objects, env.assets)
     every = tuple(dict.fromkeys(map(plain_name, objects.names)))
     for name in ("names", "target"):
         if not isinstance(ranges[name], list | None):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import time
 from collections.abc import Generator, Iterable
 from contextlib import closing
@@ -17,6 +18,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptions
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.own_parts import camera_of, object_set_of, segmentation_of
 from cavin_pyro.data.dataset import (
     Arrays,
     CorruptShardError,
@@ -33,7 +35,6 @@ from cavin_pyro.launching.launcher import Launcher, as_launcher
 from cavin_pyro.storage.checkpoint import find_checkpoint
 from cavin_pyro.storage.files import atomic_write, file_digest
 from cavin_pyro.storage.progress import progress_bar
-from envs.objects.object_sets import load_object_set
 from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
@@ -55,16 +56,16 @@ class CollectionConfig(CollectionOptions):
     """Everything that determines the data: equal configurations give equal data.
 
     Attributes:
-        ranges: object parameters. object_set: by name. assets: folder of meshes, for a set that needs one; its path
-            does not affect the data. Of a checkpoint its content does, not its path.
-        camera, segmentation: by name, see `envs.scene.Scene`.
+        ranges: object parameters. object_set: as `env.objects`. assets: folder of meshes, for a set that needs one;
+            its path does not affect the data. Of a checkpoint its content does, not its path.
+        camera, segmentation: as `env.camera` and `env.segmentation`, by name or with a class of the user's.
     """
 
     ranges: ObjectRanges = field(default_factory=lambda: ObjectRanges(clearance=COLLECTION_CLEARANCE))
-    object_set: str = WorldConfig.objects
+    object_set: Any = WorldConfig.objects
     assets: str | None = WorldConfig.assets
-    camera: str = WorldConfig.camera
-    segmentation: str = WorldConfig.segmentation
+    camera: Any = WorldConfig.camera
+    segmentation: Any = WorldConfig.segmentation
 
 
 def collect(
@@ -210,17 +211,17 @@ def open_scene(config: CollectionConfig) -> Scene:
     """
     with user_input():
         return Scene(
-            object_set=load_object_set(config.object_set, config.assets),
-            camera=config.camera,
-            segmentation=config.segmentation,
+            object_set=object_set_of(config.object_set, config.assets),
+            camera=camera_of(config.camera),
+            segmentation=segmentation_of(config.segmentation),
             slots=object_slots(config.maximum_objects),
         )
 
 
 @cache
-def _scene(**parts: Any) -> Scene:
-    """One per worker process."""
-    return open_scene(CollectionConfig(**parts))
+def _scene(parts: str) -> Scene:
+    """One per worker process; `parts` as JSON."""
+    return open_scene(CollectionConfig(**json.loads(parts)))
 
 
 @cache
@@ -232,7 +233,7 @@ def _pusher(checkpoint: str) -> tuple[Model, Geometry]:
 def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str, float]]:
     config, shard = job
     parts = ("object_set", "assets", "camera", "segmentation", "maximum_objects")
-    scene = _scene(**{name: getattr(config, name) for name in parts})
+    scene = _scene(json.dumps({name: getattr(config, name) for name in parts}))
     began = time.process_time()
     scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     first = shard * config.episodes_per_shard
@@ -261,7 +262,7 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
     if not (folder / "metadata.json").exists():
         metadata = {
             "configuration": wanted,
-            "shape_names": list(load_object_set(config.object_set, config.assets).names),
+            "shape_names": list(object_set_of(config.object_set, config.assets).names),
             "made_by": f"cavin_pyro {__version__}",
             "shards": 0,
             "episodes": 0,

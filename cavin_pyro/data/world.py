@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
+from cavin_pyro.config.commands.world import WorldConfig
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.own_parts import own_class, plain
 from cavin_pyro.config.world import check_world, object_ranges
 from cavin_pyro.data.collection import CollectionConfig
 
@@ -16,14 +18,15 @@ def collecting_world(env: DictConfig) -> CollectionConfig:
         UserError: as `check_world` and `object_ranges`, or another robot than the stick.
     """
     check_world(env)
-    if env.robot != "stick":
+    if env.robot != WorldConfig.robot:
+        robot = own_class(env.robot)
         raise UserError(
-            f"random pushes are made with env.robot=stick, not {env.robot}: its pushes are equivalent and faster"
+            f"random pushes are made with env.robot=stick, not {robot}: its pushes are equivalent and faster"
         )
     return CollectionConfig(
         ranges=object_ranges(env),
-        object_set=env.objects,
+        object_set=plain(env.objects),
         assets=env.assets,
-        camera=env.camera,
-        segmentation=env.segmentation,
+        camera=plain(env.camera),
+        segmentation=plain(env.segmentation),
     )

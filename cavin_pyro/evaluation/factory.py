@@ -17,6 +17,7 @@ from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input, whole_number
 from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
+from cavin_pyro.config.own_parts import camera_of, object_set_of, robot_of, segmentation_of
 from cavin_pyro.config.parts import check_largest, class_of, construct, naming
 from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
@@ -158,13 +159,13 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
             criterion=config.criterion,
             objects=config.objects,
             ranges=object_ranges(config.env),
-            object_set=config.env.objects,
+            object_set=object_set_of(config.env.objects, config.env.assets),
             assets=config.env.assets,
             maximum_steps=config.maximum_steps,
-            camera=config.env.camera,
-            segmentation=config.env.segmentation,
+            camera=camera_of(config.env.camera),
+            segmentation=segmentation_of(config.env.segmentation),
             render_mode="rgb_array" if render else None,
-            robot=config.env.robot,
+            robot=robot_of(config.env.robot, config.env.assets),
         )
 
 

@@ -76,12 +76,14 @@ OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
 """Makers of object sets by name; their argument is the folder of assets, or None."""
 
 
-def load_object_set(name: str, assets: str | Path | None = None) -> ObjectSet:
-    """The set of that name.
+def load_object_set(name: str | ObjectSet, assets: str | Path | None = None) -> ObjectSet:
+    """The set of that name, or the given one.
 
     Raises:
         ValueError: the name is unknown, or the set needs assets that are not there.
     """
+    if not isinstance(name, str):
+        return name
     if name not in OBJECT_SETS:
         raise ValueError(f"unknown object set {name!r}: choose from {', '.join(OBJECT_SETS)}")
     return OBJECT_SETS[name](assets)

@@ -42,12 +42,14 @@ ROBOTS: dict[str, Callable[[str | Path | None], RobotMaker]] = {
 }
 
 
-def robot_maker(name: str, assets: str | Path | None = None) -> RobotMaker:
-    """The maker of the robot of that name.
+def robot_maker(robot: str | RobotMaker, assets: str | Path | None = None) -> RobotMaker:
+    """The maker of the robot of that name, or the given one.
 
     Raises:
         ValueError: unknown robot, or missing files; the message says how to get them.
     """
-    if name not in ROBOTS:
-        raise ValueError(f"unknown robot {name!r}: choose from {', '.join(ROBOTS)}")
-    return ROBOTS[name](assets)
+    if not isinstance(robot, str):
+        return robot
+    if robot not in ROBOTS:
+        raise ValueError(f"unknown robot {robot!r}: choose from {', '.join(ROBOTS)}")
+    return ROBOTS[robot](assets)

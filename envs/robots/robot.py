@@ -1,6 +1,6 @@
 """The interface of robots, which the driver of a real arm implements.
 
-Add a driver that implements `Robot` to `envs.robots.ROBOTS`; `envs.robots.phases.push` then makes it push.
+`envs.robots.phases.push` makes whatever implements `Robot` push: one of `envs.robots.ROBOTS`, or a class of the user's.
 All places are those of the tool's tip, (x, y, z) metres in the robot's base frame with the table's top at z = 0, and
 the tool stands upright. No method raises for an event on the table: it reports the event and stops the robot.
 """

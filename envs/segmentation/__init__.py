@@ -9,21 +9,35 @@ from envs.segmentation.mask import MaskSegmenter, TrueMasks
 from envs.segmentation.segmenter import Pixels, Segmenter
 from envs.workspace import OBJECT_SLOTS
 
+SegmenterMaker = Callable[[int], Segmenter]
+"""Makes a segmenter that finds at most so many objects."""
+
 SEGMENTERS: dict[str, Callable[..., Segmenter]] = {  # from the simulator's masks and M
     "mask": lambda true_masks, slots=OBJECT_SLOTS: MaskSegmenter(true_masks),  # the scene's objects and no others
     "clusters": lambda true_masks, slots=OBJECT_SLOTS: ClusterSegmenter(slots),  # which does not use the masks
 }
 
 
-def segmenter_of(segmentation: str, true_masks: TrueMasks, slots: int = OBJECT_SLOTS) -> Segmenter:
-    """The segmenter of that name, which finds at most `slots` objects.
+def segmenter_of(segmentation: str | SegmenterMaker, true_masks: TrueMasks, slots: int = OBJECT_SLOTS) -> Segmenter:
+    """The segmenter of that name, or of the given maker, which finds at most `slots` objects.
 
     Raises:
         ValueError: unknown name.
     """
+    if not isinstance(segmentation, str):
+        return segmentation(slots)
     if segmentation not in SEGMENTERS:
         raise ValueError(f"unknown segmentation {segmentation!r}: choose from {', '.join(SEGMENTERS)}")
     return SEGMENTERS[segmentation](true_masks, slots)
 
 
-__all__ = ["SEGMENTERS", "ClusterSegmenter", "MaskSegmenter", "Pixels", "Segmenter", "TrueMasks", "segmenter_of"]
+__all__ = [
+    "SEGMENTERS",
+    "ClusterSegmenter",
+    "MaskSegmenter",
+    "Pixels",
+    "Segmenter",
+    "SegmenterMaker",
+    "TrueMasks",
+    "segmenter_of",
+]

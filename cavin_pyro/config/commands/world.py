@@ -1,4 +1,4 @@
-"""The world of an episode: robot, objects, camera and segmentation."""
+"""The world of an episode: robot, objects, camera and segmentation, each by name or as a class of the user's own."""
 
 from __future__ import annotations
 
@@ -43,22 +43,22 @@ class RangesConfig:
 class WorldConfig:
     """The section `env`."""
 
-    robot: str = option(
+    robot: Any = option(
         ENVIRONMENT["robot"],
         "what pushes",
         choices="envs.robots.ROBOTS",
         group="world",
     )
-    objects: str = option(
+    objects: Any = option(
         ENVIRONMENT["object_set"], "set of objects", choices="envs.objects.object_sets.OBJECT_SETS", group="world"
     )
-    camera: str = option(
+    camera: Any = option(
         ENVIRONMENT["camera"],
         "depth camera",
         choices="envs.sensors.CAMERAS",
         group="world",
     )
-    segmentation: str = option(
+    segmentation: Any = option(
         ENVIRONMENT["segmentation"],
         "segmentation of objects in a depth image",
         choices="envs.segmentation.SEGMENTERS",

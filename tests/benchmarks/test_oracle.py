@@ -1,0 +1,130 @@
+"""The oracle's second world mirrors the real one, its choice is the best outcome, and its report tells who wins."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.evaluation.factory import make_environment
+from models.state import State
+from planning import PerturbedRollouts
+from tests.benchmarks.loading import load
+from tests.cavin_pyro.conftest import run_script
+
+ROOT = Path(__file__).parents[2]
+TINY = ("--objects", "2", "--planner", "cavin", "--candidates", "2", "--seed", "3")
+OVERRIDES = ("planner.samples=8", "planner.horizon=6", "maximum_steps=3", "pushes_per_plan=null")
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> Any:
+    return load("oracle")
+
+
+def test_a_push_in_the_second_world_ends_as_in_the_real_one(benchmark: Any) -> None:
+    config = compose("evaluate", "task=crossing", "objects=2", "planner=cavin")
+    env = make_environment(config)
+    oracle = benchmark.Oracle(config, env, candidates=2)
+    try:
+        start = env.reset(seed=5)[0]["centers"]
+        oracle.reset(5)
+        # From a side of the first object through it, twice: what is reached matters to the second push.
+        low, high = np.array((0.30, -0.55)), np.array((0.80, 0.55))
+        beside = 2.0 * (start[0, :2] - (0.07, 0.0) - low) / (high - low) - 1.0
+        pushes = np.array([[*beside, 1.0, 0.0]] * 2, dtype=np.float32)
+        foreseen = oracle.path(pushes)
+        assert np.linalg.norm(foreseen[1, 0] - start[0]) > 0.02  # the object was pushed
+        again = oracle.path(pushes)  # from where the real objects are, not from where the last path ended
+        reached = [env.step(push)[0]["centers"] for push in pushes]
+        np.testing.assert_allclose(foreseen, again, atol=2e-3)  # which points are seen is a matter of chance
+        np.testing.assert_allclose(foreseen[:, :2], np.stack(reached)[:, :2], atol=2e-3)
+    finally:
+        oracle.twin.close()
+        env.close()
+
+
+def test_the_motion_with_the_best_outcome_is_chosen_unless_it_fails(benchmark: Any) -> None:
+    """Motion k is known by its first number; the simulator says where it leads, f says the opposite."""
+    ends = torch.tensor([0.3, 0.1, 0.0, 0.2])  # metres from the subgoal
+    here = State(torch.zeros(1, 1, 3), torch.zeros(1, 1, 2), torch.ones(1, 1, dtype=torch.bool))
+    subgoals = State(torch.zeros(1, 1, 1, 3), torch.zeros(1, 1, 1, 2), torch.ones(1, 1, 1, dtype=torch.bool))
+    actions = torch.arange(4.0).view(1, 4, 1, 1).expand(1, 4, 2, 4)
+    motions = SimpleNamespace(problem=SimpleNamespace(state=here), at=lambda segment, field: actions)
+
+    def reward(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Any:
+        nothing = torch.zeros(mask.shape[:-1])
+        return SimpleNamespace(reward=nothing, success=nothing.bool(), failure=centers[..., 0, 1] > 0.5)
+
+    def chosen(candidates: int, failing: int, failure_cost: float = 0.3) -> int:
+        def path(pushes: np.ndarray) -> np.ndarray:
+            number = int(pushes[0, 0])
+            side = 1.0 if number == failing else 0.0  # on the way only
+            return np.array([[[0.0, side, 0.0]], [[ends[number], 0.0, 0.0]]], dtype=np.float32)
+
+        oracle = SimpleNamespace(candidates=candidates, path=path)
+        scores, later = ends.unsqueeze(0), torch.zeros(1, 4)
+        rules = PerturbedRollouts(failure_cost=failure_cost)
+        return int(benchmark.Oracle.choose(oracle, rules, motions, scores, later, None, reward, subgoals, 0.0).number)
+
+    assert chosen(4, failing=-1) == 2
+    assert chosen(4, failing=2) == 1
+    assert chosen(4, failing=2, failure_cost=0.0) == 2
+    assert chosen(2, failing=-1) == 3  # f ranks 0 and 3 best, and no others are played
+
+
+def row(line_10: str, seed: int, outcome: str, steps: int) -> dict[str, Any]:
+    names = "line_10", "seed", "outcome", "steps", "strict_outcome", "strict_steps"
+    return dict(zip(names, (line_10, seed, outcome, steps, outcome, steps), strict=True))
+
+
+def test_the_report_tells_by_how_much_f_is_behind(benchmark: Any) -> None:
+    """Of 20 scenes f fails in 4, and takes 12 pushes where the simulator takes 8."""
+    rows = [row("f", seed, "timeout" if seed < 4 else "success", 12) for seed in range(20)]
+    rows += [row("simulator", seed, "success", 8) for seed in range(20)]
+    rows.append(row("f", 20, "success", 100))  # not played by the simulator yet
+    _, f, simulator, compared = benchmark.lines(rows, "strict")
+    assert f.split()[:4] == ["strict", "f", "16/20", "80.0%"] and simulator.split()[2:4] == ["20/20", "100.0%"]
+    assert (
+        "f behind by 20.0 points (4 scenes that the simulator alone solves, 0 that f alone does, p = 0.12)" in compared
+    )
+    assert compared.endswith("pushes of f over those of the simulator: 1.50 (1.50 to 1.50)")
+    exchanged = [{**one, "line_10": {"f": "simulator", "simulator": "f"}[one["line_10"]]} for one in rows]
+    assert "f behind by -20.0 points (0 scenes" in list(benchmark.lines(exchanged, "strict"))[-1]
+    assert len(list(benchmark.lines(rows, "published"))) == 7  # episodes that tell both criteria
+
+
+def test_the_interval_of_a_ratio_covers_the_truth_and_not_more(benchmark: Any) -> None:
+    generator = np.random.default_rng(1)
+    one, other = generator.normal(12.0, 3.0, 400), generator.normal(10.0, 3.0, 400)
+    ratio, low, high = benchmark.ratio(one, other)
+    assert low < 1.2 < high and low < ratio < high and high - low < 0.15
+
+
+def test_a_second_run_goes_on_after_the_episodes_of_a_log(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+
+    def run(episodes: int, *more: str) -> str:
+        given = (*TINY, "--episodes", str(episodes), "--log", str(log), *OVERRIDES, *more)
+        ended = run_script(ROOT / "benchmarks" / "oracle.py", *given, folder=ROOT)
+        assert ended.status == 0, ended.errors
+        return ended.output
+
+    run(1)
+    with log.open("a") as file:
+        file.write('{"line_10": "f", "se')  # cut off
+        file.write("\n")
+    printed = run(2)
+    assert re.search(r"^strict +simulator +\d/2 ", printed, re.MULTILINE)
+    first = log.read_text().splitlines()
+    assert len(first) == 2 + 1 + 2 and [json.loads(line)["seed"] for line in first[:2]] == [3, 3]
+    assert run(2) == printed and log.read_text().splitlines() == first  # nothing is left to play
+    run(1, "planner.nearest_objects=1")  # another question: its episodes are its own
+    assert len(log.read_text().splitlines()) == 7
