@@ -110,7 +110,8 @@ def test_licence_and_citation_say_whose_work_it_is() -> None:
 
 def test_every_dependency_is_locked_at_the_version_that_the_project_names() -> None:
     extras = PROJECT["project"]["optional-dependencies"]
-    named = pins(PROJECT["project"]["dependencies"] + extras["test"] + extras["assets"] + extras["docs"])
+    optional = [one for name in ("test", "assets", "docs", "ray", "slurm") for one in extras[name]]
+    named = pins(PROJECT["project"]["dependencies"] + optional)
     locked = lock()
     assert named == {name: locked.get(name) for name in named}
 

@@ -71,7 +71,7 @@ def _check_target(target: Any, path: Path, trust: Sequence[str]) -> None:
     if trusted:
         line += f": trust={_list(trusted)} allows the classes that are defined there, and {target} is none of them"
     elif top.isidentifier() and top != str(target) and top not in NEVER_SUGGESTED:
-        line += f": if you trust that module, pass trust=[{top}]"
+        line += f": if you trust that module, pass 'trust=[{top}]'"
     raise UserError(line)
 
 

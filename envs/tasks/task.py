@@ -134,7 +134,7 @@ class Task(ABC):
             progress = self.potential(step.states, step.mask).diff(dim=-1)
         return {
             "goal": GOAL_REWARD * success,
-            "violation": VIOLATION_REWARD * failure,
+            "violation": torch.where(failure, VIOLATION_REWARD, 0.0),  # a product with false is -0.0
             "time": torch.full_like(progress, TIME_REWARD),
             "progress": progress,
         }

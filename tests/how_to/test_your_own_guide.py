@@ -93,7 +93,7 @@ def test_the_commands_of_the_page_work_and_need_trust(
         refused = run_command(command, *[one for one in overrides if not one.startswith("trust=")], folder=folder)
         line = in_one_line(refused)
         assert f"runs/{run}/checkpoint.safetensors asks to run my_lab.{target}" in line
-        assert line.endswith("pass trust=[my_lab]")
+        assert line.endswith("pass 'trust=[my_lab]'")
         assert is_on_the_page(line) or target != "MyGuide"
         (output,) = (one.removeprefix("output=") for one in overrides if one.startswith("output="))
         assert not (folder / output).exists()

@@ -13,16 +13,9 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.figures.consistency import draw_distances, draw_examples, draw_prediction, draw_split
 from cavin_pyro.criticism.section import Picture, Section, Table
+from cavin_pyro.criticism.segment_plan import CLOSEST, GIVEN, OUTCOMES, SAMPLED
 from cavin_pyro.criticism.statistics.consistency import MOVING, measure
-from cavin_pyro.criticism.subgoal_rollout import (
-    CLOSEST,
-    GIVEN,
-    GOAL_DISTANCE,
-    OUTCOMES,
-    SAMPLED,
-    SubgoalRollout,
-    subgoal_rollouts,
-)
+from cavin_pyro.criticism.subgoal_rollout import GOAL_DISTANCE, SubgoalRollout, subgoal_rollouts
 from cavin_pyro.criticism.verdicts.verdict import FEW, GOOD, NONE, Verdict, grade
 from cavin_pyro.storage.progress import progress_bar
 from models.model import Model

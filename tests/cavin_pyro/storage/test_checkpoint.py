@@ -135,7 +135,7 @@ def test_a_module_that_the_user_trusts_may_be_named(
     config = small.config()
     config["prior"]["_target_"] = "parts_of_mine.OwnPrior"
     path = rewritten(checkpoint_file, tmp_path, config)
-    with pytest.raises(UserError, match=r"pass trust=\[parts_of_mine\]"):
+    with pytest.raises(UserError, match=r"pass 'trust=\[parts_of_mine\]'"):
         load_checkpoint(path)
     assert "parts_of_mine" not in sys.modules  # not even imported
     with pytest.raises(UserError, match=r'^trust must be a list of modules, \["parts_of_mine"\] in Python, not'):

@@ -16,16 +16,9 @@ from torch.distributions import Independent, Normal
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.checks.consistency import assess_consistency
 from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.segment_plan import SegmentPlan, code_selections, expected_distances, plan_segment
 from cavin_pyro.criticism.statistics.consistency import measure
-from cavin_pyro.criticism.subgoal_rollout import (
-    SegmentPlan,
-    SubgoalRollout,
-    code_selections,
-    expected_distances,
-    plan_segment,
-    sample_scene,
-    subgoal_rollouts,
-)
+from cavin_pyro.criticism.subgoal_rollout import SubgoalRollout, sample_scene, subgoal_rollouts
 from cavin_pyro.data.collection import CollectionConfig
 from envs.objects.sampling import ObjectRanges
 from envs.policy import HeuristicPushingPolicy
