@@ -12,10 +12,12 @@ hit     the tool's path passes within half of the object's half-width (across th
 graze   within all of it and the tool's radius
 miss    farther off, or the push ends before the object
 
-The floor has three parts. Hidden: the distance between an object's motion and its mean in --redraws replays of the
+The floor has four parts. Hidden: the distance between an object's motion and its mean in --redraws replays of the
 same push in a second world, from the same poses, with mass and friction drawn anew within their ranges (those that
 leave the object on the table). Place: the same for somebody who also sees where each object lies only to within
---place-error (standard deviation in x and in y), so that the replays begin around the place that he sees. Camera: the
+--place-error (standard deviation in x and in y), so that the replays begin around the place that he sees. Facets:
+as hidden, with cans and cups turned about their own axis by any angle: they are prisms with 16 and 10 sides, and no
+image of this resolution tells which of them the tool meets. Camera: the
 distance between the motion of the mean of the visible points and that of the body. `--picture FILE` draws all of it.
 `--policy model` has pushes that `--pusher CHECKPOINT` chooses, as in `collect policy=model`.
 `--objects 8 10` is for other numbers of objects than 1 to 5, and `--neighbours 4 9` predicts once with the nearest 4
@@ -37,6 +39,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pyro import poutine
+from scipy.spatial.transform import Rotation
 
 from cavin_pyro.config.commands.collection import POLICIES
 from cavin_pyro.config.commands.world import WorldConfig
@@ -46,6 +49,7 @@ from cavin_pyro.data.features import cloud_features
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.progress import progress_bar
+from envs.objects.asset import plain_name
 from envs.observation import Observation
 from envs.physics import Poses
 from envs.randomness import collection_streams
@@ -55,6 +59,7 @@ from envs.workspace import OBJECT_SLOTS, push_endpoints
 from models.state import State, Window, stack_steps
 
 T = 3  # pushes of a segment
+ROUND = ("tomato_soup_can", "tuna_fish_can", "a_cups")  # about their own z axis, but for their flat sides
 MOVED, STILL, PHANTOM = 0.01, 0.002, 0.02  # metres
 Table = dict[str, "Errors"]
 Replays = dict[int, NDArray[np.float64]]  # [redraws, objects, 3] motions in metres after 1 and T pushes; NaN if fallen
@@ -72,6 +77,7 @@ class Push:
     end: NDArray[np.float64]
     replayed: Replays  # from where the bodies were
     displaced: Replays  # from around where somebody saw them
+    turned: Replays  # with round objects turned about their axes
 
 
 @dataclass
@@ -98,13 +104,14 @@ def play(scene: Scene, twin: Scene, config: CollectionConfig, number: int, redra
         actions.append(action)
         there.append(scene.ground_truth())
         seen.append(scene.observe())
-    again, displaced = (
-        replays(scene, twin, config, there, actions, redraws, number, error) for error in (0.0, place_error)
+    again, displaced, turned = (
+        replays(scene, twin, config, there, actions, redraws, number, error, turning)
+        for error, turning in ((0.0, False), (place_error, False), (0.0, True))
     )
-    pushes = [
-        Push(seen[t], seen[t + 1], action, begun[t], there[t].positions, there[t + 1].positions, again[t], displaced[t])
-        for t, action in enumerate(actions)
-    ]
+    pushes = []
+    for t, action in enumerate(actions):
+        bodies = there[t].positions, there[t + 1].positions
+        pushes.append(Push(seen[t], seen[t + 1], action, begun[t], *bodies, again[t], displaced[t], turned[t]))
     return Episode([each.name for each in scene.objects], pushes)
 
 
@@ -117,11 +124,15 @@ def replays(
     redraws: int,
     number: int,
     place_error: float,
+    turning: bool,
 ) -> list[Replays]:
     """For every push: motions after 1 and, where there are as many, after T pushes.
 
     place_error: metres, of the place that is seen from the true one, and of the true one from that; 0 for the true one.
+    turning: whether round objects begin turned about their axes.
     """
+    angles = np.random.default_rng([config.seed, number, 2])
+    round_ones = [place for place, each in enumerate(scene.objects) if plain_name(each.name) in ROUND]
     generator, places = (np.random.default_rng([config.seed, number, *of]) for of in ((), (1,)))
     motions: list[dict[int, list[NDArray[np.float64]]]] = [defaultdict(list) for _ in actions]
     seen = [place_error * places.standard_normal((len(scene.objects), 2)) for _ in actions]
@@ -134,7 +145,11 @@ def replays(
         for t in range(len(actions)):
             start = there[t].positions.copy()
             start[:, :2] += seen[t] + place_error * places.standard_normal(seen[t].shape)
-            twin.world.restore(twin.bodies, Poses(start, there[t].orientations))
+            orientations = there[t].orientations.copy()
+            if turning and round_ones:
+                turns = Rotation.from_euler("z", angles.uniform(0.0, 2.0 * np.pi, len(round_ones)))
+                orientations[round_ones] = (Rotation.from_quat(orientations[round_ones]) * turns).as_quat()
+            twin.world.restore(twin.bodies, Poses(start, orientations))
             for ahead, action in enumerate(actions[t : t + T], start=1):
                 twin.push(action)
                 if ahead in (1, T):
@@ -199,8 +214,13 @@ def measure(episodes: Sequence[Episode], ahead: int, predicted: dict[str, list[N
             begun = all(push.begun for push in pushes)
             groups: tuple[str, ...] = (f"{len(episode.names)} object{'s' * (len(episode.names) > 1)}", name, best)
             groups += ("all pushes begun",) if begun else ()
+            groups += ("cans and cups",) if plain_name(name) in ROUND else ("other objects",)
             before, seen = first.before.centers[slot], last.after.centers[slot]
-            for floor, again in (("hidden", first.replayed), ("place", first.displaced)):
+            for floor, again in (
+                ("hidden", first.replayed),
+                ("place", first.displaced),
+                ("facets", first.turned),
+            ):
                 stayed = again[ahead][np.isfinite(again[ahead][:, slot, 2]), slot]
                 if len(stayed):
                     table[floor].add(groups, moved, float(np.linalg.norm(stayed.mean(0) - body)), begun)
@@ -280,7 +300,11 @@ def draw(tables: dict[int, Table], path: Path) -> None:
         for number, who in enumerate(table):
             means = [100 * float(np.mean(table[who].moved.get(group, [np.nan]))) for group in groups]
             width, (model, _, part) = 0.8 / len(table), who.partition(": ")
-            color = f"C{models.index(model)}" if part else {"hidden": "0.3", "place": "0.55", "camera": "0.8"}[who]
+            color = (
+                f"C{models.index(model)}"
+                if part
+                else {"hidden": "0.3", "place": "0.5", "facets": "0.65", "camera": "0.85"}[who]
+            )
             place = places + (number - (len(table) - 1) / 2) * width
             ax.bar(place, means, width, label=who, color=color, alpha=0.45 if part == "h" else 1.0)
         ax.set_xticks(places, [group.replace("_", " ") for group in groups], rotation=30, ha="right")

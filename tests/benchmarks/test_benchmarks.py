@@ -275,12 +275,14 @@ def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -
     for part in (one_push, three_pushes):
         (row,) = re.findall(r"^all +\d+ +(.*)$", part, re.M)
         means[part] = [float(cell.split(" / ")[0]) for cell in re.split(r" {2,}", row.strip())]
-    hidden, place, camera, f = means[one_push]
+    hidden, place, _, camera, f = means[one_push]
     assert 0.0 < max(hidden, camera) < f < 3.0  # centimetres
     assert place > hidden
-    assert means[three_pushes][3] > hidden
-    counts = re.findall(r"% \((\d+) of (\d+)\)", one_push)  # of hidden, place, camera and f; then by pushes begun alone
-    (said, still), (said_begun, still_begun) = ([int(one) for one in counts[number]] for number in (3, 7))
+    assert means[three_pushes][4] > hidden
+    known, turned = _floors("other objects", one_push)
+    assert known == turned  # boxes, the banana and the mug are not turned
+    counts = re.findall(r"% \((\d+) of (\d+)\)", one_push)  # of the four floors and f; then by pushes begun alone
+    (said, still), (said_begun, still_begun) = ([int(one) for one in counts[number]] for number in (4, 9))
     assert 0 < still_begun < still  # some of the heuristic's pushes touch down on an object
     assert said_begun <= said
     assert (tmp_path / "a.png").stat().st_size > 10_000
@@ -288,6 +290,20 @@ def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -
     assert "place" in blind
     hidden_again, place_again = re.search(r"^all +\d+ +(\S+) / \S+ +(\S+) /", blind, re.M).groups()  # type: ignore[union-attr]
     assert hidden_again == place_again  # who sees the places exactly knows as much
+
+
+def _floors(group: str, printed: str) -> tuple[str, str]:
+    """The cells of what is hidden, and of what is hidden with cans and cups turned."""
+    row = re.search(rf"^{group} +\d+ +(.*)$", printed, re.M)
+    assert row is not None
+    hidden, _, turned, *_ = re.split(r" {2,}", row[1].strip())
+    return hidden, turned
+
+
+def test_cans_and_cups_that_are_turned_end_elsewhere() -> None:
+    printed = run("accuracy", "mpc", "--episodes", "3", "--redraws", "2", "--seed", "10000", "--place-error", "0")
+    hidden, turned = _floors("cans and cups", printed)
+    assert hidden != turned
 
 
 def test_pushes_of_a_model_are_others_than_the_heuristics() -> None:
