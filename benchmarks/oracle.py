@@ -53,6 +53,11 @@ LINE_10 = ("f", "simulator")
 CRITERIA = {"paper": "published", "cavin": "strict"}  # by planner, unless overridden
 COLUMNS = ("outcome", "steps"), ("strict_outcome", "strict_steps")  # of an episode's row
 RESAMPLES = 10_000
+HEAD = (
+    "| task | objects | scenes | criterion | f: success | the simulator | f alone, the simulator alone "
+    "| pushes where both succeed: f and the simulator, means | ratio |",
+    f"|{9 * ' --- |'}",
+)
 Row = dict[str, Any]
 Job = tuple[tuple[str, ...], int, str, int]  # arguments of `episode`
 
@@ -165,35 +170,32 @@ def ratio(one: Sequence[float], other: Sequence[float]) -> tuple[float, float, f
     return float(pairs[0].mean() / pairs[1].mean()), float(low), float(high)
 
 
-def lines(rows: Sequence[Row], criterion: str) -> Iterator[str]:
-    """The results of scenes that were played both ways, by the criterion of the episodes.
+def table(rows: Sequence[Row], title: str, criterion: str) -> Iterator[str]:
+    """A row for each criterion, of the scenes that were played both ways; `title` fills its first cells.
 
     Episodes of `criterion=published` go on where the strict one ends, so they tell both.
     """
-    told = (
-        dict(zip(("published", "strict"), COLUMNS, strict=True))
-        if criterion == "published"
-        else {criterion: COLUMNS[0]}
-    )
+    told = {"published": COLUMNS[0], "strict": COLUMNS[1]} if criterion == "published" else {criterion: COLUMNS[0]}
     ways = [{row["seed"]: row for row in rows if row["line_10"] == way} for way in LINE_10]
     scenes = sorted(ways[0].keys() & ways[1].keys())
-    yield "criterion  line 10    success   rate  95 % interval    pushes, where both succeed"
     for name, (outcome, steps) in told.items():
         solved = [[way[seed][outcome] == "success" for seed in scenes] for way in ways]
         both = [seed for seed, *ends in zip(scenes, *solved, strict=True) if all(ends)]
         taken = [[way[seed][steps] for seed in both] for way in ways]
-        for way, ends, pushes in zip(LINE_10, solved, taken, strict=True):
-            rate = wilson(sum(ends), len(scenes))
-            interval = f"{rate['low']:.1%} to {rate['high']:.1%}"
-            mean = f"{np.mean(pushes):.1f} (median {np.median(pushes):.0f})" if both else "none"
-            yield f"{name:9s}  {way:9s}  {sum(ends):3d}/{len(scenes):<3d}  {rate['rate']:6.1%}  {interval:15s}  {mean}"
         alone = [sum(one and not other for one, other in zip(*pair, strict=True)) for pair in (solved, solved[::-1])]
-        of_pushes = "{:.2f} ({:.2f} to {:.2f})".format(*ratio(*taken)) if both else "unknown"
-        yield (
-            f"{name:9s}  f behind by {100 * (alone[1] - alone[0]) / len(scenes):.1f} points ({alone[1]} scenes "
-            f"that the simulator alone solves, {alone[0]} that f alone does, p = {mcnemar(*alone):.2g}); pushes of f "
-            f"over those of the simulator: {of_pushes}"
-        )
+        cells = [title, name, *map(success, solved), f"{alone[0]}, {alone[1]} (p = {mcnemar(*alone):.2g})"]
+        if both:
+            means = " and ".join(f"{np.mean(pushes):.1f} (median {np.median(pushes):.0f})" for pushes in taken)
+            cells += [means, "{:.2f} ({:.2f} to {:.2f})".format(*ratio(*taken))]
+        yield f"| {' | '.join(cells if both else [*cells, '-', '-'])} |"
+
+
+def success(ends: Sequence[bool]) -> str:
+    """A rate with its interval."""
+    rate = wilson(sum(ends), len(ends))
+    return (
+        f"{sum(ends)} of {len(ends)}: {100 * rate['rate']:.1f} % ({100 * rate['low']:.1f} to {100 * rate['high']:.1f})"
+    )
 
 
 def main() -> None:
@@ -229,10 +231,8 @@ def main() -> None:
             rows.append({**what, **row})
             print(json.dumps(rows[-1]), file=log, flush=True)
             bar.update()
-    print(
-        f"{arguments.task}, {arguments.objects} objects, planner={arguments.planner}, scenes {seeds[0]} to {seeds[-1]}"
-    )
-    print("\n".join(lines(rows, criterion)))
+    title = f"{arguments.task} | {arguments.objects} | {seeds[0]} to {seeds[-1]}"
+    print("\n".join([*HEAD, *table(rows, title, criterion)]))
 
 
 if __name__ == "__main__":

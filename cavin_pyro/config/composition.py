@@ -113,9 +113,13 @@ def presets_by_name(overrides: Sequence[str]) -> list[str]:
     for part in (word.partition("._target_=")[0] for word in overrides if re.match(_OWN_PART, word)):
         mine = re.compile(rf"\+{{0,2}}{re.escape(part.lstrip('+'))}\.([\w.]+)=(.*)", re.DOTALL)
         found = [(place, one) for place, word in enumerate(words) if (one := mine.fullmatch(word))]
-        section = ", ".join(f"{one[1]}: {one[2]}" for _, one in found)
         if found:
-            words[found[0][0]] = f"{part.lstrip('+')}={{{section}}}"
+            options = dict(one.groups() for _, one in found)
+            sections = [  # several for a sweep over classes
+                ", ".join(f"{name}: {value}" for name, value in {**options, "_target_": target}.items())
+                for target in options["_target_"].split(",")
+            ]
+            words[found[0][0]] = f"{part.lstrip('+')}=" + ",".join(f"{{{section}}}" for section in sections)
             words = [word for place, word in enumerate(words) if place not in {place for place, _ in found[1:]}]
     return words
 

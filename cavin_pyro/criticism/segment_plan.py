@@ -60,13 +60,10 @@ def plan_segment(
     without a push that touches down on an `observed` point, which moves with its object as f predicts. A model with
     one code has the motion given by the effect.
     """
-    model, (effect, motion) = context.model, selection
-    here, count = state.expand_plans(1), samples if effect == CHOSEN else 1
+    model, (effect, motion), here = context.model, selection, state.expand_plans(1)
     if "effect_code" not in context.codes:
-        return _closest_to_goal(model, state, goal, seed, count)
-    code = _effect_code(model, state, goal, seed, count)
-    subgoal = model.subgoal(here, code)
-    actions = _actions(context, state, code, seed, 1 if motion == SAMPLED else samples)
+        return _closest_to_goal(model, state, goal, seed, samples if effect == CHOSEN else 1)
+    subgoal, actions = sampled_motions(context, state, goal, selection, seed, samples)
     ends, path = predict_states(model, here, actions)
     if motion == EXPECTED:
         scores = -expected_distances(model, here, actions, subgoal, _generator([*seed, 4]), OUTCOMES).sum(-1)
@@ -83,6 +80,17 @@ def plan_segment(
     return SegmentPlan(
         actions[0, best].numpy(), subgoal.centers[0, 0].numpy(), ends.centers[0, best].numpy(), expected[0, 0].numpy()
     )
+
+
+@torch.inference_mode()
+def sampled_motions(
+    context: CheckContext, state: State, goal: Tensor, selection: tuple[str, str], seed: list[int], samples: int
+) -> tuple[State, Tensor]:
+    """The subgoal `[1, 1]` and the pushes `[1, N, T, 4]` that `plan_segment` chooses from, of a model with effects."""
+    effect, motion = selection
+    code = _effect_code(context.model, state, goal, seed, samples if effect == CHOSEN else 1)
+    subgoal = context.model.subgoal(state.expand_plans(1), code)
+    return subgoal, _actions(context, state, code, seed, 1 if motion == SAMPLED else samples)
 
 
 def _closest_to_goal(model: Model, state: State, goal: Tensor, seed: list[int], count: int) -> SegmentPlan:

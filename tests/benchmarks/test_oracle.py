@@ -85,20 +85,28 @@ def row(line_10: str, seed: int, outcome: str, steps: int) -> dict[str, Any]:
     return dict(zip(names, (line_10, seed, outcome, steps, outcome, steps), strict=True))
 
 
-def test_the_report_tells_by_how_much_f_is_behind(benchmark: Any) -> None:
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_table_tells_by_how_much_f_is_behind(benchmark: Any) -> None:
     """Of 20 scenes f fails in 4, and takes 12 pushes where the simulator takes 8."""
     rows = [row("f", seed, "timeout" if seed < 4 else "success", 12) for seed in range(20)]
     rows += [row("simulator", seed, "success", 8) for seed in range(20)]
     rows.append(row("f", 20, "success", 100))  # not played by the simulator yet
-    _, f, simulator, compared = benchmark.lines(rows, "strict")
-    assert f.split()[:4] == ["strict", "f", "16/20", "80.0%"] and simulator.split()[2:4] == ["20/20", "100.0%"]
-    assert (
-        "f behind by 20.0 points (4 scenes that the simulator alone solves, 0 that f alone does, p = 0.12)" in compared
-    )
-    assert compared.endswith("pushes of f over those of the simulator: 1.50 (1.50 to 1.50)")
+    (line,) = benchmark.table(rows, "crossing | 3 | 0 to 20", "strict")
+    f, simulator, alone, pushes, ratio = cells(line)[4:]
+    assert len(cells(line)) == len(cells(benchmark.HEAD[0]))
+    assert f.startswith("16 of 20: 80.0 %") and simulator.startswith("20 of 20: 100.0 %")
+    assert alone == "0, 4 (p = 0.12)" and pushes == "12.0 (median 12) and 8.0 (median 8)"
+    assert ratio == "1.50 (1.50 to 1.50)"
     exchanged = [{**one, "line_10": {"f": "simulator", "simulator": "f"}[one["line_10"]]} for one in rows]
-    assert "f behind by -20.0 points (0 scenes" in list(benchmark.lines(exchanged, "strict"))[-1]
-    assert len(list(benchmark.lines(rows, "published"))) == 7  # episodes that tell both criteria
+    (line,) = benchmark.table(exchanged, "crossing | 3 | 0 to 20", "strict")
+    assert cells(line)[6] == "4, 0 (p = 0.12)" and cells(line)[8] == "0.67 (0.67 to 0.67)"
+    published, strict = benchmark.table(rows, "crossing | 3 | 0 to 20", "published")  # episodes that tell both
+    assert cells(published)[4:] == cells(strict)[4:]
+    (line,) = benchmark.table([{**one, "outcome": "timeout"} for one in rows], "crossing | 3 | 0 to 20", "strict")
+    assert cells(line)[7:] == ["-", "-"]
 
 
 def test_the_interval_of_a_ratio_covers_the_truth_and_not_more(benchmark: Any) -> None:
@@ -122,7 +130,7 @@ def test_a_second_run_goes_on_after_the_episodes_of_a_log(tmp_path: Path) -> Non
         file.write('{"line_10": "f", "se')  # cut off
         file.write("\n")
     printed = run(2)
-    assert re.search(r"^strict +simulator +\d/2 ", printed, re.MULTILINE)
+    assert re.search(r"^\| crossing \| 2 \| 3 to 4 \| strict \| \d of 2: ", printed, re.MULTILINE)
     first = log.read_text().splitlines()
     assert len(first) == 2 + 1 + 2 and [json.loads(line)["seed"] for line in first[:2]] == [3, 3]
     assert run(2) == printed and log.read_text().splitlines() == first  # nothing is left to play

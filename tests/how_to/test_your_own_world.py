@@ -135,6 +135,8 @@ def test_a_dataset_remembers_the_classes_and_refuses_others(folder: Path) -> Non
 def test_the_class_of_a_part_becomes_its_section() -> None:
     words = ["env.camera._target_=my_lab.Mine", "seed=3", "+env.camera.noise=0.1", "++env.camera.names=[a,b]"]
     assert presets_by_name(words) == ["env.camera={_target_: my_lab.Mine, noise: 0.1, names: [a,b]}", "seed=3"]
+    swept = ["env.robot.speed=2", "env.robot._target_=my_lab.One,my_lab.Other"]
+    assert presets_by_name(swept) == ["env.robot={speed: 2, _target_: my_lab.One},{speed: 2, _target_: my_lab.Other}"]
     assert presets_by_name(["env.camera=kinect2", "env.robot=stick"]) == ["env.camera=kinect2", "env.robot=stick"]
     config = compose("evaluate", *words, "env.objects._target_=my_lab.Others")
     assert config.env.camera == {"_target_": "my_lab.Mine", "noise": 0.1, "names": ["a", "b"]}
