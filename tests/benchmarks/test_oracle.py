@@ -72,7 +72,7 @@ def test_the_motion_with_the_best_outcome_is_chosen_unless_it_fails(benchmark: A
         oracle = SimpleNamespace(candidates=candidates, path=path)
         scores, later = ends.unsqueeze(0), torch.zeros(1, 4)
         rules = PerturbedRollouts(failure_cost=failure_cost)
-        return int(benchmark.Oracle.choose(oracle, rules, motions, scores, later, None, reward, subgoals, 0.0).number)
+        return int(benchmark.Oracle.choose(oracle, rules, motions, scores, later, None, reward, subgoals, 0.0).index)
 
     assert chosen(4, failing=-1) == 2
     assert chosen(4, failing=2) == 1
@@ -136,3 +136,19 @@ def test_a_second_run_goes_on_after_the_episodes_of_a_log(tmp_path: Path) -> Non
     assert run(2) == printed and log.read_text().splitlines() == first  # nothing is left to play
     run(1, "planner.nearest_objects=1")  # another question: its episodes are its own
     assert len(log.read_text().splitlines()) == 7
+
+
+def test_the_page_has_the_rows_of_the_stored_episodes(benchmark: Any) -> None:
+    folder = ROOT / "docs" / "measurements"
+    stored = [json.loads(line) for line in (folder / "oracle.jsonl").read_text().splitlines()]
+    page = (folder / "success.md").read_text()
+    told = page.partition("### The simulator in the place of f")[2].partition("\n## ")[0]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in stored:
+        _, task, objects, *_ = (option.partition("=")[2] for option in row["options"])
+        groups.setdefault((task, objects), []).append(row)
+    for (task, objects), rows in groups.items():
+        seeds = {row["seed"] for row in rows}
+        (line,) = benchmark.table(rows, f"{task} | {objects} | {min(seeds)} to {max(seeds)}", "strict")
+        assert line in told and len(rows) == 2 * len(seeds) == 2 * (max(seeds) - min(seeds) + 1)
+    assert told.count("| strict |") == len(groups)
