@@ -103,17 +103,17 @@ def problems(task: str, objects: int, episodes: int, pushes: int) -> list[Planni
 
 
 def true_costs(problem: PlanningProblem, truth: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The best motions' numbers, mean costs in square metres and shares of failures, each `[64]`."""
+    """The best motions' indices, mean costs in square metres and shares of failures, each `[64]`."""
     robustness, model, reward, state, goal, scores, actions, later, *_ = problem.given
-    numbers = scores[0].topk(MOTIONS).indices
+    indices = scores[0].topk(MOTIONS).indices
     parts = [
         perturbed_rollouts(
-            robustness, model, reward, state, goal, actions[:, numbers], 16, [torch.Generator().manual_seed(seed)]
+            robustness, model, reward, state, goal, actions[:, indices], 16, [torch.Generator().manual_seed(seed)]
         )
         for seed in range(truth // 16)
     ]
     distance, failed = (torch.cat(part, -1)[0].float().mean(-1) for part in zip(*parts, strict=True))
-    return numbers, distance + robustness.failure_cost * failed + later[0, numbers], failed
+    return indices, distance + robustness.failure_cost * failed + later[0, indices], failed
 
 
 def main() -> None:
@@ -134,7 +134,7 @@ def main() -> None:
     failures: dict[Allocation, list[float]] = {allocation: [] for allocation in ALLOCATIONS}
     with torch.inference_mode():
         for problem in chosen:
-            numbers, costs, failed = true_costs(problem, arguments.truth)
+            indices, costs, failed = true_costs(problem, arguments.truth)
             for allocation in ALLOCATIONS:
                 fields = allocation._asdict()
                 independent = fields.pop("independent")
@@ -142,8 +142,8 @@ def main() -> None:
                 for seed in range(REPETITIONS):
                     given = (options, *problem.given[1:-1], [torch.Generator().manual_seed(1000 + seed)])
                     with noise_of_each_motion(independent, seed):
-                        taken = sequential_halving(*given, **problem.options).number
-                    place = int((numbers == taken).nonzero())
+                        taken = sequential_halving(*given, **problem.options).candidate
+                    place = int((indices == taken).nonzero())
                     regret[allocation].append(float(costs[place] - costs.min()))
                     failures[allocation].append(float(failed[place]))
     print(f"{len(chosen)} of {len(asked)} plans")

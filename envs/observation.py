@@ -24,7 +24,7 @@ class Observation:
         clouds: [M, 256, 3] metres in the robot's base frame. centers: [M, 3] metres, the mean of all points that the
             camera sees of each object, of which a cloud has a sample.
         mask: [M] bool, True for objects observed at least once.
-        visible: [M] bool, True for objects in this image; a hidden object keeps its latest cloud.
+        visible: [M] bool, True for objects in this image; an occluded object keeps its latest cloud.
     """
 
     clouds: NDArray[np.float32]

@@ -18,9 +18,9 @@ from envs.objects.object_sets import ObjectSet, load_object_set
 from envs.objects.sampling import Area, ObjectRanges
 from envs.observation import Observation
 from envs.randomness import goal_stream, layout_stream, next_scene_stream
-from envs.robots import RobotMaker
+from envs.robots import RobotFactory
 from envs.scene import Scene
-from envs.segmentation import SegmenterMaker
+from envs.segmentation import SegmenterFactory
 from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
 from envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
@@ -56,7 +56,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward: dense or sparse. criterion: what ends an episode as a violation, see `envs.tasks.TaskReward`. Scenes and
             observations do not depend on it.
         objects: how many, 1 to 10. ranges: object parameters.
-        robot: one of `envs.robots.ROBOTS`, or a maker of robots.
+        robot: one of `envs.robots.ROBOTS`, or a factory of robots.
         object_set: a key of `envs.objects.object_sets.OBJECT_SETS`, or a set.
         camera, segmentation: see `envs.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
@@ -85,10 +85,10 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         assets: str | Path | None = None,
         maximum_steps: int = EPISODE_STEPS,
         camera: str | Camera | DepthSensor = "ideal",
-        segmentation: str | SegmenterMaker = "mask",
+        segmentation: str | SegmenterFactory = "mask",
         render_mode: str | None = None,
         show_tiles: bool = True,
-        robot: str | RobotMaker = "stick",
+        robot: str | RobotFactory = "stick",
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
             raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")

@@ -23,8 +23,8 @@ from envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRan
 from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from envs.physics import PhysicsWorld, Poses
 from envs.randomness import next_sample_streams, sensor_stream
-from envs.robots import RobotMaker, Stopped, push, robot_maker, settle
-from envs.segmentation import Pixels, SegmenterMaker, segmenter_of
+from envs.robots import RobotFactory, Stopped, push, robot_factory, settle
+from envs.segmentation import Pixels, SegmenterFactory, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.sensors.camera import Camera
 from envs.workspace import OBJECT_SLOTS, push_endpoints
@@ -66,10 +66,10 @@ class Scene:
 
     Args:
         camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
-        segmentation: a name in `envs.segmentation.SEGMENTERS`, or a maker of segmenters.
+        segmentation: a name in `envs.segmentation.SEGMENTERS`, or a factory of segmenters.
         object_set: the set of the objects' names, by default the builtin shapes.
         on_frame: called a few times during every push, to film it.
-        robot: one of `envs.robots.ROBOTS`, or a maker of robots. assets: folder of the files that some robots need.
+        robot: one of `envs.robots.ROBOTS`, or a factory of robots. assets: folder of the files that some robots need.
         slots: M, the objects that observations have room for.
 
     Raises:
@@ -80,10 +80,10 @@ class Scene:
         self,
         *,
         camera: str | Camera | DepthSensor = "ideal",
-        segmentation: str | SegmenterMaker = "mask",
+        segmentation: str | SegmenterFactory = "mask",
         object_set: ObjectSet | None = None,
         on_frame: FrameHook | None = None,
-        robot: str | RobotMaker = "stick",
+        robot: str | RobotFactory = "stick",
         assets: str | Path | None = None,
         slots: int = OBJECT_SLOTS,
     ) -> None:
@@ -91,7 +91,7 @@ class Scene:
         self.segmenter = segmenter_of(segmentation, self.true_masks, slots)
         self.slots = slots
         self.object_set = object_set or BuiltinObjects()
-        self._make_robot = robot_maker(robot, assets)
+        self._make_robot = robot_factory(robot, assets)
         self.on_frame = on_frame
         self.world = PhysicsWorld()
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
@@ -222,7 +222,7 @@ class Scene:
         return [self._body_image == body for body in self.bodies]
 
     def point_at_target(self, image: DepthImage) -> tuple[int, int] | None:
-        """A pixel (row, column) on the target, as a person points it out before an episode; None if it is hidden."""
+        """A pixel (row, column) on the target, as a person points it out before an episode; None if it is occluded."""
         rows, columns = np.nonzero(self.true_masks()[0] & (image.depth > 0.0))
         if len(rows) < MINIMUM_PIXELS:
             return None

@@ -27,9 +27,13 @@ class AutomaticGuide(Guide):
     amortized = False
 
     def __init__(self, model: Model, *, autoguide: Callable[[Model], nn.Module]) -> None:
-        """`autoguide`: a class of `pyro.infer.autoguide`, or one of your own that takes the model.
+        """Pyro's guide of the model.
 
-        Raises `ValueError` for an incompatible model, or a class that is no module.
+        Args:
+            autoguide: a class of `pyro.infer.autoguide`, or one of your own that takes the model.
+
+        Raises:
+            ValueError: an incompatible model, or a class that is no module.
         """
         super().__init__(model)
         self.automatic = autoguide(model)

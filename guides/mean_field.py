@@ -22,9 +22,14 @@ class MeanFieldGuide(Guide):
     fits = ("cascaded",)
 
     def __init__(self, model: CascadedModel, *, width: int = 64) -> None:
-        """`width` is that of the guide's own layers; all other dimensions are the model's.
+        """The inference networks.
 
-        Raises `ValueError` for an incompatible model.
+        Args:
+            model: whose codes the guide infers, and whose other dimensions it has.
+            width: width of the guide's own layers.
+
+        Raises:
+            ValueError: an incompatible model.
         """
         super().__init__(model)
         self.effect_inference = effect_inference(model, width=width)

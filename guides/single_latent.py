@@ -24,9 +24,15 @@ class SingleLatentGuide(Guide):
     fits = ("single_latent",)
 
     def __init__(self, model: SingleLatentModel, *, width: int = 64, reads_actions: bool = False) -> None:
-        """`width` is that of the guide's own layers; all other dimensions are the model's.
+        """The inference network.
 
-        Raises `ValueError` for an incompatible model.
+        Args:
+            model: whose code the guide infers, and whose other dimensions it has.
+            width: width of the guide's own layers.
+            reads_actions: whether the code is inferred from the actions as well, q(c | s, s', a).
+
+        Raises:
+            ValueError: an incompatible model.
         """
         super().__init__(model)
         self.effect_inference = effect_inference(model, width=width, reads_actions=reads_actions)

@@ -43,7 +43,15 @@ class CascadedModel(Model):
         motion_prior: Prior | None = None,
         **shared: Any,
     ) -> None:
-        """`shared`: the arguments of `Model`."""
+        """The networks of the cascade.
+
+        Args:
+            effect_dimension: C, numbers of an effect code.
+            motion_dimension: Z, numbers of a motion code.
+            effect_prior: p(c | s); by default N(0, I).
+            motion_prior: p(z | s, c); by default N(0, I).
+            shared: the arguments of `Model`.
+        """
         super().__init__(**shared)
         self.effect_dimension = effect_dimension
         self.motion_dimension = motion_dimension

@@ -37,7 +37,13 @@ class FlatModel(Model):
         motion_prior: Prior | None = None,
         **shared: Any,
     ) -> None:
-        """`shared`: the arguments of `Model`."""
+        """The networks of the cascade without h and the layers that read c.
+
+        Args:
+            motion_dimension: Z, numbers of a motion code.
+            motion_prior: p(z | s); by default N(0, I).
+            shared: the arguments of `Model`.
+        """
         super().__init__(**shared)
         self.motion_dimension = motion_dimension
         self.trunk = EffectTrunk(None, width=self.width, encoder_width=self.width)

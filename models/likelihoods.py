@@ -16,12 +16,18 @@ from models.state import State
 
 
 class Scales:
-    """Base class of likelihood scales: the likelihoods around the networks' means, from four standard deviations."""
+    """Base class of likelihood scales: the likelihoods around the networks' means, from four standard deviations.
 
-    center: float | Tensor  # metres
-    feature: float | Tensor  # of a vector of unit length
-    start: float | Tensor  # normalised
-    motion: float | Tensor  # normalised
+    center: standard deviation of an object's centre, in metres.
+    feature: standard deviation of each number of a geometric feature, whose length is 1.
+    start: standard deviation of a push's start, in normalised units (1 is half the reachable box).
+    motion: standard deviation of a push's motion, in normalised units (1 is the longest push along an axis).
+    """
+
+    center: float | Tensor
+    feature: float | Tensor
+    start: float | Tensor
+    motion: float | Tensor
 
     def centers(
         self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
@@ -48,7 +54,7 @@ class Scales:
         return IsotropicNormal(mean, self.feature)
 
     def planar_errors(self, uniform: Tensor, predicted: Tensor | None = None) -> Tensor:
-        """Errors of centres in x and y, metres, as of `centers`: the sample that `uniform: [..., M, 2]` determines.
+        """Errors of centres in x and y, metres, as in `centers`: the sample that `uniform: [..., M, 2]` determines.
 
         `predicted: [..., M]`, scales of centres. Of two numbers in [0, 1), the first is the probability of a smaller
         error, the second tells its direction (Box and Muller 1958; for Student's t, Bailey 1994).
@@ -71,7 +77,10 @@ class Scales:
 
 @dataclass(frozen=True)
 class LikelihoodScales(Scales):
-    """Fixed standard deviations, instead of loss weights (the paper's choice and the default)."""
+    """Fixed standard deviations, instead of loss weights (the paper's choice and the default).
+
+    For their units see `Scales`.
+    """
 
     center: float = 0.01  # metres
     feature: float = 0.1  # of a vector of unit length
@@ -89,10 +98,13 @@ class PredictedScales(LikelihoodScales):
     """Scales of f that depend on state and push, predicted by its network, with heavy tails; fixed ones for h and g.
 
     f's likelihoods are Student's t around its means: most outcomes are nearly certain, and some objects topple or roll.
+
+    degrees_of_freedom: of Student's t; fewer give heavier tails.
+    height_ratio: scale of a centre's height over that of its place on the table.
     """
 
     degrees_of_freedom: float = 3.0
-    height_ratio: float = 1.0  # scale of a centre's height over that of its place on the table
+    height_ratio: float = 1.0
 
     def _around_centers(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
         if predicted is None:
@@ -112,7 +124,7 @@ class PredictedScales(LikelihoodScales):
 
 
 class LearnedScales(Scales, nn.Module):
-    """Learned standard deviations, shared by f and h, and by all windows."""
+    """Learned standard deviations, shared by f and h, and by all windows. For their units see `Scales`."""
 
     def __init__(
         self, *, center: float = 0.01, feature: float = 0.1, start: float = 0.077, motion: float = 0.245

@@ -60,13 +60,20 @@ class Model(Program):
         scales: Scales | None = None,
         dynamics: PushOutcome | None = None,
     ) -> None:
-        """T; feature dimension per object; width of all layers; objects in a scene of the training, at
-        most; how many others enter a relation; the likelihoods' scales; f.
+        """The dimensions and parts that all models share.
 
-        A scene may have more than `maximum_objects`. `neighbours`: the nearest others that enter each sum over other
-        objects; None takes `maximum_objects - 1`, which are all others in the scenes of the training, as in the paper.
+        Args:
+            segment_length: T, pushes of a segment.
+            feature_dimension: F, numbers of an object's geometric feature.
+            width: width of all layers.
+            maximum_objects: most objects in a scene of the training; other scenes may have more.
+            neighbours: how many other objects, the nearest, enter each sum over other objects; None takes
+                `maximum_objects - 1`, which are all others in the scenes of the training, as in the paper.
+            scales: of the likelihoods; by default `LikelihoodScales()`.
+            dynamics: f; by default the paper's, `Dynamics`.
 
-        Raises `ValueError` for scales that f must predict if it does not.
+        Raises:
+            ValueError: scales that f must predict if it does not.
         """
         super().__init__()
         self.segment_length = segment_length

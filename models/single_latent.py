@@ -42,11 +42,18 @@ class SingleLatentModel(Model):
         action_weight: float = 1.0,
         **shared: Any,
     ) -> None:
-        """`shared`: the arguments of `Model`.
+        """The networks of the cascade without the layers that read z.
 
-        `action_weight` balances the two reconstructions, which the paper tunes with care (section 4.2): up to a
-        constant, a weight w divides the standard deviations of the pushes by sqrt(w). The objective is a bound on the
-        evidence only with 1. Raises `ValueError` unless it is above 0.
+        Args:
+            effect_dimension: C, numbers of an effect code.
+            effect_prior: p(c | s); by default N(0, I).
+            action_weight: factor on the log-density of the pushes, which balances the two reconstructions. The paper
+                tunes it with care (section 4.2): up to a constant, a weight w divides the standard deviations of the
+                pushes by sqrt(w). The objective is a bound on the evidence only with 1.
+            shared: the arguments of `Model`.
+
+        Raises:
+            ValueError: an `action_weight` that is not a positive number.
         """
         if not 0 < action_weight < math.inf:
             raise ValueError(f"action_weight must be a positive number, not {action_weight}")

@@ -31,7 +31,7 @@ from planning.rollouts.segment import Objective, SegmentRollout, actions_of, sel
 from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
-# Motions are sampled for one effect, and most bring it about.
+# Motions are all sampled for one effect, so few candidates suffice.
 FEW_CANDIDATES = PerturbedRollouts(candidates=64, rounds=2, reduction_factor=8)
 
 

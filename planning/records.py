@@ -23,13 +23,13 @@ def apply(record: Record, function: Callable[[Any], Any]) -> Record:
     return applied(record)
 
 
-def take(record: Record, numbers: Tensor) -> Record:
-    """Take plans by number, per environment: fields `[B, N, ...]`, `numbers: [B, n]` int64 -> `[B, n, ...]`."""
-    environments = torch.arange(len(numbers), device=numbers.device).unsqueeze(-1)
+def take(record: Record, indices: Tensor) -> Record:
+    """Take plans by index, per environment: fields `[B, N, ...]`, `indices: [B, n]` int64 -> `[B, n, ...]`."""
+    environments = torch.arange(len(indices), device=indices.device).unsqueeze(-1)
 
-    def chosen(field: Tensor) -> Tensor:  # one row at a time: faster than field[environments, numbers]
-        rows = (numbers + environments * field.shape[1]).flatten()
-        return field.flatten(0, 1).index_select(0, rows).unflatten(0, numbers.shape)
+    def chosen(field: Tensor) -> Tensor:  # one row at a time: faster than field[environments, indices]
+        rows = (indices + environments * field.shape[1]).flatten()
+        return field.flatten(0, 1).index_select(0, rows).unflatten(0, indices.shape)
 
     return apply(record, chosen)
 

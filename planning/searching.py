@@ -42,7 +42,25 @@ GRAPHS = "cuda_graphs"  # value of `compile`: for models on a GPU
 class SearchingPlanner:
     """Searches N = `samples` plans of K = `horizon` / T segments for the highest cumulative reward.
 
-    See `planning.cavin.CavinPlanner` for the options.
+    The options, of which `planning.cavin.CavinPlanner` says more:
+
+    samples: N, plans to compare.
+    horizon: H steps, a multiple of the model's T.
+    optimizer: searches the plans: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
+        `planning.optimizers.Optimizer`.
+    reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment.
+    stride_limits: two distances in metres; a segment that moves every object less than the first, or any object more
+        than the second, ends the plan like a violation; None in the paper.
+    warm_start: the last plan's noise is among the candidates of `shooting`, `evolution` and `smc` (our addition).
+    robustness: ranks the best plans by perturbed rollouts (our addition); None in the paper.
+    idle_distance: metres; pushes that, according to f, move no object by this distance come last (our addition); 0 in
+        the paper.
+    touchdown_distance: metres; plans whose first push starts nearer to a point that the camera sees are left out (our
+        addition); 0 in the paper.
+    guidance: `layout` prefers, among plans that miss the goal, those that leave the shortest way to it along allowed
+        places (our addition); `none` in the paper.
+    compile: true runs the inner functions as native code, which takes minutes once and is cached on disk; `auto` loads
+        what is cached and runs the rest eagerly; `cuda_graphs` captures them on the GPU where the model is.
     """
 
     requires: ClassVar[ModelRequirements]  # of the planner on its model
@@ -119,10 +137,18 @@ class SearchingPlanner:
         warm_start: Tensor | None = None,
         best_only: bool = False,
     ) -> Candidates:
-        """All candidates `[B, N]` that the optimizer evaluates, by default `self.optimizer`.
+        """All candidates `[B, N]` that the optimizer evaluates.
 
-        segments, samples: by default K and N. warm_start, best_only: see `planning.rollouts.candidates.SearchProblem`.
-        Raises ValueError if codes must be reparameterised and their prior cannot be.
+        Args:
+            space: extends candidates by a segment, from D numbers of noise. objective: ranks them.
+            state: `[B]`, observed scenes. generators: one per scene.
+            optimizer: by default `self.optimizer`.
+            segments: of a candidate, by default K. samples: number of candidates, by default N.
+            warm_start: `[B, h, K, D]`, noise of promising candidates, from the last plan.
+            best_only: whether the caller reads only the best candidate.
+
+        Raises:
+            ValueError: codes must be reparameterised and their prior cannot be.
         """
         problem = SearchProblem(
             space,
@@ -174,7 +200,7 @@ def summary(
 ) -> dict[str, Any]:
     """The fields of a `Plan` about its search, from `segments` to `success_predictors`.
 
-    candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, number of the chosen one.
+    candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, index of the chosen one.
     distance_to_goal: that guided the search. failures: `[B]` share of the chosen motion's perturbed rollouts that fail.
     """
     progress = candidates.score_state

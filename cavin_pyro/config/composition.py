@@ -114,7 +114,7 @@ def presets_by_name(overrides: Sequence[str]) -> list[str]:
         mine = re.compile(rf"\+{{0,2}}{re.escape(part.lstrip('+'))}\.([\w.]+)=(.*)", re.DOTALL)
         found = [(place, one) for place, word in enumerate(words) if (one := mine.fullmatch(word))]
         if found:
-            options = dict(one.groups() for _, one in found)
+            options = {one[1]: one[2] for _, one in found}
             sections = [  # several for a sweep over classes
                 ", ".join(f"{name}: {value}" for name, value in {**options, "_target_": target}.items())
                 for target in options["_target_"].split(",")

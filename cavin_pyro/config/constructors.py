@@ -47,17 +47,17 @@ def constructor_options(target: str) -> dict[str, inspect.Parameter]:
         found = get_object(target)
     except Exception:  # a user's module may raise anything; building the part says it in one line
         return {}
-    makers = (
+    constructors = (
         [vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)]
         if inspect.isclass(found)
         else [found]
     )
     options: dict[str, inspect.Parameter] = {}
-    for maker in makers:
-        if not inspect.isfunction(maker) or maker.__module__.partition(".")[0] not in OWN_PACKAGES:
+    for constructor in constructors:
+        if not inspect.isfunction(constructor) or constructor.__module__.partition(".")[0] not in OWN_PACKAGES:
             break
-        hints, handed_on = _hints(maker), False
-        for name, one in inspect.signature(maker).parameters.items():
+        hints, handed_on = _hints(constructor), False
+        for name, one in inspect.signature(constructor).parameters.items():
             handed_on |= one.kind is inspect.Parameter.VAR_KEYWORD
             if one.kind in (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY) and name != "self":
                 options.setdefault(name, one.replace(annotation=hints.get(name, Any)))
@@ -122,9 +122,9 @@ def _declared(config: Mapping[str, Any]) -> Iterator[tuple[str, Any, inspect.Par
                 yield name, config[name], one
 
 
-def _hints(maker: Any) -> dict[str, Any]:
+def _hints(constructor: Any) -> dict[str, Any]:
     try:
-        return get_type_hints(maker)
+        return get_type_hints(constructor)
     except NameError:  # of a type that is imported for checkers only
         plain = {one.__name__: one for one in PLAIN}
-        return {name: plain[text] for name, text in maker.__annotations__.items() if text in plain}
+        return {name: plain[text] for name, text in constructor.__annotations__.items() if text in plain}

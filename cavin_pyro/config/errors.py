@@ -55,7 +55,7 @@ def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:
 class Parser(argparse.ArgumentParser):
     """Reads a command line, of which a wrong one is a `UserError`.
 
-    hint: what to do about a wrong one; by default the usage, as of `assets ycb --to DIR`.
+    hint: what to do about a wrong one; by default the usage, as in `assets ycb --to DIR`.
     """
 
     def __init__(self, *arguments: Any, hint: str | None = None, **options: Any) -> None:

@@ -53,9 +53,10 @@ HEADINGS = {  # of the groups, in the order of the page
     "objects": "Objects",
     "run": "Run",
 }
-# "name: what it means" or "one, other: what both mean", up to the next of its kind.
 FACTS_OF_PRESETS = ("model_free", "default_checkpoint")  # which a preset tells the program, and users need not set
-MEANING = r"(?:(?<=\s)|^)([a-z_]+(?:, [a-z_]+)*): (.+?)(?=\s[a-z_, ]+: |\n\n|$)"
+# "name: what it means" or "one, other: what both mean", up to the next of its kind; names may be in backticks.
+NAMES = r"`?[a-z_]+`?(?:, `?[a-z_]+`?)*"
+MEANING = rf"(?:(?<=\s)|^)({NAMES}): (.+?)(?=\s{NAMES}: |\n\n|$)"
 FLAGS = """
 -m                       one run for each value: -m seed=0,1,2 (Hydra's launchers: hydra/launcher=...)
 --cfg job                print the configuration, run nothing
@@ -113,35 +114,55 @@ def presets(group: str) -> list[str]:
     return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
 
-def _part_entries(prefix: str, section: Any) -> Iterator[tuple[str, str]]:
-    """The options of a part and of the parts in it, with what its class says of each."""
-    meanings = _meanings(section.get("_target_"))
+def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tuple[str, str]]:
+    """The options of a part and of the parts in it, with what its class says of each.
+
+    Args:
+        meaning: of the section, for the entries of one without a class.
+    """
+    found = _found(section.get("_target_"))
+    meanings, kind = _meanings(found), "function" if inspect.isfunction(found) else "class"
     for name, value in section.items():
+        said = meanings.get(name, meaning)
         if isinstance(value, dict):
-            yield from _part_entries(f"{prefix}.{name}", value)
-        elif name == "_target_" and value is not None:
-            yield f"{prefix}._target_={value}", "the class; name one of your own to take its place"
-        elif name not in FACTS_OF_PRESETS:
-            yield f"{prefix}.{name}={_text(value)}", meanings.get(name, "")
+            yield from _part_entries(f"{prefix}.{name}", value, said)
+        elif name == "_target_":
+            default = f"null takes that of {prefix.rpartition('.')[2]}=; " if value is None else ""
+            yield f"{prefix}._target_={_text(value)}", f"the {kind}; {default}name one of your own to take its place"
+        elif name not in FACTS_OF_PRESETS and not name.startswith("_"):  # such as Hydra's _partial_
+            yield f"{prefix}.{name}={_text(value)}", said
 
 
-def _meanings(target: str | None) -> Mapping[str, str]:
-    """What the docstrings of a class and of its parents say of its arguments, a sentence each."""
-    if target is None:
-        return {}
+def _found(target: str | None) -> Any:
+    """The class or function at a dotted path, None if there is none."""
     try:
-        found = get_object(target)
+        return target and get_object(target)
     except Exception:  # a user's module may raise anything; building the part says it in one line
-        return {}
-    texts = [vars(one).get("__doc__") or "" for one in getattr(found, "__mro__", [found])]
+        return None
+
+
+def _meanings(found: Any) -> Mapping[str, str]:
+    """What the docstrings of a class, its parents and their constructors, or of a function, say of each argument.
+
+    Returns:
+        A sentence by the argument's name.
+    """
     meanings: dict[str, str] = {}
-    for text in map(inspect.cleandoc, filter(None, texts)):
+    for text in map(inspect.cleandoc, _docstrings(found)):
         for names, said in re.findall(MEANING, text, re.S):
             sentence = re.split(r"(?<=[^.])\.(?:\s|$)", " ".join(said.split()))[0]
             sentence = re.sub(r"\bNone\b", "null", sentence)  # as the command line writes it
-            for name in names.split(", "):
+            for name in names.replace("`", "").split(", "):
                 meanings.setdefault(name, sentence)
     return meanings
+
+
+def _docstrings(found: Any) -> list[str]:
+    """Those of a function, or of a class and each of its parents with their constructors."""
+    described = [found]
+    if inspect.isclass(found):
+        described = [part for one in found.__mro__ for part in (one, vars(one).get("__init__")) if part is not None]
+    return [one.__doc__ for one in described if one.__doc__]
 
 
 def _text(value: Any) -> str:

@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import construct, naming
 from envs.objects.object_sets import ObjectSet, load_object_set
-from envs.robots import Robot, RobotMaker, robot_maker
-from envs.segmentation import Segmenter, SegmenterMaker
+from envs.robots import Robot, RobotFactory, robot_factory
+from envs.segmentation import Segmenter, SegmenterFactory
 from envs.sensors import DepthSensor
 
 Named = str | Mapping[str, Any] | DictConfig
@@ -30,13 +30,13 @@ def own_class(value: Named) -> str:
     return value if isinstance(value, str) else str(value.get("_target_"))
 
 
-def robot_of(value: Named, assets: str | Path | None = None) -> RobotMaker:
-    """The maker of the robot `env.robot`; a class of the user's gets the world (`envs.physics.PhysicsWorld`).
+def robot_of(value: Named, assets: str | Path | None = None) -> RobotFactory:
+    """The factory of the robot `env.robot`; a class of the user's gets the world (`envs.physics.PhysicsWorld`).
 
     Raises:
-        ValueError: as `envs.robots.robot_maker`.
+        ValueError: as `envs.robots.robot_factory`.
     """
-    return robot_maker(_checked(value, "robot", Robot), assets)
+    return robot_factory(_checked(value, "robot", Robot), assets)
 
 
 def camera_of(value: Named) -> str | DepthSensor:
@@ -49,8 +49,8 @@ def camera_of(value: Named) -> str | DepthSensor:
     return made if isinstance(made, str) else made()
 
 
-def segmentation_of(value: Named) -> str | SegmenterMaker:
-    """The maker of segmenters `env.segmentation`, or a name; a class of the user's gets M, the most objects."""
+def segmentation_of(value: Named) -> str | SegmenterFactory:
+    """The factory of segmenters `env.segmentation`, or a name; a class of the user's gets M, the most objects."""
     return _checked(value, "segmentation", Segmenter)
 
 

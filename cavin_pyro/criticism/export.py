@@ -84,7 +84,9 @@ def write_samples(
     """Write the file, atomically.
 
     Args:
-        about: what the report says of the checkpoint. windows: held-out windows, at most. samples: of each window.
+        about: what the report says of the checkpoint.
+        windows: held-out windows, at most.
+        samples: samples of prior and guide for each window.
     """
     from xarray import DataTree
 

@@ -101,13 +101,13 @@ def load_trained(config: DictConfig, name: str, accept: Accept | None = None) ->
 def context_of(
     config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: torch.Tensor
 ) -> tuple[CheckContext, dict[str, Any]]:
-    """The context of a checkpoint and its data, and `about`; `held_out`: numbers of windows for validation."""
+    """The context of a checkpoint and its data, and `about`; `held_out`: indices of windows for validation."""
     path, checkpoint, model, guide, geometry, selection, table, folders = loaded
     chosen = {
         "training": sample_windows(table, table.training, config.windows, seed=[config.seed, 0]),
         "validation": sample_windows(table, held_out, config.windows, seed=[config.seed, 1]),
     }
-    episodes = {name: table.episodes[numbers] for name, numbers in chosen.items()}
+    episodes = {name: table.episodes[indices] for name, indices in chosen.items()}
     context = CheckContext(
         model,
         guide,
@@ -130,8 +130,8 @@ def context_of(
         "objective": _objective(checkpoint.config),
         "trained": checkpoint.provenance,
         "data": [compare_data(folder, checkpoint.provenance) for folder in folders],
-        "windows": {name: len(numbers) for name, numbers in chosen.items()},
-        "windows_digest": tensors_digest({name: table.starts[numbers] for name, numbers in chosen.items()})[:12],
+        "windows": {name: len(indices) for name, indices in chosen.items()},
+        "windows_digest": tensors_digest({name: table.starts[indices] for name, indices in chosen.items()})[:12],
         "episodes": {name: len(numbers.unique()) for name, numbers in episodes.items()},
         "seed": config.seed,
         "run": provenance(),
@@ -176,16 +176,16 @@ def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowCo
         ) from error
 
 
-def sample_windows(table: WindowTable, numbers: torch.Tensor, count: int, *, seed: Sequence[int]) -> torch.Tensor:
-    """At most `count` of the windows with these numbers, among those that count for all terms: their numbers."""
-    counted = counted_windows(table, numbers)
-    order = np.random.default_rng(list(seed)).permutation(len(counted))[:count]
-    return counted[torch.from_numpy(np.sort(order))]
+def sample_windows(table: WindowTable, indices: torch.Tensor, count: int, *, seed: Sequence[int]) -> torch.Tensor:
+    """Indices of at most `count` of the windows `indices: [N]` int64, among those that `sequence_mask` keeps."""
+    unmasked = unmasked_windows(table, indices)
+    order = np.random.default_rng(list(seed)).permutation(len(unmasked))[:count]
+    return unmasked[torch.from_numpy(np.sort(order))]
 
 
-def counted_windows(table: WindowTable, numbers: torch.Tensor) -> torch.Tensor:
-    """Those of the windows with these numbers that count for all terms."""
-    return numbers[table.sequence_mask[numbers]]
+def unmasked_windows(table: WindowTable, indices: torch.Tensor) -> torch.Tensor:
+    """Those of the windows `indices: [N]` int64 that `sequence_mask` keeps."""
+    return indices[table.sequence_mask[indices]]
 
 
 def _objective(config: Mapping[str, Any]) -> str | None:

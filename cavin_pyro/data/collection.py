@@ -331,10 +331,10 @@ def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 
     """Collect again the shards that are missing or corrupt; returns how many there were.
 
     Args:
-        workers: as of `collect`.
+        workers: as in `collect`.
 
     Raises:
-        UserError: as of `collect`.
+        UserError: as in `collect`.
     """
     metadata, damaged = _begin(config, folder), []
     for number in range(metadata["shards"]):

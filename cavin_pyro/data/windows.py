@@ -47,7 +47,7 @@ class WindowTable:
     Windows are chosen on the CPU, so that one seed chooses the same ones for every device (`move`).
 
     Attributes:
-        training, validation: numbers of windows, for `batch`. episodes: the episode that each window is from.
+        training, validation: indices of windows, for `batch`. episodes: the episode that each window is from.
         device: of batches.
     """
 
@@ -88,27 +88,27 @@ class WindowTable:
         return {int(count): self.training[objects == count] for count in objects.unique()}
 
     def sample(self, count: int, generator: torch.Generator, *, bucketed: bool = False) -> Tensor:
-        """Numbers [count] of training windows, sampled with replacement.
+        """Indices [count] int64 of training windows, sampled with replacement.
 
         `bucketed`: windows with the same number of objects as one that is sampled first. Every window is equally
         likely, and a batch needs no padding, which is most of the work for small numbers of objects.
         """
-        numbers = self.training
+        indices = self.training
         if bucketed:
-            first = numbers[torch.randint(len(numbers), (1,), generator=generator)]
-            numbers = self._by_object_count[int(self._objects[self.starts[first]])]
-        return numbers[torch.randint(len(numbers), (count,), generator=generator)]
+            first = indices[torch.randint(len(indices), (1,), generator=generator)]
+            indices = self._by_object_count[int(self._objects[self.starts[first]])]
+        return indices[torch.randint(len(indices), (count,), generator=generator)]
 
-    def batch(self, numbers: Tensor) -> Window:
-        """The windows with these numbers [B] on the CPU, without padding that none of them needs, on `device`."""
-        positions = self.starts[numbers, None] + self._steps
+    def batch(self, indices: Tensor) -> Window:
+        """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`."""
+        positions = self.starts[indices, None] + self._steps
         objects = int(self._objects[positions].max())
         positions = send(positions, self._actions.device)
         window = Window(
             states=self._states.map(lambda field: field[:, :objects][positions]),
             actions=self._actions[positions[:, :-1]],
             transition_mask=self._transition_mask[positions[:, :-1]],
-            sequence_mask=self.sequence_mask[numbers],
+            sequence_mask=self.sequence_mask[indices],
         )
         return window.map(lambda field: send(field, self.device))
 

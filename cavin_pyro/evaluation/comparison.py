@@ -50,7 +50,7 @@ class Comparison:
 
 
 def compare(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]) -> Comparison:
-    """Compare rows as of `evaluation.episode_row` where both have the seed.
+    """Compare rows as in `evaluation.episode_row` where both have the seed.
 
     Raises:
         UserError: they have no seed in common.

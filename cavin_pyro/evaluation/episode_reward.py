@@ -29,7 +29,7 @@ class EpisodeReward:
     Every call reads the environment's `task`, so the tiles and the goal are always those of the current episode.
 
     Args:
-        env: whose episodes are planned. reward: dense or sparse. margin: metres, as of `TaskReward`.
+        env: whose episodes are planned. reward: dense or sparse. margin: metres, as in `TaskReward`.
         device: where plans are made.
 
     Raises:

@@ -54,10 +54,10 @@ class EpisodeRunner:
     env: PushingEnv
     planner: Planner
     geometry: Geometry
-    pushes_per_plan: int | None  # as of `cavin_pyro.evaluation.rollout.rollout`
+    pushes_per_plan: int | None  # as in `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
     probability: Probability = NO_PROBABILITY  # of success, which each plan is given
-    push_decimals: int | None = PUSH_DECIMALS  # as of `cavin_pyro.evaluation.rollout.rollout`
+    push_decimals: int | None = PUSH_DECIMALS  # as in `cavin_pyro.evaluation.rollout.rollout`
 
     @property
     def task(self) -> Task:

@@ -83,7 +83,7 @@ class Transition:
 
 @dataclass
 class Episode:
-    """One episode. outcome: one of `OUTCOMES`. photograph, clouds: as of `PlanRecord`, after the last push."""
+    """One episode. outcome: one of `OUTCOMES`. photograph, clouds: as in `PlanRecord`, after the last push."""
 
     seed: int
     outcome: str = "timeout"
@@ -157,6 +157,11 @@ def rollout(
         probability: of success, from what the episode's plans have told so far; None leaves it out.
         callbacks: called in this order; without any, no frame is computed.
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
+
+    Raises:
+        NoRoomError: the layout has no room for the objects.
+        NoFiniteCandidateError: the planner found no plan with finite numbers.
+        RuntimeError: the robot stands in the camera's view.
     """
     episode = Episode(seed)
     previous: Plan | None = None

@@ -24,7 +24,7 @@ def draw_figure(path: Path, rates: Rates, *, planner: str, criterion: str) -> No
     """Both rows of the paper's figure, for one kind of planner and one criterion.
 
     Args:
-        rates: as of `cavin_pyro.reproduction.statistics.rates`. Bars and lines are rates of success, whiskers the wider
+        rates: as in `cavin_pyro.reproduction.statistics.rates`. Bars and lines are rates of success, whiskers the wider
             of the two intervals on each side.
     """
     own = [rate for rate in rates if rate["planner"] == planner and rate["criterion"] == criterion]

@@ -59,7 +59,7 @@ def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> N
                 "the code's numbers are the event, see to_event(1)"
             )
         if ((site["log_prob"] != 0) & (theirs["log_prob"] == 0)).any():
-            raise UserError(f"{name} counts {code} of windows that do not count: sample it within sequence_mask")
+            raise UserError(f"{name} does not mask {code} in windows that are masked: sample it within sequence_mask")
 
 
 def _codes(program: nn.Module, window: Window) -> Sites:

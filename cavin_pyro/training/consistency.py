@@ -17,7 +17,7 @@ from models.state import State, Window
 from planning.rollouts.dynamics import predict_states
 
 SCALE = 0.02  # metres, in x and in y: how near to its place in the subgoal an object must come
-LEAST = math.exp(-8.0)  # of the density, as of one object 8 cm away: a motion that goes elsewhere says nothing more
+LEAST = math.exp(-8.0)  # of the density, as for one object 8 cm away: a motion that goes elsewhere says nothing more
 
 
 def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows: int = 32) -> Tensor:

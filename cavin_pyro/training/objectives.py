@@ -45,16 +45,17 @@ class Objective:
     whatever the bound and its weights, and the rollout and consistency terms. It has no counterfactual term.
 
     Args:
-        elbo: any of Pyro's ELBOs. kl_weights: per code, positive. warm_up_steps: over which the weights of the
-            codes' log densities (of prior and guide) grow from nearly zero.
-        counterfactual_weight: of the published code's term, see `cavin_pyro.training.counterfactual`. The validation
-            loss, which chooses the best checkpoint, does not contain it.
-        rollout_weight: of the error where f reads its own predictions, see `cavin_pyro.training.rollout`. The bound
-            contains each push already, so a weight trades its density for the accuracy of rollouts.
-        consistency_weight: of how likely sampled motions reach the subgoal, see `cavin_pyro.training.consistency`; it
-            changes the prior of motions alone.
-        consistency_motions: how many motions of each effect the consistency term samples. consistency_windows: of how
-            many windows of a batch it is computed.
+        elbo: any of Pyro's ELBOs. kl_weights: weight of each code's KL term, positive.
+        warm_up_steps: steps over which the weights of the codes' log densities (of prior and guide) grow from nearly
+            zero.
+        counterfactual_weight: weight of the published code's term, see `cavin_pyro.training.counterfactual`. The
+            validation loss, which chooses the best checkpoint, does not contain it.
+        rollout_weight: weight of the error where f reads its own predictions, see `cavin_pyro.training.rollout`. The
+            bound contains each push already, so a weight trades its density for the accuracy of rollouts.
+        consistency_weight: weight of how likely sampled motions reach the subgoal, see
+            `cavin_pyro.training.consistency`; it changes the prior of motions alone.
+        consistency_motions: how many motions of each effect the consistency term samples. consistency_windows: how many
+            windows of a batch enter the consistency term.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.

@@ -126,12 +126,12 @@ class Trainer:
 
     def _update(self) -> float:
         config = self.config
-        numbers = self._fixed
-        if numbers is None:
-            numbers = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
-        window = self.windows.batch(numbers)
+        indices = self._fixed
+        if indices is None:
+            indices = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
+        window = self.windows.batch(indices)
         if self._mirror_signs is not None:
-            mirrored = torch.rand(len(numbers), generator=self._batches) < 0.5
+            mirrored = torch.rand(len(indices), generator=self._batches) < 0.5
             window = reflect(window, send(mirrored, self.windows.device), self._mirror_signs)
         for optimizer in self._optimizers.values():
             for group in optimizer.param_groups:
@@ -193,8 +193,8 @@ class Trainer:
         Each term of the bound is a mean over all windows or transitions that count for it, each other term over all
         windows.
         """
-        numbers, device = self.windows.validation, self.windows.device
-        chosen = numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))]
+        indices, device = self.windows.validation, self.windows.device
+        chosen = indices[torch.randperm(len(indices), generator=torch.Generator().manual_seed(0))]
         sums: Row = {}
         counts: dict[str, int] = {}
         parts: Sequence[Tensor] = chosen[: self.config.validation_windows].split(VALIDATION_BATCH)

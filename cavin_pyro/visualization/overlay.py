@@ -1,6 +1,6 @@
 """Overlays of an episode in pixels: tiles, candidates, subgoals, predictions and pushes.
 
-Figures, videos and recordings share them. All pixels are (column, row), as of `Camera.project`.
+Figures, videos and recordings share them. All pixels are (column, row), as in `Camera.project`.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def pushes(record: PlanRecord, view: View) -> Pixels:
 
 
 def candidate_subgoals(record: PlanRecord, task: Task, view: View, *, count: int) -> tuple[Pixels, NDArray[np.float32]]:
-    """Some of the candidate subgoals, of the target alone or, in clearing, of every real object.
+    """Some of the candidate subgoals, of every real object if the goal is about all of them, else of the target alone.
 
     Returns:
         Pixels [n, 2] and returns [n] of their plans with n at most `count`, best last.

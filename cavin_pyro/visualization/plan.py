@@ -114,7 +114,7 @@ def return_scale(returns: NDArray[np.float32]) -> Normalize | None:
 
 
 def draw_return_scale(figure: Figure, scale: Normalize, **place: Any) -> None:
-    """Draw the colours of the candidates' returns; `place`: as of `Figure.colorbar`."""
+    """Draw the colours of the candidates' returns; `place`: as in `Figure.colorbar`."""
     bar = figure.colorbar(ScalarMappable(scale, RETURNS), **place)
     bar.set_label("return of a candidate", fontsize=9)
     bar.ax.tick_params(labelsize=8)

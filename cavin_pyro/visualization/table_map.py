@@ -10,7 +10,7 @@ from cavin_pyro.visualization.overlay import Pixels, View
 from envs.scene import COLORS
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW
 
-PIXELS_PER_METRE = 365.5  # as of the videos' camera, so that both views have one size
+PIXELS_PER_METRE = 365.5  # that of the videos' camera, so that both views have one size
 GRID = 0.25  # metres between two marks on an axis
 
 

@@ -99,7 +99,7 @@ def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:
     """The validation loss and its terms over training steps, in nats per window or transition that counts.
 
     Args:
-        runs: by a name for the legend, at most five, the rows of a run as of `Trainer.rows` or
+        runs: by a name for the legend, at most five, the rows of a run as in `Trainer.rows` or
             `cavin_pyro.training.trainer.read_rows`.
 
     Raises:

@@ -61,7 +61,7 @@ def possible_tasks(
     """A task in each of the layouts that an episode may have, equally likely: one, or several for `layout=random`.
 
     Args:
-        task, layout, tiles: as of `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
+        task, layout, tiles: as in `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
             in this folder. All get the fields of `tiles` that are no lists of tiles, such as `clearance`.
 
     Raises:
@@ -86,7 +86,7 @@ def generate_task(
     """A task in a generated layout: that of `wanted.seed`, or without one a new one.
 
     Args:
-        generator: for a new one; None generates that of seed 0. tiles: fields that are no lists of tiles, as of
+        generator: for a new one; None generates that of seed 0. tiles: fields that are no lists of tiles, as in
             `possible_tasks`.
 
     Raises:

@@ -73,7 +73,7 @@ OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
     "mixed": lambda assets: MixedObjects(BuiltinObjects(), ScannedObjects(assets)),
     "random": lambda assets: RandomObjects(),
 }
-"""Makers of object sets by name; their argument is the folder of assets, or None."""
+"""Factories of object sets by name; their argument is the folder of assets, or None."""
 
 
 def load_object_set(name: str | ObjectSet, assets: str | Path | None = None) -> ObjectSet:

@@ -12,10 +12,10 @@ from envs.robots.panda import panda
 from envs.robots.phases import SETTLED_SPEED, push, settle
 from envs.robots.robot import STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, Robot, Stopped
 from envs.robots.sawyer import sawyer
-from envs.robots.stick import OFF_STAGE, StickRobot
+from envs.robots.stick import RETRACTED, StickRobot
 
 __all__ = [
-    "OFF_STAGE",
+    "RETRACTED",
     "ROBOTS",
     "SETTLED_SPEED",
     "STICK_LENGTH",
@@ -23,27 +23,28 @@ __all__ = [
     "TIP_HEIGHT",
     "ArmRobot",
     "Robot",
-    "RobotMaker",
+    "RobotFactory",
     "StickRobot",
     "Stopped",
     "push",
-    "robot_maker",
+    "robot_factory",
     "settle",
 ]
 
-RobotMaker = Callable[[PhysicsWorld], Robot]
+RobotFactory = Callable[[PhysicsWorld], Robot]
 """Puts a robot into an empty world."""
 
-# Functions from the folder of assets, or None, to a maker. They raise if a file is missing, before a world is built.
-ROBOTS: dict[str, Callable[[str | Path | None], RobotMaker]] = {
+# Functions from the folder of assets, or None, to a factory of robots. They raise if a file is missing, before a world
+# is built.
+ROBOTS: dict[str, Callable[[str | Path | None], RobotFactory]] = {
     "stick": lambda assets: StickRobot,
     "sawyer": lambda assets: partial(ArmRobot, description=sawyer(assets)),
     "panda": lambda assets: partial(ArmRobot, description=panda(assets)),
 }
 
 
-def robot_maker(robot: str | RobotMaker, assets: str | Path | None = None) -> RobotMaker:
-    """The maker of the robot of that name, or the given one.
+def robot_factory(robot: str | RobotFactory, assets: str | Path | None = None) -> RobotFactory:
+    """The factory of the robot of that name, or the given one.
 
     Raises:
         ValueError: unknown robot, or missing files; the message says how to get them.

@@ -26,7 +26,7 @@ inverse_kinematics = lru_cache(maxsize=None)(InverseKinematics)
 
 
 class ArmRobot:
-    """An arm, which waits off stage between pushes.
+    """An arm, which waits retracted, out of the camera's view, between pushes.
 
     A push has the stick's number of physics steps and speed profile, or more steps if a joint would exceed its
     velocity limit. All other motions are as fast as the joints allow.
@@ -42,14 +42,17 @@ class ArmRobot:
         self._place = self.arm.tip()  # commanded position of the tip
 
     def fits(self, place: Point) -> bool:
+        """See `Robot`."""
         return not self._world.occupied(place, radius=STICK_RADIUS, length=STICK_LENGTH)
 
     def reaches(self, start: Point, end: Point) -> bool:
+        """See `Robot`."""
         columns = [_line(np.append(place[:2], ABOVE_HEIGHT), place, WAYPOINTS_UP) for place in (start, end)]
         paths = [self._angles(places) for places in (*columns, _line(start, end, WAYPOINTS))]
         return all(path is not None for path in paths)
 
     def move(self, place: Point) -> Stopped:
+        """See `Robot`."""
         if np.allclose(place[:2], self._place[:2]):
             path = self._angles(_line(self._place, place, WAYPOINTS_UP))
         else:
@@ -58,9 +61,11 @@ class ArmRobot:
         return self._follow(path, place, MOVE_STEPS)
 
     def slide(self, end: Point) -> Stopped:
+        """See `Robot`."""
         return self._follow(self._angles(_line(self._place, end, WAYPOINTS)), end, PUSH_STEPS)
 
     def leave(self) -> Stopped:
+        """See `Robot`."""
         if self._at is self._home:
             return ""
         stopped = self._follow(np.stack([self._at, self._home]), self.arm.tip(), MOVE_STEPS, guarded=False)
@@ -70,6 +75,7 @@ class ArmRobot:
         return stopped
 
     def clear_of_view(self, camera: Camera) -> bool:
+        """See `Robot`."""
         x, y, z = camera.position
         corners = self.arm.corners()
         # Project the arm from the camera onto the table; parts above the camera do not count.
@@ -80,13 +86,16 @@ class ArmRobot:
         return bool(apart.any(axis=1).all())
 
     def stop(self) -> None:
+        """See `Robot`."""
         self._at, self._place = self.arm.angles(), self.arm.tip()
         self.arm.command(self._at, np.zeros_like(self._at))
 
     def wait(self) -> None:
+        """See `Robot`."""
         self._world.step()
 
     def tip(self) -> Point:
+        """See `Robot`."""
         return self.arm.tip()
 
     def _angles(self, places: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -1,4 +1,4 @@
-"""One push, the same for every robot: above the start, down, straight, up, off stage; and the wait afterwards.
+"""One push, the same for every robot: above the start, down, straight, up, retract; and the wait afterwards.
 
 Source: paper section 4.1 (position control, straight pushes) and the published implementation.
 """
@@ -22,7 +22,7 @@ SETTLING_STEPS = 20  # physics steps between two checks of the objects' speed
 
 
 def push(robot: Robot, start: NDArray[np.float64], end: NDArray[np.float64]) -> Ended:
-    """Execute one push and leave the view. If the push is stopped, the tool goes up and off stage.
+    """Execute one push and leave the view. If the push is stopped, the tool goes up and is retracted.
 
     Args:
         start, end: [2] metres, where the tip touches down and where it leaves the table.

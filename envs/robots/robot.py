@@ -30,7 +30,7 @@ error exceeds the robot's tolerance, so an obstacle is in the way. "table": the 
 
 
 class Robot(Protocol):
-    """Holds a stick upright and pushes with it. Between pushes it is off stage."""
+    """Holds a stick upright and pushes with it. Between pushes it is retracted, out of the camera's view."""
 
     def fits(self, place: Point) -> bool:
         """Whether the stick, upright with its tip at `place` [3], would overlap no object.

@@ -9,7 +9,7 @@ from envs.segmentation.mask import MaskSegmenter, TrueMasks
 from envs.segmentation.segmenter import Pixels, Segmenter
 from envs.workspace import OBJECT_SLOTS
 
-SegmenterMaker = Callable[[int], Segmenter]
+SegmenterFactory = Callable[[int], Segmenter]
 """Makes a segmenter that finds at most so many objects."""
 
 SEGMENTERS: dict[str, Callable[..., Segmenter]] = {  # from the simulator's masks and M
@@ -18,8 +18,8 @@ SEGMENTERS: dict[str, Callable[..., Segmenter]] = {  # from the simulator's mask
 }
 
 
-def segmenter_of(segmentation: str | SegmenterMaker, true_masks: TrueMasks, slots: int = OBJECT_SLOTS) -> Segmenter:
-    """The segmenter of that name, or of the given maker, which finds at most `slots` objects.
+def segmenter_of(segmentation: str | SegmenterFactory, true_masks: TrueMasks, slots: int = OBJECT_SLOTS) -> Segmenter:
+    """The segmenter of that name, or of the given factory, which finds at most `slots` objects.
 
     Raises:
         ValueError: unknown name.
@@ -37,7 +37,7 @@ __all__ = [
     "MaskSegmenter",
     "Pixels",
     "Segmenter",
-    "SegmenterMaker",
+    "SegmenterFactory",
     "TrueMasks",
     "segmenter_of",
 ]

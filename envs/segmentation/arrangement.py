@@ -15,7 +15,7 @@ LEVEL = 0.004  # metres; heights are compared in steps of this
 TOLERANCE, CAP = 0.004, 0.02  # metres of height by which a cell may differ at no cost, and where the cost is highest
 MISFIT = 0.7  # highest cost of a cell on which a shape lies; a cell on which none lies costs 1
 EMPTY, OVERLAP = 0.7, 0.7  # cost of a shape's cell where nothing stands, and of one where another shape lies already
-PRESENT = 0.2  # fraction of its cells by which a shape must lower the cost, or it counts as hidden
+PRESENT = 0.2  # fraction of its cells by which a shape must lower the cost, or it counts as occluded
 # Fractions of its cells: the cost of moving a shape by 0.1 m and of rotating it by a radian. The cost grows faster than
 # the distance, so that similar objects that are pushed in a row do not exchange identities.
 MOVING, TURNING, POWER = 0.1, 0.05, 1.5

@@ -25,7 +25,7 @@ class Segmenter(Protocol):
 
         Args:
             target: row and column of a pixel on the target, which a person confirms once; None if the target is
-                hidden, which leaves the first entry empty.
+                occluded, which leaves the first entry empty.
         """
         ...
 

@@ -47,7 +47,7 @@ def begin_track(region: Mask, heights: HeightMap) -> Track:
 
 
 def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Track | None]:
-    """Update each track with the new map; None for objects that are hidden, or were never observed."""
+    """Update each track with the new map; None for objects that are occluded, or were never observed."""
     known = {number: track for number, track in enumerate(tracks) if track is not None}
     standing = {
         number: Match(track.region & heights.occupied, track.shape)

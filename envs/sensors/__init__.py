@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from envs.sensors.camera import Camera
 from envs.sensors.kinect2 import Kinect2
-from envs.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering, SensorMaker
+from envs.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering, SensorFactory
 
-CAMERAS: dict[str, SensorMaker] = {"ideal": IdealSensor, "kinect2": Kinect2}
+CAMERAS: dict[str, SensorFactory] = {"ideal": IdealSensor, "kinect2": Kinect2}
 
 
 def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:

@@ -84,4 +84,4 @@ class IdealSensor:
         return DepthImage(rendering.depth, self.nominal), rendering.bodies
 
 
-SensorMaker = Callable[[], DepthSensor]
+SensorFactory = Callable[[], DepthSensor]

@@ -66,7 +66,7 @@ class Insertion(Task):
 
     @classmethod
     def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
-        """A slot as of `random_layouts`, and a start as many tiles away from it as wanted; obstacles start anywhere."""
+        """A slot as in `random_layouts`, and a start as many tiles away from it as wanted; obstacles start anywhere."""
         found = []
         for slot in cls.random_layouts():
             assert isinstance(slot, Insertion)

@@ -54,7 +54,7 @@ class Step(NamedTuple):
         return self._enters(depth, self.states[..., :1, :]).squeeze(-1)
 
     def any_enters(self, depth: Depth) -> Tensor:
-        """Whether any real object is in a forbidden place, with the margin as of `target_enters`: [..., T] bool."""
+        """Whether any real object is in a forbidden place, with the margin as in `target_enters`: [..., T] bool."""
         return (self._enters(depth, self.states) & self.mask).any(dim=-1)
 
     def all_within(self, depth: Depth) -> Tensor:

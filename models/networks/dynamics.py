@@ -94,6 +94,13 @@ class Dynamics(PushOutcome):
     def __init__(
         self, *, feature_dimension: int = 64, width: int = 64, maximum_displacement: float = PUSH_RANGE
     ) -> None:
+        """The layers.
+
+        Args:
+            feature_dimension: F, numbers of an object's geometric feature.
+            width: width of all layers.
+            maximum_displacement: largest displacement of an object's centre by one push, along each axis, in metres.
+        """
         super().__init__()
         self.trunk = EffectTrunk(4, width=width, encoder_width=width)
         self.change = StateChange(

@@ -13,7 +13,10 @@ DECODED_POINTS = 64
 
 
 class PointNet(Geometry):
-    """Layers 16-32-64 shared by all points, maximum over points, FC 64, unit length."""
+    """Layers 16-32-64 shared by all points, maximum over points, FC F, unit length.
+
+    feature_dimension: F, numbers of a feature.
+    """
 
     def __init__(self, feature_dimension: int = 64) -> None:
         super().__init__()
@@ -29,7 +32,12 @@ class PointNet(Geometry):
 
 
 class PointNetAutoencoder(nn.Module):
-    """PointNet and a decoder that reconstructs a cloud from its feature."""
+    """PointNet and a decoder that reconstructs a cloud from its feature.
+
+    feature_dimension: F, numbers of a feature.
+    width: width of the decoder's hidden layers.
+    points: number of points of a reconstruction.
+    """
 
     def __init__(self, *, feature_dimension: int = 64, width: int = 128, points: int = DECODED_POINTS) -> None:
         super().__init__()

@@ -27,7 +27,15 @@ class FlowPrior(nn.Module):
         width: int = 32,
         transforms: int = 4,
     ) -> None:
-        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s)."""
+        """The layers.
+
+        Args:
+            dimension: of the code.
+            feature_dimension: F of the states.
+            effect_dimension: C for p(z | s, c), None for p(c | s).
+            width: width of all layers.
+            transforms: number of couplings of the flow.
+        """
         super().__init__()
         self.dimension = dimension
         self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)

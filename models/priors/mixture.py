@@ -40,9 +40,17 @@ class ObjectMixturePrior(nn.Module):
         width: int = 32,
         components: int = 4,
     ) -> None:
-        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s).
+        """The layers.
 
-        `components`: Gaussians per object. Raises ValueError unless there is at least one.
+        Args:
+            dimension: of the code.
+            feature_dimension: F of the states.
+            effect_dimension: C for p(z | s, c), None for p(c | s).
+            width: width of all layers.
+            components: number of Gaussians per object.
+
+        Raises:
+            ValueError: fewer than one component.
         """
         super().__init__()
         if components < 1:

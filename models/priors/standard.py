@@ -19,7 +19,13 @@ class StandardPrior(nn.Module):
     def __init__(
         self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None
     ) -> None:
-        """`dimension` is the code's; `effect_dimension` is C for p(z | s, c), None for p(c | s)."""
+        """It has no layers; the last two dimensions are not read.
+
+        Args:
+            dimension: of the code.
+            feature_dimension: F of the states.
+            effect_dimension: C for p(z | s, c), None for p(c | s).
+        """
         super().__init__()
         self.dimension = dimension
 

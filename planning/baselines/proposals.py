@@ -64,8 +64,8 @@ class HeuristicPushes:
         centers = state.centers
         real = state.mask.sum(-1, keepdim=True)  # [..., 1]
         rank = (torch.special.ndtr(shared[..., :1]) * real).long().clamp(max=(real - 1).clamp(min=0))
-        number = ((state.mask.cumsum(-1) > rank) & state.mask).int().argmax(-1, keepdim=True)
-        target = centers.gather(-2, number.unsqueeze(-1).expand(*number.shape, 3)).squeeze(-2)[..., :2]
+        index = ((state.mask.cumsum(-1) > rank) & state.mask).int().argmax(-1, keepdim=True)
+        target = centers.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3)).squeeze(-2)[..., :2]
         turn, aside, before = _uniform(own[..., 0]), _uniform(own[..., 1]), torch.special.ndtr(own[..., 2])
         angle = math.pi * _uniform(shared[..., 1]) + SPREAD * turn
         direction = torch.stack([angle.cos(), angle.sin()], -1)

@@ -70,7 +70,7 @@ class SectarPlanner(SearchingPlanner):
         if self.robustness is not None:
             returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
             finite, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, returns, generators)
-            best = torch.where(finite, robust.number, best)
+            best = torch.where(finite, robust.candidate, best)
             failures = torch.where(finite, robust.failures, torch.nan)
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
@@ -111,5 +111,5 @@ class SectarPlanner(SearchingPlanner):
         )
         what = state, subgoals, scores, actions, -RETURN_WEIGHT * scores, generators
         chosen = sequential_halving(robustness, self.model, self.reward, *what, backend=self.backend)
-        number = best.indices.gather(1, chosen.number.unsqueeze(-1)).squeeze(1)
-        return MostRobust(number, chosen.failures)
+        index = best.indices.gather(1, chosen.candidate.unsqueeze(-1)).squeeze(1)
+        return MostRobust(index, chosen.failures)

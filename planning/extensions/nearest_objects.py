@@ -18,34 +18,34 @@ class NearestObjects(NamedTuple):
     because an excluded object can obstruct a push.
     """
 
-    numbers: Tensor | None = None  # [B, m] int64, ascending: the target, object 0, comes first; None for all objects
+    indices: Tensor | None = None  # [B, m] int64, ascending: the target, object 0, comes first; None for all objects
 
     def of(self, state: State) -> State:
         """These objects alone: `[B, ...]` of M objects -> `[B, ...]` of m."""
-        if self.numbers is None:
+        if self.indices is None:
             return state
-        numbers = _along(self.numbers, state)
+        indices = _along(self.indices, state)
         return State(
-            state.centers.take_along_dim(numbers, -2),
-            state.features.take_along_dim(numbers, -2),
-            state.mask.take_along_dim(numbers.squeeze(-1), -1),
+            state.centers.take_along_dim(indices, -2),
+            state.features.take_along_dim(indices, -2),
+            state.mask.take_along_dim(indices.squeeze(-1), -1),
         )
 
     def among(self, others: State, these: State) -> State:
         """States `these: [B, n]` of m objects, with all `others: [B]` of M where they are: `[B, n]` of M."""
-        if self.numbers is None:
+        if self.indices is None:
             return these
-        numbers, everything = _along(self.numbers, these), others.expand_plans(these.batch_shape[-1])
+        indices, everything = _along(self.indices, these), others.expand_plans(these.batch_shape[-1])
         return State(
-            everything.centers.scatter(-2, numbers.expand_as(these.centers), these.centers),
-            everything.features.scatter(-2, numbers.expand_as(these.features), these.features),
+            everything.centers.scatter(-2, indices.expand_as(these.centers), these.centers),
+            everything.features.scatter(-2, indices.expand_as(these.features), these.features),
             everything.mask,
         )
 
 
-def _along(numbers: Tensor, state: State) -> Tensor:
-    """`numbers: [B, m]` of objects, to index the fields of `state: [B, ...]`: `[B, 1 ..., m, 1]`."""
-    return numbers.reshape(len(numbers), *(1,) * (len(state.batch_shape) - 1), -1, 1)
+def _along(indices: Tensor, state: State) -> Tensor:
+    """`indices: [B, m]` of objects, to index the fields of `state: [B, ...]`: `[B, 1 ..., m, 1]`."""
+    return indices.reshape(len(indices), *(1,) * (len(state.batch_shape) - 1), -1, 1)
 
 
 def nearest_objects(state: State, most: int | None, reward: RewardFunction) -> NearestObjects:

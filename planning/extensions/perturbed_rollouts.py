@@ -41,8 +41,9 @@ class PerturbedRollouts:
     sampled have common numbers only.
 
     candidates: motions with perturbed rollouts, the best by line 10, or by their return in the baselines.
-    rollouts: of each candidate in the first round.
-    rounds: of equally many rollouts in total, for fewer and fewer candidates; 1 gives every candidate the same number.
+    rollouts: number for each candidate in the first round.
+    rounds: number of rounds, each with as many rollouts in total, for fewer and fewer candidates; 1 gives every
+        candidate the same number.
     reduction_factor: how many times fewer candidates a round has than the one before.
     outcomes: `perturbed`, with the two noises below, or `sampled` from f's own predictive distribution, push by push.
         A sampled rollout continues from its own samples, which also give its distance to the subgoal; its pushes start

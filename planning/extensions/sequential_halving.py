@@ -20,7 +20,7 @@ from planning.rollouts.segment import actions_of
 class MostRobust(NamedTuple):
     """The motion with the lowest cost on average."""
 
-    number: Tensor  # [B] int64, among the candidates
+    candidate: Tensor  # [B] int64, its index
     failures: Tensor  # [B] share of its rollouts that failed
 
 
@@ -62,7 +62,7 @@ def sequential_halving(
     motion whose score or whose cost is not finite loses.
     """
     best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
-    numbers, count, done = best.indices, robustness.rollouts, 0
+    indices, count, done = best.indices, robustness.rollouts, 0
     infinite = ~torch.isfinite(best.values)
     total = torch.zeros_like(best.values)  # cost of all rollouts so far
     failures = torch.zeros_like(best.values)  # how many of them failed
@@ -71,25 +71,25 @@ def sequential_halving(
             break  # one candidate is left
         if number:
             going = (total / done).topk(max(1, total.shape[-1] // robustness.reduction_factor), largest=False).indices
-            fields = numbers, infinite, total, failures
-            numbers, infinite, total, failures = (field.gather(1, going) for field in fields)
+            fields = indices, infinite, total, failures
+            indices, infinite, total, failures = (field.gather(1, going) for field in fields)
             count = robustness.reduction_factor * count
         distance, failed = perturbed_rollouts(
             robustness,
             model,
             reward,
             state,
-            goal if goal is None or goal.batch_shape[-1] == 1 else records.take(goal, numbers),
-            actions.take_along_dim(numbers[..., None, None], dim=1),
+            goal if goal is None or goal.batch_shape[-1] == 1 else records.take(goal, indices),
+            actions.take_along_dim(indices[..., None, None], dim=1),
             count,
             generators,
             feature_weight=feature_weight,
             backend=backend,
         )
         cost = (distance + robustness.failure_cost * failed).sum(-1)
-        cost = cost + count * later.gather(1, numbers)
+        cost = cost + count * later.gather(1, indices)
         total = torch.where(infinite | ~torch.isfinite(cost), torch.inf, total + cost)
         failures = failures + failed.sum(-1)
         done += count
     winner = total.argmin(-1, keepdim=True)
-    return MostRobust(numbers.gather(1, winner).squeeze(1), failures.gather(1, winner).squeeze(1) / done)
+    return MostRobust(indices.gather(1, winner).squeeze(1), failures.gather(1, winner).squeeze(1) / done)

@@ -18,9 +18,9 @@ MINIMUM_SCALE = 1e-3  # so that a search never collapses onto a point
 class CrossEntropy:
     """Samples from a Gaussian fitted to the elites of the last iteration; the first iteration samples the prior.
 
-    iterations: share the samples equally. elite_fraction: fraction of an iteration's candidates for the next fit.
-    momentum: weight of the last mean and scale in the next. replacement: failed candidates become copies of active
-    ones, as in shooting.
+    iterations: number of iterations, which share the samples equally. elite_fraction: fraction of an iteration's
+    candidates for the next fit. momentum: weight of the last mean and scale in the next. replacement: failed candidates
+    become copies of active ones, as in shooting.
 
     Raises ValueError for counts below 1 and fractions outside of their range.
     """

@@ -22,11 +22,12 @@ class Evolution:
     Under a sparse reward a random plan that reaches the goal has many superfluous segments. Fresh segments at the end
     replace the deleted ones, so offspring are as long as their parents.
 
-    generations: after the initial one, which is sampled from the prior. initial_fraction: of the samples, for the
-    initial generation. parents: how many, at most. deletion_rate, mutation_rate: segments per offspring, on average.
-    step: of a mutation, in (0, 1], which leaves the prior invariant; 1 samples the segment anew. replacement: as in
-    shooting, in the initial generation. warm_start: fraction of the initial generation for the warm start and its
-    offspring.
+    generations: number after the initial one, which is sampled from the prior. initial_fraction: fraction of the
+    samples for the initial generation. parents: number of parents, at most. deletion_rate: segments that an offspring
+    loses, on average. mutation_rate: segments of an offspring that mutate, on average. step: size of a mutation, in
+    (0, 1], which leaves the prior invariant; 1 samples the segment anew. replacement: failed candidates of the initial
+    generation become copies of active ones, as in shooting. warm_start: fraction of the initial generation for the warm
+    start and its offspring.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """

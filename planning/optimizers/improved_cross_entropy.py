@@ -21,8 +21,9 @@ class ImprovedCrossEntropy:
     From the published method: coloured noise, elites that compete again in the next iteration, and the mean as a
     candidate of the last iteration. Omitted: elites carried over from the last plan.
 
-    iterations, elite_fraction, momentum, replacement: as `CrossEntropy`. kept_elite_fraction: fraction of the elites
-    that compete again.
+    iterations: number of iterations, which share the samples equally. elite_fraction: fraction of an iteration's
+    candidates for the next fit. momentum: weight of the last mean and scale in the next. replacement: failed candidates
+    become copies of active ones, as in shooting. kept_elite_fraction: fraction of the elites that compete again.
     exponent: the noise's power falls as frequency^-exponent; 0 is white, 2 makes neighbouring segments similar.
 
     Raises ValueError for counts below 1 and numbers outside of their range.

@@ -16,9 +16,10 @@ from planning.rollouts.candidates import SearchProblem
 class PathIntegral:
     """Samples around the last mean, weighted by exp(return / temperature); the first iteration samples the prior.
 
-    iterations: share the samples equally. temperature: in units of the return; None adapts it so that the weights'
-    effective sample size is `effective_sample_size`, a fraction of the candidates. shrink: factor from one iteration's
-    scale to the next's. replacement: as `CrossEntropy`.
+    iterations: number of iterations, which share the samples equally. temperature: temperature of the weights, in units
+    of the return; None adapts it to `effective_sample_size`. effective_sample_size: effective sample size of the
+    weights with an adapted temperature, as a fraction of the candidates. shrink: factor from one iteration's scale to
+    the next's. replacement: failed candidates become copies of active ones, as in shooting.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """

@@ -39,14 +39,16 @@ class SequentialMonteCarlo:
     temperature, and failed particles count as impossible while others have not failed.
 
     effective_sample_size: without a `temperature`, the one after a segment is the lowest at which the weights'
-    effective sample size is this fraction of the particles that have not failed. moves: of every particle after every
-    segment. block: last segments that a move changes. step: of a move, in (0, 1]; 1 samples independently of the
-    current value. temperature: in units of return; None adapts it. schedule: with a `temperature`, `constant` has it
-    after every segment, `linear` has K / k times as much after segment k. resample_below: resample if the effective
-    sample size is at most this fraction of the particles, and after the last segment; 1 resamples after every segment.
-    proposal: of codes, `prior`, `last_plan` or a `NoiseProposal`. value: a `Value` of states that leads particles
-    before the last segment; None has none. keep_last_plan: the planner also chooses from the warm start's plans, as
-    with `shooting`; they are no particles, so the estimate does not count them, but they take their share of samples.
+    effective sample size is this fraction of the particles that have not failed. moves: number for every particle
+    after every segment. block: last segments that a move changes. step: size of a move, in (0, 1]; 1 samples
+    independently of the current value. temperature: temperature of the target, in units of the return; None adapts it.
+    schedule: with a `temperature`, `constant` has it after every segment, `linear` has K / k times as much after
+    segment k. resample_below: resample if the effective sample size is at most this fraction of the particles, and
+    after the last segment; 1 resamples after every segment.
+    proposal: distribution of codes, `prior`, `last_plan` or a `NoiseProposal`. value: a `Value` of states that leads
+    particles before the last segment; None has none. keep_last_plan: the planner also chooses from the warm start's
+    plans, as with `shooting`; they are no particles, so the estimate does not count them, but they take their share of
+    samples.
 
     Extending n particles over K segments and moving their last ones costs as much as N samples of shooting.
 
@@ -148,8 +150,8 @@ class SequentialMonteCarlo:
         chance = uniform_each((particles.count,), problem.generators, problem.device)
         accepted = chance.log() < gain
         own = torch.arange(particles.count, device=inverse.device)
-        numbers = torch.where(accepted, own + particles.count, own.expand_as(accepted))
-        return join([particles, proposed]).take(numbers), proposed
+        indices = torch.where(accepted, own + particles.count, own.expand_as(accepted))
+        return join([particles, proposed]).take(indices), proposed
 
     def _scores(self, candidates: Candidates) -> Tensor:
         """Return so far and value `[B, n]`; -inf for candidates of weight zero."""
@@ -172,11 +174,11 @@ def active_returns(candidates: Candidates) -> Tensor:
 
 
 def _resample(logarithms: Tensor, generators: Sequence[torch.Generator], due: Tensor) -> Tensor:
-    """Ancestors' numbers `[B, n]` by systematic resampling where it is `due: [B]` and a weight is not zero."""
+    """Ancestors' indices `[B, n]` int64 by systematic resampling where it is `due: [B]` and a weight is not zero."""
     count = logarithms.shape[-1]
     weights = torch.softmax(logarithms, -1)
     offsets = uniform_each((1,), generators, weights.device)
     places = (torch.arange(count, device=weights.device) + offsets.double()) / count
-    numbers = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)
+    indices = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)
     stay = ~(due.unsqueeze(-1) & torch.isfinite(weights).all(-1, keepdim=True))
-    return torch.where(stay, torch.arange(count, device=weights.device), numbers)
+    return torch.where(stay, torch.arange(count, device=weights.device), indices)

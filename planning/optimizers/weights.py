@@ -73,9 +73,9 @@ def adapt_temperature(returns: Tensor, fraction: float, before: Tensor | None = 
     enough = sizes >= fraction * counts.sum(-1, keepdim=True).clamp(min=1)
     ranks = torch.arange(TEMPERATURES, device=returns.device)
     # If no temperature keeps enough, take the one that keeps most.
-    number = torch.where(enough.any(-1), torch.where(enough, ranks, -1).amax(-1), sizes.argmax(-1))
-    weighs_the_same = enough & (sizes <= SAME * sizes.gather(-1, number.unsqueeze(-1)))
-    number = torch.where(weighs_the_same.any(-1), weighs_the_same.int().argmax(-1), number)
-    chosen = inverse.gather(-1, number.unsqueeze(-1)).squeeze(-1)
+    index = torch.where(enough.any(-1), torch.where(enough, ranks, -1).amax(-1), sizes.argmax(-1))
+    weighs_the_same = enough & (sizes <= SAME * sizes.gather(-1, index.unsqueeze(-1)))
+    index = torch.where(weighs_the_same.any(-1), weighs_the_same.int().argmax(-1), index)
+    chosen = inverse.gather(-1, index.unsqueeze(-1)).squeeze(-1)
     environments = torch.arange(len(returns), device=returns.device)
-    return chosen, logarithms[environments, number]
+    return chosen, logarithms[environments, index]

@@ -106,17 +106,17 @@ class SearchProblem:
     def _roll_out(
         self, count: int, noise: Sequence[Tensor | None], replacement: bool, early_stopped: Tensor | None
     ) -> Candidates:
-        chances: Sequence[Tensor | None] = [None] * len(noise)
+        uniforms: Sequence[Tensor | None] = [None] * len(noise)
         if replacement and len(noise) > 1:
             # All at once, beforehand: an environment's random numbers must not depend on when others stop early.
-            chances = uniform_each((len(noise), count), self.generators, self.device).unbind(1)
+            uniforms = uniform_each((len(noise), count), self.generators, self.device).unbind(1)
         candidates = self.begin(count)
-        for number, (segment, chance) in enumerate(zip(noise, chances, strict=True), 1):
+        for number, (segment, uniform) in enumerate(zip(noise, uniforms, strict=True), 1):
             if early_stopped is not None and all(early_stopped.tolist()):
                 candidates = candidates.stay(segment)
             else:
                 last = number == len(noise)
-                candidates, early_stopped = candidates.extend_and_replace(segment, chance, early_stopped, last=last)
+                candidates, early_stopped = candidates.extend_and_replace(segment, uniform, early_stopped, last=last)
         self.add_candidates(candidates)
         return candidates
 
@@ -125,7 +125,7 @@ class SearchProblem:
 class Candidates:
     """n candidates per environment, k segments long: extend, select, concatenate and truncate them.
 
-    Each segment is stored once, under the numbers of its candidates then; `ancestors` map the numbers from one segment
+    Each segment is stored once, under the indices of its candidates then; `ancestors` map the indices from one segment
     to the next. Copies of a candidate cost nothing.
     """
 
@@ -133,8 +133,8 @@ class Candidates:
     plans: State  # [B, n, M, .] their last states
     score_state: Any  # fields [B, n]
     segments: tuple[SegmentRecord, ...] = ()  # k of them, of [B, R, ...]
-    # k of [B, .] int64: for each candidate of the next segment (after the last, for each of `plans`) the number of
-    # its ancestor; None if the numbers do not change.
+    # k of [B, .] int64: for each candidate of the next segment (after the last, for each of `plans`) the index of
+    # its ancestor; None if the indices do not change.
     ancestors: tuple[Tensor | None, ...] = ()
 
     @property
@@ -186,7 +186,7 @@ class Candidates:
 
     @cached_property
     def rows(self) -> tuple[Tensor | None, ...]:
-        """The numbers of the candidates in each segment, k of `[B, n]` int64; None if they did not change since."""
+        """The indices of the candidates in each segment, k of `[B, n]` int64; None if they did not change since."""
         rows: list[Tensor | None] = []
         later: Tensor | None = None
         for ancestor in reversed(self.ancestors):
@@ -199,17 +199,17 @@ class Candidates:
         return self.extend_and_replace(noise, None, None)[0]
 
     def extend_and_replace(
-        self, noise: Tensor | None, chances: Tensor | None, early_stopped: Tensor | None, *, last: bool = False
+        self, noise: Tensor | None, uniforms: Tensor | None, early_stopped: Tensor | None, *, last: bool = False
     ) -> tuple[Candidates, Tensor | None]:
-        """One more segment; then copies of active candidates, by `chances: [B, n]` in [0, 1), replace failed ones.
+        """One more segment; then copies of active candidates, by `uniforms: [B, n]` in [0, 1), replace failed ones.
 
-        Without chances, and after the `last` segment, failed candidates stay. In
+        Without `uniforms`, and after the `last` segment, failed candidates stay. In
         `early_stopped: [B]` environments, if given, all stay. Also returns the environments that have stopped by then.
         """
         problem, before, number = self.problem, self.plans, len(self.segments)
         # In the first segment all candidates start from one state, which the model reads once.
         here = before if self.segments else problem.state.expand_plans(1)
-        what = problem.space, problem.objective, number, here, before, self.score_state, noise, chances, early_stopped
+        what = problem.space, problem.objective, number, here, before, self.score_state, noise, uniforms, early_stopped
         after = extend_segment(*what, problem.generators) if noise is None else problem.backend(extend_segment, *what)
         segments = (*self.segments, SegmentRecord(noise, after.rollout, after.score_state))
         ancestors = None if last else after.ancestors
@@ -232,7 +232,7 @@ class Candidates:
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
 
     def rolled_out(self) -> Candidates:
-        """The same candidates and numbers, each rolled out to its end, for callers that read more than the best one.
+        """The same candidates and indices, each rolled out to its end, for callers that read more than the best one.
 
         Those that were not reparameterised are returned as they are.
         """
@@ -243,13 +243,13 @@ class Candidates:
         problem.evidence.extend(self.problem.evidence)  # of the search that found them
         return problem.evaluate(self.noise)
 
-    def take(self, numbers: Tensor) -> Candidates:
-        """Candidates by number, `[B, m]` int64; a repeated number gives copies."""
-        plans, score_state = records.take((self.plans, self.score_state), numbers)
+    def take(self, indices: Tensor) -> Candidates:
+        """The candidates `indices: [B, m]` int64; a repeated index gives copies."""
+        plans, score_state = records.take((self.plans, self.score_state), indices)
         ancestors = self.ancestors
         if ancestors:
             last = ancestors[-1]
-            ancestors = (*ancestors[:-1], numbers if last is None else last.gather(1, numbers))
+            ancestors = (*ancestors[:-1], indices if last is None else last.gather(1, indices))
         return Candidates(self.problem, plans, score_state, self.segments, ancestors)
 
     def back(self, segments: int) -> Candidates:
@@ -263,7 +263,7 @@ class Candidates:
         return Candidates(self.problem, last.rollout.states, last.score_state, self.segments[:left], ancestors)
 
     def compact(self) -> Candidates:
-        """The same candidates, with every segment stored under their current numbers."""
+        """The same candidates, with every segment stored under their current indices."""
         pairs = zip(self.segments, self.rows, strict=True)
         segments = tuple(segment if row is None else records.take(segment, row) for segment, row in pairs)
         return Candidates(self.problem, self.plans, self.score_state, segments, (None,) * len(segments))
@@ -275,7 +275,7 @@ class Candidates:
 
     @cached_property
     def _environments(self) -> Tensor:
-        """Numbers of the environments, `[B, 1]`."""
+        """Indices of the environments, `[B, 1]`."""
         mask = self.plans.mask
         return torch.arange(len(mask), device=mask.device).unsqueeze(-1)
 

@@ -33,13 +33,13 @@ def extend_segment(
     before: State,
     score_state: Any,
     noise: Tensor | None,
-    chances: Tensor | None,
+    uniforms: Tensor | None,
     early_stopped: Tensor | None,
     generators: Sequence[torch.Generator] = (),
 ) -> ExtendedSegment:
     """Roll out segment `number` of candidates in the states `before: [B, n]`; terminated ones stay.
 
-    For `chances` and `early_stopped` see `Candidates.extend_and_replace`, for `here` see `SearchSpace.extend`. The
+    For `uniforms` and `early_stopped` see `Candidates.extend_and_replace`, for `here` see `SearchSpace.extend`. The
     `generators` are used without noise only.
     """
     rollout = space.extend(number, here, before, noise, generators)
@@ -55,9 +55,9 @@ def extend_segment(
     if early_stopped is not None:
         after, failed = records.where(early_stopped, score_state, after), failed & ~early_stopped.unsqueeze(-1)
         early_stopped = objective.early_stopped(after)
-    if chances is None:
+    if uniforms is None:
         return ExtendedSegment(rollout, after, None, rollout.states, after, early_stopped)
-    ancestors = choose_ancestors(failed, after.active, chances)
+    ancestors = choose_ancestors(failed, after.active, uniforms)
     return ExtendedSegment(rollout, after, ancestors, *records.take((rollout.states, after), ancestors), early_stopped)
 
 

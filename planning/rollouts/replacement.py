@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 
-def choose_ancestors(failed: Tensor, active: Tensor, chances: Tensor) -> Tensor:
-    """The ancestor of every candidate, the number of the candidate that it continues: `[B, N]` int64.
+def choose_ancestors(failed: Tensor, active: Tensor, uniforms: Tensor) -> Tensor:
+    """The ancestor of every candidate, the index of the candidate that it continues: `[B, N]` int64.
 
-    `failed`, `active`: `[B, N]` bool. `chances`: `[B, N]`, uniform in [0, 1). A failed candidate continues an active
+    `failed`, `active`: `[B, N]` bool. `uniforms`: `[B, N]`, uniform in [0, 1). A failed candidate continues an active
     one, all equally likely; every other candidate continues itself, successful ones too. An environment without an
     active candidate keeps all of its candidates.
     """
     own = torch.arange(failed.shape[-1], device=failed.device).expand_as(failed)
     actives = active.cumsum(-1)  # counts active candidates up to and including each
-    number = actives[:, -1:]
-    rank = (chances * number).long().clamp(max=(number - 1).clamp(min=0))  # a product may be rounded up to its factor
+    count = actives[:, -1:]
+    rank = (uniforms * count).long().clamp(max=(count - 1).clamp(min=0))  # a product may be rounded up to its factor
     ancestors = torch.searchsorted(actives, rank + 1).clamp(max=failed.shape[-1] - 1)
-    return torch.where(failed & (number > 0), ancestors, own)
+    return torch.where(failed & (count > 0), ancestors, own)

@@ -72,7 +72,9 @@ def test_the_motion_with_the_best_outcome_is_chosen_unless_it_fails(benchmark: A
         oracle = SimpleNamespace(candidates=candidates, path=path)
         scores, later = ends.unsqueeze(0), torch.zeros(1, 4)
         rules = PerturbedRollouts(failure_cost=failure_cost)
-        return int(benchmark.Oracle.choose(oracle, rules, motions, scores, later, None, reward, subgoals, 0.0).index)
+        return int(
+            benchmark.Oracle.choose(oracle, rules, motions, scores, later, None, reward, subgoals, 0.0).candidate
+        )
 
     assert chosen(4, failing=-1) == 2
     assert chosen(4, failing=2) == 1

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from envs.physics import PhysicsWorld
 from envs.pushing import PushingEnv
-from envs.robots import ROBOTS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, ArmRobot, push, robot_maker
+from envs.robots import ROBOTS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, ArmRobot, push, robot_factory
 from envs.robots.arm import inverse_kinematics
 from envs.robots.panda import panda
 from envs.robots.robot import ABOVE_HEIGHT
@@ -87,7 +87,7 @@ def test_the_tip_follows_its_line_with_the_sticks_profile(scene_of: Callable, pu
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_an_arm_touches_nothing_on_its_way_between_off_stage_and_above(
+def test_an_arm_touches_nothing_on_its_way_between_retracted_and_above(
     scene_of: Callable, put: Callable, name: str
 ) -> None:
     scene = scene_of(name)
@@ -193,7 +193,7 @@ def test_an_arm_that_meets_the_table_stops_and_leaves(scene_of: Callable, put: C
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_a_push_against_what_cannot_move_is_blocked_and_ends_off_stage(
+def test_a_push_against_what_cannot_move_is_blocked_and_ends_retracted(
     scene_of: Callable, put: Callable, push: Callable, name: str
 ) -> None:
     scene = scene_of(name)
@@ -206,7 +206,7 @@ def test_a_push_against_what_cannot_move_is_blocked_and_ends_off_stage(
 
 
 class Deaf:
-    """A robot that stops at one verb, to see that the push still ends off stage."""
+    """A robot that stops at one verb, to see that the push still ends retracted."""
 
     def __init__(self, verb: str) -> None:
         self.verb, self.called = verb, []
@@ -223,7 +223,7 @@ class Deaf:
 
 
 @pytest.mark.parametrize("verb", ["move", "slide"])
-def test_whatever_stops_a_push_the_robot_goes_up_and_off_stage(verb: str) -> None:
+def test_whatever_stops_a_push_the_robot_goes_up_and_is_retracted(verb: str) -> None:
     robot = Deaf(verb)
     assert push(robot, np.array([0.5, 0.0]), np.array([0.6, 0.0])) == "blocked"
     assert robot.called[-3:] == ["stop", "move", "leave"]
@@ -301,7 +301,7 @@ def test_a_urdf_of_something_else_is_refused(tmp_path: Path, capfd: pytest.Captu
     (tmp_path / "sawyer" / "sawyer_stick.urdf").write_text('<robot name="r"><link name="base"/></robot>')
     world = PhysicsWorld()
     with pytest.raises(ValueError, match=r"has no joint or link named 'controller_box'"):
-        robot_maker("sawyer", tmp_path)(world)
+        robot_factory("sawyer", tmp_path)(world)
     world.close()
 
 
@@ -348,7 +348,7 @@ def test_every_name_makes_a_robot_that_has_every_verb() -> None:
     assert verbs == {"fits", "reaches", "move", "slide", "leave", "clear_of_view", "stop", "wait", "tip"}
     assert set(ROBOTS) == {"stick", "sawyer", "panda"}
     world = PhysicsWorld()
-    for robot in (robot_maker("stick")(world), robot_maker("panda")(world)):
+    for robot in (robot_factory("stick")(world), robot_factory("panda")(world)):
         assert all(callable(getattr(robot, verb)) for verb in verbs)
     assert isinstance(robot, ArmRobot)
     world.close()

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from envs.objects.shapes import BUILTIN_NAMES
 from envs.physics import PhysicsWorld
-from envs.robots import OFF_STAGE, SETTLED_SPEED, STICK_RADIUS
+from envs.robots import RETRACTED, SETTLED_SPEED, STICK_RADIUS
 from envs.scene import COLORS, MOVED, TURNED, PushReport, Scene
 from envs.sensors.camera import Camera
 from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, normalised_push, push_endpoints
@@ -152,7 +152,7 @@ def test_the_tool_leaves_the_view_after_a_push(
     scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
     report = scene.push(push(0.55 if onto_the_cube else 0.4, 0.0, 0.0, 0.1))
     assert report.unsafe == onto_the_cube
-    assert OFF_STAGE[2] > scene.camera.position[2]
+    assert RETRACTED[2] > scene.camera.position[2]
     in_view = set(np.unique(scene.world.render(scene.camera).bodies).tolist())
     assert in_view - {-1} == {0, scene.bodies[0]}  # the table and the cube
 
@@ -279,7 +279,7 @@ def test_the_tool_fits_into_a_mug_and_not_into_a_can(scene: Scene, put: Callable
     for body, place in ((mug, floor), (can, scene.ground_truth().positions[1, :2])):
         scene.world.place(tool, (*place, 0.1), (0.0, 0.0, 0.0))
         inside.append(not scene.world.overlaps(tool, body))
-    scene.world.place(tool, OFF_STAGE, (0.0, 0.0, 0.0))
+    scene.world.place(tool, RETRACTED, (0.0, 0.0, 0.0))
     assert inside == [True, False]
 
 

@@ -37,9 +37,13 @@ class CollectionOptions:
         group="policy",
     )
     checkpoint: str | None = option(
-        None, "of policy=model: a shipped one, or the path of one from train; by default contact", group="policy"
+        None,
+        "checkpoint for policy=model: a shipped one, or the path of one from train; by default contact",
+        group="policy",
     )
-    motions: int = option(256, "for each effect, of policy=model", minimum=1, group="policy", limit=10**6)
+    motions: int = option(
+        256, "motions sampled for each effect, for policy=model", minimum=1, group="policy", limit=10**6
+    )
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1, group="data")
     maximum_objects: int = option(
         OBJECT_SLOTS,

@@ -21,11 +21,13 @@ class CheckConfig:
     )
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
-        f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train",
+        f"checkpoint to check: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train",
         group="model",
     )
-    a: str | None = option(None, "a checkpoint to compare with b, instead of checkpoint", group="model")
-    b: str | None = option(None, "the other: both are checked on windows that neither was trained on", group="model")
+    a: str | None = option(None, "first of two checkpoints to compare, in place of checkpoint", group="model")
+    b: str | None = option(
+        None, "second checkpoint to compare; both are checked on windows that neither was trained on", group="model"
+    )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
     data: Any = option("data/pushes", f"{DATA}; preferably the model's training data", group="data")
     output: str | None = option(
@@ -55,7 +57,7 @@ class CalibrateConfig(DeviceOptions):
     defaults: list[Any] = field(default_factory=lambda: ["_self_", "base"])
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
-        f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train",
+        f"checkpoint to calibrate: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train",
         group="model",
     )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
@@ -67,7 +69,9 @@ class CalibrateConfig(DeviceOptions):
     seed: int = seed_option(group="run")
     steps: int = option(1500, "gradient steps", minimum=1, group="training", limit=10**9)
     batch_size: int = option(256, "windows per step", minimum=1, group="training", limit=10**6)
-    learning_rate: float = option(3e-3, "Adam's at the start; it ends at a hundredth of it", above=0, group="training")
+    learning_rate: float = option(
+        3e-3, "learning rate of Adam at the start; it falls to a hundredth of that", above=0, group="training"
+    )
     wake_weight: float = option(
         0.03,
         "weight of -ELBO on real windows beside the loss on generated ones; 0 learns from generated ones alone",
@@ -75,7 +79,9 @@ class CalibrateConfig(DeviceOptions):
         group="training",
     )
     windows: int = option(2000, "held-out windows for measurements", minimum=1, group="data", limit=10**7)
-    samples: int = option(50, "of the guide for each window, in measurements", minimum=2, group="data", limit=10**5)
+    samples: int = option(
+        50, "samples of the guide for each window, in measurements", minimum=2, group="data", limit=10**5
+    )
     repeats: int = option(
         1,
         "windows generated from the first state of each held-out one, in measurements",

@@ -14,7 +14,7 @@ class DeviceOptions:
     device: str = option(
         "cpu",
         "where the networks run: the CPU, or a GPU by CUDA; auto takes the GPU where there is one. Results depend on "
-        "the seed and on this: a GPU rounds otherwise",
+        "the seed and on this: a GPU rounds differently",
         choices="cavin_pyro.config.device.DEVICES",
         group="run",
     )

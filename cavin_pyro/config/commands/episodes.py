@@ -42,14 +42,14 @@ class GeneratedConfig:
 
     tiles: int = option(
         GENERATED["tiles"],
-        "of the bridge, of the region to clear, or of the way to the slot (at most 8): how difficult it is",
+        "number of tiles of the bridge, of the region to clear, or of the way to the slot (at most 8); more are harder",
         minimum=FEWEST,
         maximum=MOST,
         group="task",
     )
     shape: str = option(
         GENERATED["shape"],
-        "of the bridge or of the region, which may also be a block; winding has more than two turns",
+        "shape of the bridge, or of the region, which may also be a block; winding has more than two turns",
         choices=(*SHAPES, ANY_SHAPE),
         group="task",
     )
@@ -58,7 +58,7 @@ class GeneratedConfig:
     )
     seed: int | None = option(
         GENERATED["seed"],
-        "of one layout for all scenes; null generates one for each scene, from its seed",
+        "seed of one layout for all scenes; null generates one for each scene, from the scene's seed",
         minimum=0,
         maximum=MAXIMUM_SEED,
         group="task",
@@ -79,7 +79,7 @@ class EpisodeConfig(DeviceOptions):
     )
     tiles: TilesConfig = field(default_factory=TilesConfig)
     generated: GeneratedConfig = field(default_factory=GeneratedConfig)
-    reward: str = option(ENVIRONMENT["reward"], "reward", choices=("dense", "sparse"), group="task")
+    reward: str = option(ENVIRONMENT["reward"], "reward of the task", choices=("dense", "sparse"), group="task")
     criterion: str = option(
         ENVIRONMENT["criterion"],
         "what ends an episode as a violation: strict, the paper's text; published, the published implementation, "
@@ -99,7 +99,7 @@ class EpisodeConfig(DeviceOptions):
     )
     push_decimals: int | None = option(
         PUSH_DECIMALS,
-        "to how many decimals planned pushes are rounded, so that an episode does not depend on how a machine rounds; "
+        "decimals to which planned pushes are rounded, so that an episode does not depend on how a machine rounds; "
         "null executes them as planned",
         minimum=1,
         limit=6,
@@ -121,8 +121,8 @@ class EpisodeConfig(DeviceOptions):
     )
     checkpoint: str = option(
         f"${{oc.select:planner.default_checkpoint,{DEFAULT_CHECKPOINT}}}",
-        f"a shipped one ({', '.join(CHECKPOINTS)}), or the path of a checkpoint from train; by default the planner's "
-        "own, such as sectar for planner=sectar",
+        f"checkpoint to plan with: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train; by default "
+        "the planner's own, such as sectar for planner=sectar",
         group="model",
     )
     success_probability: str | None = option(
@@ -150,7 +150,7 @@ class PlanConfig(EpisodeConfig):
         group="run",
     )
     viewer: str | None = option(
-        None, "rerun also writes a recording in 3D, episode.rrd; needs the extra .[viewer]", group="run"
+        None, "further viewer; rerun writes a recording in 3D, episode.rrd, and needs the extra .[viewer]", group="run"
     )
 
 

@@ -13,11 +13,13 @@ class LaunchOptions:
 
     launcher: str = option(
         "local",
-        "local runs episodes in processes of this machine (workers); ray on all processors of a Ray cluster; needs the "
-        "extra .[ray]",
+        "where episodes run: local, in processes of this machine (workers); ray, on all processors of a Ray cluster, "
+        "which needs the extra .[ray]",
         choices=("local", "ray"),
         group="run",
     )
     address: str | None = option(
-        None, "of a running Ray cluster, host:6379; by default one on this machine is started", group="run"
+        None,
+        "address of a running Ray cluster, host:6379; by default one on this machine is started",
+        group="run",
     )

@@ -49,14 +49,14 @@ class ReproduceConfig(DeviceOptions):
     )
     episodes: int | None = option(
         None,
-        "per cell of the top row; by default the scale's. A finished run goes on to more",
+        "episodes per cell of the top row; by default the scale's. A finished run goes on to more",
         minimum=1,
         group="run",
         limit=10**6,
     )
     bottom_episodes: int | None = option(
         None,
-        "per cell of the bottom row and of the variants; by default the scale's",
+        "episodes per cell of the bottom row and of the variants; by default the scale's",
         minimum=1,
         group="run",
         limit=10**6,

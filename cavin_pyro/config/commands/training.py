@@ -23,17 +23,20 @@ class TrainerConfig:
     batch_size: int = option(64, "windows per step", minimum=1, group="trainer", limit=65_536)
     optimizer: str = option(
         "adam",
-        "muon for matrices of weights and Adam for the rest takes fewer steps",
+        "optimizer of the weights; muon for matrices and Adam for the rest takes fewer steps",
         choices="cavin_pyro.training.optimizers.OPTIMIZERS",
         group="trainer",
     )
-    learning_rate: float = option(1e-4, "the optimizer's", above=0, group="trainer")
+    learning_rate: float = option(1e-4, "learning rate of the optimizer", above=0, group="trainer")
     schedule: str = option(
-        "constant", "of the learning rate; cosine ends at a hundredth of it", choices=SCHEDULES, group="trainer"
+        "constant",
+        "schedule of the learning rate; cosine ends at a hundredth of the initial rate",
+        choices=SCHEDULES,
+        group="trainer",
     )
     batches: str = option(
         "mixed",
-        "bucketed by object count: every batch has windows with one number of objects, without padding",
+        "windows of a batch; bucketed fills each batch with windows of one number of objects, without padding",
         choices=BATCHES,
         group="trainer",
     )
@@ -84,13 +87,25 @@ class WindowConfig:
         0.1, "share of the episodes that is held out for validation", minimum=0, maximum=1, group="windows"
     )
     maximum_step: float = option(
-        0.2, "a transition counts for f if every object moved less", unit="metres", above=0, group="windows"
+        0.2,
+        "upper bound on the displacement of every object in a transition for f",
+        unit="metres",
+        above=0,
+        group="windows",
     )
     minimum_move: float = option(
-        0.1, "a window counts for h and g if some object moved farther ...", unit="metres", minimum=0, group="windows"
+        0.1,
+        "least displacement of the farthest-moving object in a window for h and g",
+        unit="metres",
+        minimum=0,
+        group="windows",
     )
     maximum_move: float = option(
-        0.5, "... none farther than this, and every push was safe", unit="metres", minimum=0, group="windows"
+        0.5,
+        "largest displacement of the farthest-moving object in a window for h and g, whose pushes are also all safe",
+        unit="metres",
+        minimum=0,
+        group="windows",
     )
     negative_fraction: float = option(
         0.25,
@@ -173,5 +188,5 @@ class PretrainConfig(DeviceOptions):
     )
     steps: int = option(6000, "gradient steps", minimum=1, group="training", limit=10**9)
     batch_size: int = option(128, "clouds per step", minimum=1, group="training", limit=65_536)
-    learning_rate: float = option(1e-3, "Adam's", above=0, group="training")
+    learning_rate: float = option(1e-3, "learning rate of Adam", above=0, group="training")
     autoencoder: Any = None

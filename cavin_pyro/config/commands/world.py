@@ -19,19 +19,25 @@ class RangesConfig:
     """Distributions of objects and their parameters (section `env.ranges`; presets `env/ranges=`)."""
 
     names: list[str] | None = option(None, "objects to sample from; by default all of env.objects", group="objects")
-    target: list[str] | None = option(None, "objects to sample the target from; by default names", group="objects")
-    scale: Any = option(list(ObjectRanges.scale), "factor on size: low, high", group="objects")
+    target: list[str] | None = option(
+        None, "objects to sample the target from; by default those of names", group="objects"
+    )
+    scale: Any = option(list(ObjectRanges.scale), "factor on each object's size: low, high", group="objects")
     mass: Any = option(list(ObjectRanges.mass), "factor on each object's own mass: low, high", group="objects")
     kilograms: Any = option(
         None, "mass of every object in place of the factor: low, high", unit="kilograms", group="objects"
     )
-    friction: Any = option(list(ObjectRanges.friction), "Coulomb coefficient: low, high", group="objects")
+    friction: Any = option(list(ObjectRanges.friction), "Coulomb coefficient of friction: low, high", group="objects")
     clearance: float = option(
-        ObjectRanges.clearance, "between centres at the start", unit="metres", minimum=0, group="objects"
+        ObjectRanges.clearance,
+        "least distance between the objects' centres at the start",
+        unit="metres",
+        minimum=0,
+        group="objects",
     )
     drop_height: float = option(
         ObjectRanges.drop_height,
-        "above the table, from which objects are dropped; 0: just above the table",
+        "height above the table from which objects are dropped; 0 drops them from just above it",
         unit="metres",
         minimum=0,
         group="objects",
@@ -45,7 +51,7 @@ class WorldConfig:
 
     robot: Any = option(
         ENVIRONMENT["robot"],
-        "what pushes",
+        "robot that pushes",
         choices="envs.robots.ROBOTS",
         group="world",
     )

@@ -28,6 +28,10 @@ def assess_aggregate(context: CheckContext, *, windows: int = 1000, permutations
     For every validation window, one code is sampled from each: from q(. | window), and from p(c | s), p(z | s, c) with
     the prior's own c, as a planner samples them. The energy distance with permutations tests a whole code (and both
     codes together), the Kolmogorov-Smirnov test each dimension.
+
+    Args:
+        windows: held-out windows, at most.
+        permutations: number of permutations of the energy distance's test.
     """
     if not context.codes:
         return without_codes(NAME, TITLE)

@@ -36,7 +36,10 @@ def assess_amortization(
     `samples` particles of the refined guide, which lies below the evidence.
 
     Args:
-        steps, particles: of the optimization. samples: to evaluate both guides with the same noise.
+        windows: held-out windows, at most.
+        steps: gradient steps of the refinement.
+        particles: samples of the codes per gradient step.
+        samples: samples of the codes with which each guide is evaluated, from the same noise.
     """
     if not context.codes:
         return without_codes(NAME, TITLE)

@@ -48,7 +48,7 @@ SCALES = {  # label, unit, and how many of the unit are one of the program's
 }
 TOLERANCE = 0.05  # a 90 % interval that holds this much more or less is called too wide or too narrow
 
-Scores = Mapping[str, Mapping[str, Mapping[str, dict[str, Any]]]]  # predictor, group, coordinate: as of `scores`
+Scores = Mapping[str, Mapping[str, Mapping[str, dict[str, Any]]]]  # predictor, group, coordinate: as in `scores`
 
 EXPLANATION = """
 {samples} samples of each prediction of {windows} held-out windows, in all of which some object moved more than
@@ -71,7 +71,8 @@ def assess_calibration(context: CheckContext, *, windows: int = 400, samples: in
     """Coverage, PIT, CRPS and energy scores of f's and h's predictions.
 
     Args:
-        windows: of `context.validation` at most. samples: of each prediction.
+        windows: held-out windows, at most.
+        samples: samples of each prediction.
     """
     (window, episodes), model = context.held_out(windows), context.model
     energy: dict[str, float] = {}

@@ -58,8 +58,11 @@ def assess_codes(
     """Active dimensions, nats per dimension, and information, on validation windows.
 
     Args:
-        windows: for dimensions and KL. samples: of the codes of each. pairs: windows among which the aggregate
-            posterior is estimated (its cost grows with the square), and generated windows. particles: of each of these.
+        windows: held-out windows for dimensions and KL, at most.
+        samples: samples of the codes of each window.
+        pairs: windows among which the aggregate posterior is estimated (its cost grows with the square), and
+            generated windows.
+        particles: samples of the guide for each generated window.
     """
     if not context.codes:
         return without_codes(NAME, TITLE)

@@ -52,10 +52,15 @@ def check_objects(model: Model, objects: int) -> None:
 
 
 def assess_consistency(context: CheckContext, *, scenes: int = 150, objects: int = 3, samples: int = 1024) -> Section:
-    """Execute plans for subgoals in `scenes` sampled scenes of `objects` objects, N = `samples` where a code is chosen.
+    """Execute plans for subgoals in sampled scenes.
 
-    values: `scenes`, `objects`, `samples`, and `selections`, a list with one entry per way to obtain the codes, with
-    its names `effect` and `motion` and the numbers of `measure`.
+    The section's `values` hold the arguments, and as `selections` a list with one entry per way to obtain the codes,
+    with its names `effect` and `motion` and the numbers of `measure`.
+
+    Args:
+        scenes: number of scenes to sample.
+        objects: number of objects in a scene, at most as many as the model knows.
+        samples: N, candidates where a code is chosen from several.
 
     Raises:
         UserError: the model does not know so many objects.

@@ -24,7 +24,9 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
     user's own model) stand under their own names. A term of a window is its mean over samples from the guide.
 
     Args:
-        windows: at most so many of each. batch: bounds the memory.
+        windows: training windows, and as many held-out ones, at most.
+        samples: samples of the guide for each window.
+        batch: windows that are computed at once, which bounds the memory.
     """
     parts = {
         "training": context.trained_on(windows),

@@ -38,7 +38,12 @@ fewer episodes.
 
 @torch.no_grad()
 def assess_growth(context: CheckContext, *, episodes: int = 40, segments: int = 10) -> Section:
-    """Errors after 1 to `segments` segments in `episodes` new episodes, simulated here."""
+    """Errors after each segment of new episodes, simulated here.
+
+    Args:
+        episodes: number of episodes to simulate.
+        segments: number of segments of an episode, T pushes each.
+    """
     T = context.validation.segment_length
     known = context.model.maximum_objects
     recording = record(

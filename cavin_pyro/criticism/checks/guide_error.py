@@ -48,8 +48,10 @@ def assess_guide_error(
     The first is the chain of the second and the fourth: KL(q(c,z) | p) = KL(q(c) | p) + E KL(q(z|c) | p).
 
     Args:
-        windows: used for all but effect_code, which has `inner_windows` of them.
+        windows: held-out windows for all targets but effect_code, at most.
         particles: values of K; 1 gives the ELBO, the largest is the number of samples.
+        inner_windows: of these windows, those for effect_code.
+        inner_particles: samples of the motion code for each sample of the effect code, in r(c).
     """
     if not context.codes:
         return without_codes(NAME, TITLE)

@@ -52,7 +52,8 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     """Prior and posterior predictive checks on held-out windows.
 
     Args:
-        windows: of `context.validation` at most. replicates: datasets generated per source.
+        windows: held-out windows, at most.
+        replicates: datasets generated per source.
     """
     window, episodes = context.held_out(windows)
     nearness = Nearness.of(observed(context.training))

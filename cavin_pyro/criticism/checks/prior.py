@@ -54,8 +54,9 @@ def assess_prior(context: CheckContext, *, windows: int = 1000, samples: int = 5
     """Classifier two-sample test, expected coverage and decoded statistics of (s, c, z) on held-out windows.
 
     Args:
-        windows: of `context.validation` at most. samples: of the prior for the expected coverage. permutations: of the
-            classifier's test.
+        windows: held-out windows, at most.
+        samples: samples of the prior for each window, for the expected coverage.
+        permutations: number of permutations of the classifier's test.
     """
     if not context.codes:
         return without_codes(NAME, TITLE)

@@ -52,7 +52,8 @@ def assess_simulation(context: CheckContext, *, windows: int = 1000, samples: in
     """Ranks and coverage of the guide's intervals for codes drawn from the prior.
 
     Args:
-        windows: first states of so many held-out windows. samples: of the guide, for each generated window.
+        windows: held-out windows whose first states are used, at most.
+        samples: samples of the guide for each generated window.
         repeats: windows that are generated from each first state.
     """
     if not context.codes:

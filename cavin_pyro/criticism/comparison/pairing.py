@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.loading import Accept, Loaded, context_of, counted_windows, load_trained
+from cavin_pyro.criticism.loading import Accept, Loaded, context_of, load_trained, unmasked_windows
 from cavin_pyro.criticism.training_data import compare_data
 from cavin_pyro.data.world import collecting_world
 
@@ -32,20 +32,20 @@ def load_pair(config: DictConfig, accept: Accept | None = None) -> dict[str, tup
             f"a and b cannot be compared on the same windows: they have segments of {lengths['a']} and {lengths['b']} "
             f"pushes and hold out the objects {held_out_objects[0]} and {held_out_objects[1]}"
         )
-    starts = [one.table.starts[counted_windows(one.table, _unseen(one))] for one in both.values()]
+    starts = [one.table.starts[unmasked_windows(one.table, _unseen(one))] for one in both.values()]
     common = starts[0][torch.isin(starts[0], starts[1])].sort().values
     if not len(common):
         raise UserError("no window was held out by both a and b: give other data=, on which neither was trained")
     contexts = {}
     for name, loaded in both.items():
         order = tables[name].starts.argsort()
-        numbers = order[torch.searchsorted(tables[name].starts[order], common)]
-        contexts[name] = context_of(config, loaded, world, numbers)
+        indices = order[torch.searchsorted(tables[name].starts[order], common)]
+        contexts[name] = context_of(config, loaded, world, indices)
     return contexts
 
 
 def _unseen(loaded: Loaded) -> torch.Tensor:
-    """Numbers of the windows that a model was not trained on: the held-out ones, or all of other data."""
+    """Indices of the windows that a model was not trained on: the held-out ones, or all of other data."""
     table, trained = loaded.table, loaded.checkpoint.provenance
     if all(compare_data(folder, trained)["same"] is False for folder in loaded.folders):
         return torch.cat((table.training, table.validation))

@@ -22,7 +22,7 @@ def draw_failures(path: Path, counted: Sequence[Mapping[str, Any]], *, planner: 
     """One bar per task and method, as high as its share of failures.
 
     Args:
-        counted: as of `failures.failures`.
+        counted: as in `failures.failures`.
     """
     own = [one for one in counted if (one["planner"], one["criterion"]) == (planner, criterion)]
     tasks = list(dict.fromkeys(one["task"] for one in own))

@@ -80,11 +80,19 @@ class ContactDynamics(PushOutcome):
         reach_margin: float | None = None,
         equivariant: bool = False,
     ) -> None:
-        """Widths of the layers for an object, a pair and an object's shape; `width`, of the state encoder, is not read.
+        """The layers.
 
-        `reach_margin`: metres, by which a push may pass an object that it can move; None, and all are within reach.
-        `equivariant`: to turns and shifts of the table.
-        Raises `ValueError` for features that are no outlines and for a negative margin.
+        Args:
+            feature_dimension: numbers of an outline.
+            width: width of the state encoder, which f does not read.
+            object_width: width of the layers for an object.
+            pair_width: width of the layers for a pair of objects.
+            shape_width: width of the layers for the change of an object's shape.
+            reach_margin: metres by which a push may pass an object that it can move; None computes all objects.
+            equivariant: whether f is equivariant to turns and shifts of the table.
+
+        Raises:
+            ValueError: features that are no outlines, or a negative margin.
         """
         if feature_dimension != FEATURES:
             raise ValueError(f"dynamics=contact reads outlines with {FEATURES} numbers, not {feature_dimension}")

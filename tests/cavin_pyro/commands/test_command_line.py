@@ -116,6 +116,68 @@ def test_help_says_of_every_option_of_a_part_a_whole_sentence_of_its_own(command
     assert len(set(told)) == len(told)
 
 
+UNREAD_BY_RANDOM = "planner.compile"  # which `plan` sets for every planner
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_says_of_every_option_what_it_means(command: str, pages: dict[str, str]) -> None:
+    assert not _without_meaning(pages[command])
+
+
+@pytest.mark.parametrize(
+    ("command", "group", "choice"),
+    [
+        (command, group, choice)
+        for command, groups in {
+            "train": ("model", "guide", "prior", "geometry", "dynamics", "scales", "objective"),
+            "plan": ("task", "planner", "planner/optimizer"),
+            "check": ("sizes",),
+        }.items()
+        for group in groups
+        for choice in presets(group)
+    ],
+)
+def test_help_says_of_every_option_of_a_preset_what_it_means(command: str, group: str, choice: str) -> None:
+    page = help_page(command, "What it does.", check_overrides(command, [f"{group}={choice}"]))
+    assert not _without_meaning(page) - ({UNREAD_BY_RANDOM} if choice == "random" else set())
+
+
+def test_help_reads_what_a_constructor_or_a_function_says_of_its_arguments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_help.py").write_text(OWN_PARTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    page = help_page("train", "What it does.", check_overrides("train", ["guide._target_=my_help.Wide"]))
+    assert re.search(r"guide\.width=64 +width of my layers\n", page)
+    page = help_page("check", "What it does.", check_overrides("check", ["sizes.elbo._target_=my_help.assess"]))
+    assert re.search(r"sizes\.elbo\.windows=1000 +my windows, at most\n", page)
+    assert "the function; name one of your own" in page
+
+
+OWN_PARTS = '''
+class Wide:
+    def __init__(self, width=64):
+        """My layers.
+
+        `width`: width of my layers. `depth`: how many.
+        """
+
+
+def assess(context, *, windows=1000, samples=4, batch=256):
+    """My section.
+
+    Args:
+        windows: my windows, at most. samples, batch: sizes.
+    """
+'''
+
+
+def _without_meaning(page: str) -> set[str]:
+    """The options on a page of help that have no text."""
+    listed = re.findall(r"(?m)^  ([a-z_./]+)=((?:.*\n(?: {34}.*\n)*))", page)
+    return {option for option, text in listed if not re.search(r"\s\S", re.sub(r"^\S*", "", text))}
+
+
 def _plain(command: str) -> dict:
     found = OmegaConf.to_container(compose(command))
     assert isinstance(found, dict)

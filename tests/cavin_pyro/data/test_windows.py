@@ -58,7 +58,7 @@ def load(folder: Path, arrays: Arrays, config: WindowConfig = EVERY, **more: int
     return load_windows([write(folder / "data", arrays)], PointNet(), config, **more)
 
 
-def counted_windows(table: WindowTable) -> set[tuple[int, int]]:
+def unmasked_windows(table: WindowTable) -> set[tuple[int, int]]:
     """(place of the episode, first step) of the windows that count for h and g."""
     starts = table.starts[table.sequence_mask].tolist()
     return {divmod(start, POSITIONS) for start in starts}
@@ -82,7 +82,7 @@ ALL_TRANSITIONS = {(episode, step) for episode in range(12) for step in range(ST
 
 def test_every_window_and_transition_of_good_episodes_counts(tmp_path: Path) -> None:
     table = load(tmp_path, episodes())
-    assert counted_windows(table) == ALL_WINDOWS
+    assert unmasked_windows(table) == ALL_WINDOWS
     assert counted_transitions(table) == ALL_TRANSITIONS
     assert len(table.starts) == len(ALL_WINDOWS)
 
@@ -96,14 +96,14 @@ def test_windows_count_if_an_object_moved_more_than_10_cm_and_none_more_than_50(
     arrays = episodes()
     arrays["centers"][4, :, 0] = arrays["centers"][4, 0, 0]
     arrays["centers"][4, 1:, 0, 1] += moved  # with the first push, then it stays
-    windows = counted_windows(load(tmp_path, arrays))
+    windows = unmasked_windows(load(tmp_path, arrays))
     assert windows == ALL_WINDOWS - {(4, 0), (4, 1), (4, 2)} | ({(4, 0)} if counts else set())
 
 
 def test_the_object_that_moved_farthest_decides_whether_a_window_counts(tmp_path: Path) -> None:
     arrays = episodes()
     arrays["centers"][4, 3:, 1, 1] += 0.52
-    assert counted_windows(load(tmp_path, arrays)) == ALL_WINDOWS - {(4, 0), (4, 1), (4, 2)}
+    assert unmasked_windows(load(tmp_path, arrays)) == ALL_WINDOWS - {(4, 0), (4, 1), (4, 2)}
 
 
 @pytest.mark.parametrize(("moved", "counts"), [(0.198, True), (0.202, False)])
@@ -119,7 +119,7 @@ def test_windows_with_an_unsafe_push_do_not_count_but_its_transition_does(tmp_pa
     arrays["unsafe"][4, 0] = True
     arrays["unsafe"][5, 4] = True
     table = load(tmp_path, arrays)
-    assert counted_windows(table) == ALL_WINDOWS - {(4, 0), (5, 2)}
+    assert unmasked_windows(table) == ALL_WINDOWS - {(4, 0), (5, 2)}
     assert counted_transitions(table) == ALL_TRANSITIONS
 
 
@@ -127,7 +127,7 @@ def test_neither_windows_nor_transitions_count_in_which_an_object_fell(tmp_path:
     arrays = episodes()
     arrays["fallen"][4, 4] = True
     table = load(tmp_path, arrays)
-    assert counted_windows(table) == ALL_WINDOWS - {(4, 2)}
+    assert unmasked_windows(table) == ALL_WINDOWS - {(4, 2)}
     assert counted_transitions(table) == ALL_TRANSITIONS - {(4, 4)}
 
 
@@ -136,7 +136,7 @@ def test_objects_must_be_visible_at_both_ends_of_a_window_or_transition(tmp_path
     arrays["visible"][4, 2, 1] = False
     arrays["visible"][5, 4, 0] = False
     table = load(tmp_path, arrays)
-    assert counted_windows(table) == ALL_WINDOWS - {(4, 2), (5, 1)}
+    assert unmasked_windows(table) == ALL_WINDOWS - {(4, 2), (5, 1)}
     assert counted_transitions(table) == ALL_TRANSITIONS - {(4, 1), (4, 2), (5, 3), (5, 4)}
 
 
@@ -146,7 +146,7 @@ def test_padding_counts_neither_as_moved_nor_as_hidden(tmp_path: Path) -> None:
     arrays["visible"][:, :, 1] = False
     arrays["centers"][:, ::2, 1, 1] += 0.6
     table = load(tmp_path, arrays)
-    assert counted_windows(table) == ALL_WINDOWS
+    assert unmasked_windows(table) == ALL_WINDOWS
     assert counted_transitions(table) == ALL_TRANSITIONS
     assert table.batch(torch.arange(3)).states.objects == 1
 
@@ -158,7 +158,7 @@ def test_nothing_counts_after_an_episodes_end(length: int, tmp_path: Path) -> No
     table = load(tmp_path, arrays)
     places = {divmod(start, POSITIONS) for start in table.starts.tolist()}
     assert {step for episode, step in places if episode == 4} == set(range(length - 2))
-    assert counted_windows(table) == places
+    assert unmasked_windows(table) == places
     assert counted_transitions(table) == ALL_TRANSITIONS - {
         (4, step) for step in range(length if length > 2 else 0, STEPS)
     }

@@ -45,7 +45,7 @@ class Still(RandomPlanner):
 
 
 class Rounding(RandomPlanner):
-    """Random pushes from a machine that rounds otherwise, by `error`."""
+    """Random pushes from a machine that rounds differently, by `error`."""
 
     error = 0.0
 

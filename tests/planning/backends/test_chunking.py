@@ -11,7 +11,7 @@ from planning import CvaeMpcPlanner, Planner
 from planning.backends import chunking
 from tests.planning.conftest import same, tensors
 
-MAKERS: dict[str, Callable[[SimpleNamespace], Planner]] = {
+FACTORIES: dict[str, Callable[[SimpleNamespace], Planner]] = {
     "cavin": lambda toy: toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.4, 0.0)), samples=32, horizon=9),
     "inference": lambda toy: toy.plain(
         toy.PointMass(), toy.GoalDisc(goal=(0.4, 0.0)), samples=32, horizon=9, optimizer="smc"
@@ -21,11 +21,11 @@ MAKERS: dict[str, Callable[[SimpleNamespace], Planner]] = {
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5])
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", FACTORIES)
 def test_plans_do_not_depend_on_the_size_of_chunks(
     toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, name: str, size: int
 ) -> None:
-    planner = MAKERS[name](toy)
+    planner = FACTORIES[name](toy)
     state = toy.scenes([[(0.1 * number, 0.0)] for number in range(5)])
     at_once, generators = planner.plan(state, toy.generators(*range(5))), toy.generators(*range(5))
     monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", size)
@@ -53,4 +53,4 @@ def test_a_hopeless_environment_is_named_by_its_number_in_the_whole_batch(
     monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", 2)
     state = toy.scenes([[(0.0, 0.0)]] * 3 + [[(float("nan"), 0.0)]])
     with pytest.raises(ValueError, match=r"^environment 3: none of the 32 returns .* is finite"):
-        MAKERS["cavin"](toy).plan(state, toy.generators(*range(4)))
+        FACTORIES["cavin"](toy).plan(state, toy.generators(*range(4)))

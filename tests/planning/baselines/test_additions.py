@@ -44,10 +44,10 @@ def without_effects(toy: SimpleNamespace, reward: object, **options: Any) -> Cav
     return CavinWithoutEffectsPlanner(toy.PointMass(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
 
 
-MAKERS: list[Callable[..., SearchingPlanner]] = [sectar, cvae_mpc, mpc, without_effects]
+FACTORIES: list[Callable[..., SearchingPlanner]] = [sectar, cvae_mpc, mpc, without_effects]
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize("make", FACTORIES)
 def test_without_additions_the_first_of_the_highest_returns_wins(make: Callable, toy: SimpleNamespace) -> None:
     state = toy.scenes([[(0.0, 0.0)], [(0.1, 0.0)]])
     plan = make(toy, toy.GoalDisc((0.25, 0.0), dense=True), **OFF).plan(state, toy.generators(1, 2))
@@ -58,7 +58,7 @@ def test_without_additions_the_first_of_the_highest_returns_wins(make: Callable,
     torch.testing.assert_close(found, ends)
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize("make", FACTORIES)
 def test_a_plan_with_additions_does_not_depend_on_its_neighbours(make: Callable, toy: SimpleNamespace) -> None:
     planner = make(toy, toy.GoalDisc((0.25, 0.0), forbidden_below=-0.05))
     assert planner.robustness == PerturbedRollouts() and planner.idle_distance == 0.01
@@ -70,7 +70,7 @@ def test_a_plan_with_additions_does_not_depend_on_its_neighbours(make: Callable,
     torch.testing.assert_close(both.planned_actions[1], alone.planned_actions[0])
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize("make", FACTORIES)
 def test_the_first_segment_stays_farther_from_forbidden_places(make: Callable, toy: SimpleNamespace) -> None:
     # Outcomes in y spread by half of the distance that f predicts.
     reward, state = toy.GoalDisc((0.2, 0.0), radius=0.1, forbidden_below=-0.01), toy.scenes([[(0.0, 0.0)]] * 8)
@@ -84,7 +84,7 @@ def test_the_first_segment_stays_farther_from_forbidden_places(make: Callable, t
     assert shares[1] < 0.7 * shares[0]
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize("make", FACTORIES)
 def test_where_nothing_fails_the_highest_return_wins(make: Callable, toy: SimpleNamespace) -> None:
     # Not the pushes that do least: they never fail, and come closest to their own subgoals.
     state, reward = toy.scenes([[(0.0, 0.0)]] * 8), toy.GoalDisc((0.25, 0.0), radius=0.15)
@@ -94,7 +94,7 @@ def test_where_nothing_fails_the_highest_return_wins(make: Callable, toy: Simple
     assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize("make", FACTORIES)
 def test_a_risky_way_to_the_goal_comes_before_doing_nothing(make: Callable, toy: SimpleNamespace) -> None:
     state, reward = toy.scenes([[(0.0, 0.02)]] * 8), toy.GoalDisc((0.2, 0.02), radius=0.1, forbidden_below=0.0)
     plan = make(toy, reward).plan(state, toy.generators(*range(8)))

@@ -38,37 +38,37 @@ def target_reward(toy: SimpleNamespace, **options: object) -> object:
 
 def test_the_target_comes_first_and_then_the_nearest_in_their_order(toy: SimpleNamespace) -> None:
     near = nearest_objects(scene(), 4, target_reward(toy))
-    assert near.numbers.tolist() == [[0, 2, 4, 5]]
+    assert near.indices.tolist() == [[0, 2, 4, 5]]
     assert near.of(scene()).features.flatten().tolist() == [0.0, 2.0, 4.0, 5.0]
 
 
 def test_padding_is_never_nearer_than_an_object(toy: SimpleNamespace) -> None:
     near = nearest_objects(scene(real=4), 3, target_reward(toy))  # 4 and 5, which are padding, lie near
-    assert near.numbers.tolist() == [[0, 2, 3]]
+    assert near.indices.tolist() == [[0, 2, 3]]
 
 
 @pytest.mark.parametrize("most", [6, 7, None])
 def test_all_objects_count_where_there_are_few(toy: SimpleNamespace, most: int | None) -> None:
-    assert nearest_objects(scene(), most, target_reward(toy)).numbers is None
+    assert nearest_objects(scene(), most, target_reward(toy)).indices is None
 
 
 def test_all_objects_count_where_the_goal_is_about_them(toy: SimpleNamespace) -> None:
-    assert nearest_objects(scene(), 4, about(toy.GoalDisc(goal=(0.2, 0.0)), "all")).numbers is None
-    assert nearest_objects(scene(), 4, toy.GoalDisc(goal=(0.2, 0.0))).numbers is None  # it does not say
+    assert nearest_objects(scene(), 4, about(toy.GoalDisc(goal=(0.2, 0.0)), "all")).indices is None
+    assert nearest_objects(scene(), 4, toy.GoalDisc(goal=(0.2, 0.0))).indices is None  # it does not say
     found = {name: nearest_objects(scene(), 4, TaskReward(load_task(name))) for name in ("clearing", "crossing")}
-    assert found["clearing"].numbers is None
-    assert found["crossing"].numbers is not None
+    assert found["clearing"].indices is None
+    assert found["crossing"].indices is not None
 
 
 @given(st.permutations(range(1, 6)), st.integers(1, 5))
 def test_objects_go_back_to_their_places(order: list[int], most: int) -> None:
-    state, numbers = scene(), torch.tensor([sorted([0, *order[:most]])])
-    near = NearestObjects(numbers)
+    state, indices = scene(), torch.tensor([sorted([0, *order[:most]])])
+    near = NearestObjects(indices)
     part = near.of(state.expand_plans(2))
     moved = part._replace(centers=part.centers + 1.0)
     whole = near.among(state, moved)
     expected = state.centers.clone()
-    expected[0, numbers[0]] += 1.0
+    expected[0, indices[0]] += 1.0
     assert torch.equal(whole.centers, expected.unsqueeze(1).expand(1, 2, 6, 3))
     assert torch.equal(whole.features[:, 0], state.features)
     assert torch.equal(whole.mask[:, 1], state.mask)
