@@ -225,8 +225,9 @@ def test_the_oracle_foretells_pushes_without_touching_the_episode() -> None:
         start = 2.0 * (target - (0.08, 0.0) - box[0]) / (box[1] - box[0]) - 1.0
         action = np.array([*start, 0.9, 0.1], dtype=np.float32)
         before = env.scene.ground_truth()
-        foretold = mirror.outcome(action[None])
-        assert not np.allclose(foretold, mirror.outcome(np.zeros((0, 4), dtype=np.float32)), atol=0.01)
+        foretold = mirror.path(action[None])[-1]
+        nothing = np.array([[0.95, 0.95, 0.0, 0.0]], dtype=np.float32)  # beside all objects, and not a way at all
+        assert not np.allclose(foretold, mirror.path(nothing)[-1], atol=0.01)
         after = env.scene.ground_truth()
         assert np.array_equal(before.positions, after.positions)
         assert np.array_equal(before.orientations, after.orientations)
