@@ -186,9 +186,10 @@ def _stop(line: str, status: int) -> NoReturn:
 
 def _check(name: str) -> tuple[CommandLine, DictConfig]:
     """Check the overrides of every run. Returns the command line and the configuration of its last run."""
-    from cavin_pyro.config.composition import check_overrides, presets_by_name, sweeps
+    from cavin_pyro.config.composition import check_overrides, sweeps
+    from cavin_pyro.config.rewriting import rewritten
 
-    sys.argv[1:] = presets_by_name(multirun_first(sys.argv[1:]))
+    sys.argv[1:] = rewritten(multirun_first(sys.argv[1:]))
     line = read_command_line(sys.argv[1:])
     for overrides in sweeps(line.overrides) if line.multirun else [line.overrides]:
         config = check_overrides(name, overrides, line.config_dir)

@@ -25,6 +25,7 @@ from cavin_pyro.config.constructors import check_parts, constructor_options
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import check_options, kind, shown, types
 from cavin_pyro.config.registration import register
+from cavin_pyro.config.rewriting import rewritten
 
 register()
 
@@ -35,7 +36,7 @@ def compose(name: str, *overrides: str) -> DictConfig:
     Raises:
         UserError: an invalid override.
     """
-    return completed(name, check_overrides(name, presets_by_name(overrides)))
+    return completed(name, check_overrides(name, rewritten(overrides)))
 
 
 def completed(name: str, config: DictConfig) -> DictConfig:
@@ -100,31 +101,6 @@ def check_overrides(name: str, overrides: list[str], config_dir: str | None = No
 def search_path(*folders: str) -> str:
     """The override that lets presets lie in these folders as well."""
     return f"hydra.searchpath=[{','.join(_in_quotes(f'file://{folder}') for folder in folders)}]"
-
-
-def presets_by_name(overrides: Sequence[str]) -> list[str]:
-    """`planner.optimizer=cem` as `planner/optimizer=cem`, which brings the options of `cem` with it.
-
-    And the class of a part of the world, `env.camera._target_=my_lab.Mine +env.camera.noise=1`, as its section,
-    `env.camera={_target_: my_lab.Mine, noise: 1}`, since parts of ours have names and no section.
-    """
-    named = r"^planner\.optimizer=(?!null$)(?=[A-Za-z_][\w.,]*$)"
-    words = [re.sub(named, "planner/optimizer=", word) for word in overrides]
-    for part in (word.partition("._target_=")[0] for word in overrides if re.match(_OWN_PART, word)):
-        mine = re.compile(rf"\+{{0,2}}{re.escape(part.lstrip('+'))}\.([\w.]+)=(.*)", re.DOTALL)
-        found = [(place, one) for place, word in enumerate(words) if (one := mine.fullmatch(word))]
-        if found:
-            options = {one[1]: one[2] for _, one in found}
-            sections = [  # several for a sweep over classes
-                ", ".join(f"{name}: {value}" for name, value in {**options, "_target_": target}.items())
-                for target in options["_target_"].split(",")
-            ]
-            words[found[0][0]] = f"{part.lstrip('+')}=" + ",".join(f"{{{section}}}" for section in sections)
-            words = [word for place, word in enumerate(words) if place not in {place for place, _ in found[1:]}]
-    return words
-
-
-_OWN_PART = r"\+{0,2}env\.(robot|objects|camera|segmentation)\._target_="
 
 
 def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:

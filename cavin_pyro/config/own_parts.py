@@ -71,7 +71,8 @@ def _checked(value: Named, part: str, protocol: type) -> Any:
 
 
 def _section(value: Mapping[str, Any] | DictConfig) -> dict[str, Any]:
-    return {str(name): one for name, one in OmegaConf.to_container(OmegaConf.create(dict(value))).items()}  # type: ignore[union-attr]
+    section: Any = OmegaConf.to_container(OmegaConf.create(dict(value)))
+    return dict(section)
 
 
 def _made(section: Mapping[str, Any], name: str, protocol: type, *arguments: Any) -> Any:

@@ -8,17 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from cavin_pyro.config.composition import compose
 from cavin_pyro.data.collection import CollectionConfig, collect
-from cavin_pyro.evaluation.factory import make_environment
 from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
 from cavin_pyro.reproduction.stages import preparation
-from envs.workspace import push_endpoints
-from tests.benchmarks.loading import load
 from tests.cavin_pyro.conftest import run_script
 from tests.cavin_pyro.evaluation.success.made_up import evaluation
 from tests.cavin_pyro.shell import ENVIRONMENT
@@ -194,14 +189,6 @@ def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> No
         assert float(milliseconds) > 0 and 0 < float(moved) < 6 and 0 < float(apart) < 20
 
 
-def test_the_simulator_takes_the_place_of_f() -> None:
-    small = ["planner.samples=8", "planner.horizon=3", "maximum_steps=4"]
-    lines = run("oracle", "--episodes", "1", "--objects", "2", "--candidates", "2", "--seed", "5", *small).splitlines()
-    rows = [line.strip("| ").split(" | ") for line in lines[2:]]
-    assert [row[:4] for row in rows] == [["crossing", "2", "5 to 5", name] for name in ("published", "strict")]
-    assert all(re.match(r"[01] of 1: ", cell) for row in rows for cell in row[4:6])
-
-
 def test_pushes_at_the_start_of_a_scene_are_counted() -> None:
     lines = run("starts", "--episodes", "2", "--pushes", "12", "objects=1").splitlines()
     counts = [list(map(int, line.split()[3:])) for line in lines[1:3]]
@@ -209,33 +196,6 @@ def test_pushes_at_the_start_of_a_scene_are_counted() -> None:
         assert tried == 12 and moved > 0 and moved >= nearer and broke + nearer <= tried
     assert sum(nearer for *_, nearer in counts) > 0  # a target that starts where the tool gets behind it
     assert sum(int(line.split()[0]) for line in lines[3:]) == 2
-
-
-def test_the_oracle_foretells_pushes_without_touching_the_episode() -> None:
-    oracle = load("oracle")
-    config = compose("evaluate", "planner=paper", "objects=3")
-    env, alone = make_environment(config), make_environment(config)
-    mirror = oracle.Oracle(config, env, 2)
-    for one in (env, alone, mirror):
-        one.reset(seed=7)
-    targets = env.scene.ground_truth().positions[:, :2]
-    low, high = np.array([(-1.0, -1.0), (1.0, 1.0)])
-    box = np.array([push_endpoints(np.array([*corner, 0.0, 0.0]))[0] for corner in (low, high)])
-    for target in targets[:2]:
-        start = 2.0 * (target - (0.08, 0.0) - box[0]) / (box[1] - box[0]) - 1.0
-        action = np.array([*start, 0.9, 0.1], dtype=np.float32)
-        before = env.scene.ground_truth()
-        foretold = mirror.path(action[None])[-1]
-        nothing = np.array([[0.95, 0.95, 0.0, 0.0]], dtype=np.float32)  # beside all objects, and not a way at all
-        assert not np.allclose(foretold, mirror.path(nothing)[-1], atol=0.01)
-        after = env.scene.ground_truth()
-        assert np.array_equal(before.positions, after.positions)
-        assert np.array_equal(before.orientations, after.orientations)
-        observed, untouched = env.step(action)[0], alone.step(action)[0]
-        assert all(np.array_equal(observed[name], untouched[name]) for name in observed)
-        assert np.allclose(observed["centers"], foretold, atol=0.005)
-    for one in (env, alone, mirror.twin):
-        one.close()
 
 
 def test_samples_are_set_against_success_and_a_finished_setting_is_not_run_again(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 import shlex
 import shutil
 from pathlib import Path
@@ -17,12 +16,10 @@ from cavin_pyro.training.compatibility import check_compatibility
 from models.cascaded import CascadedModel
 from models.state import State, Window
 from tests.cavin_pyro.conftest import ROOT, Answer, run_command
+from tests.how_to.page import Page
 
-PAGE = (ROOT / "docs" / "how-to" / "your-own-guide.md").read_text(encoding="utf-8")
-CODE = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
-FOLLOWS = " ..."  # in the page's table: the line goes on
-TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
+PAGE = Page("your-own-guide")
+CODE = PAGE.code
 
 # The page's commands train for days: these overrides, added to them, shorten each to seconds.
 SHORT = {
@@ -35,7 +32,7 @@ SHORT = {
 
 def commands(name: str) -> list[tuple[str, list[str]]]:
     """The page's commands about one run, with overrides that shorten them."""
-    found = [(command, shlex.split(overrides)) for command, overrides in LINES if f"runs/{name}" in overrides]
+    found = [(command, shlex.split(overrides)) for command, overrides in PAGE.commands if f"runs/{name}" in overrides]
     return [(command, [*overrides, *SHORT[command].split()]) for command, overrides in found]
 
 
@@ -43,15 +40,6 @@ def in_one_line(answer: Answer) -> str:
     assert answer.status == 2, answer.errors
     (line,) = answer.complaints
     return line.removeprefix("error: ")
-
-
-def is_on_the_page(line: str) -> bool:
-    """Whether the page's table has the line, or its beginning."""
-    return any(
-        line == line_of_error
-        or (line_of_error.endswith(FOLLOWS) and line.startswith(line_of_error.removesuffix(FOLLOWS)))
-        for line_of_error in TOLD
-    )
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +82,7 @@ def test_the_commands_of_the_page_work_and_need_trust(
         line = in_one_line(refused)
         assert f"runs/{run}/checkpoint.safetensors asks to run my_lab.{target}" in line
         assert line.endswith("pass 'trust=[my_lab]'")
-        assert is_on_the_page(line) or target != "MyGuide"
+        assert PAGE.tells(line) or target != "MyGuide"
         (output,) = (one.removeprefix("output=") for one in overrides if one.startswith("output="))
         assert not (folder / output).exists()
         done = run_command(command, *overrides, folder=folder)
@@ -110,7 +98,7 @@ def test_the_commands_of_the_page_work_and_need_trust(
 def test_error_lines_are_those_of_the_page(overrides: str, folder: Path) -> None:
     ((_, line),) = (one for one in commands("mine") if one[0] == "train" and "output=runs/mine" in one[1])
     line_of_error = in_one_line(run_command("train", *line, "output=runs/never", *overrides.split(), folder=folder))
-    assert is_on_the_page(line_of_error), line_of_error
+    assert PAGE.tells(line_of_error), line_of_error
     assert not (folder / "runs" / "never").exists()
 
 
@@ -158,4 +146,4 @@ def test_errors_of_incompatible_sites_are_those_of_the_page(mistake: str, window
     model = CascadedModel(width=8)
     with pytest.raises(UserError) as caught:
         check_compatibility(model, module_of(code).MyGuide(model), window)
-    assert is_on_the_page(str(caught.value)), str(caught.value)
+    assert PAGE.tells(str(caught.value)), str(caught.value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,11 @@ from typing import Any
 import pytest
 
 from planning.optimizers import Optimizer
-from tests.cavin_pyro.conftest import ROOT, Case, run_command, run_in_turn
+from tests.cavin_pyro.conftest import Case, run_command, run_in_turn
+from tests.how_to.page import Page
 
-PAGE = (ROOT / "docs" / "how-to" / "your-own-optimizer.md").read_text(encoding="utf-8")
-(CODE,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
-FOLLOWS = " ..."  # in the page's table: the line goes on
-TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
+PAGE = Page("your-own-optimizer")
+(CODE,) = PAGE.code
 SHORT = {  # options that make each of the page's commands a matter of seconds
     "plan": ("maximum_steps=2", "planner.samples=32", "video=false"),
     "evaluate": ("episodes=2", "workers=1", "maximum_steps=2", "planner.samples=32"),
@@ -30,13 +27,6 @@ def own(**options: Any) -> Optimizer:
     exec(compile(CODE, "my_lab.py", "exec"), made)
     optimizer: Optimizer = made["EvolutionStrategy"](**options)
     return optimizer
-
-
-def is_told(line: str) -> bool:
-    """Whether the page's table has the line, or its beginning."""
-    return any(
-        line == told or (told.endswith(FOLLOWS) and line.startswith(told.removesuffix(FOLLOWS))) for told in TOLD
-    )
 
 
 def test_the_class_is_short() -> None:
@@ -64,7 +54,7 @@ def test_it_goes_on_from_the_last_plan(toy: Any) -> None:
     assert planner.plan(state, toy.generators(2), last).expected_success.all()
 
 
-@pytest.mark.parametrize(("command", "options"), LINES)
+@pytest.mark.parametrize(("command", "options"), PAGE.commands)
 def test_the_commands_of_the_page_work(command: str, options: str, tmp_path: Path) -> None:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
     overrides = shlex.split(options)
@@ -102,7 +92,7 @@ def test_errors_of_mistakes_are_those_of_the_page(tmp_path: Path) -> None:
     for name, answer in answers.items():
         (line,) = answer.complaints
         # Where a planner cannot be built, a command names the option as typed.
-        assert is_told(line.removeprefix("error: ").removeprefix("planner.")), f"{name}: {line}"
+        assert PAGE.tells(line.removeprefix("error: ").removeprefix("planner.")), f"{name}: {line}"
 
 
 def test_other_errors_of_a_users_class_keep_their_traceback(tmp_path: Path) -> None:
@@ -117,4 +107,4 @@ def test_other_errors_of_a_users_class_keep_their_traceback(tmp_path: Path) -> N
 def test_what_is_no_optimizer_is_refused(optimizer: Any, toy: Any) -> None:
     with pytest.raises(ValueError) as error:
         toy.plain(toy.PointMass(), toy.GoalDisc(goal=(0.6, 0.0)), optimizer=optimizer)
-    assert is_told(str(error.value)), str(error.value)
+    assert PAGE.tells(str(error.value)), str(error.value)

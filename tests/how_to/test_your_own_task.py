@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import sys
 from pathlib import Path
@@ -11,14 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.cavin_pyro.conftest import ROOT, Answer, Case, run_command, run_in_turn
+from tests.cavin_pyro.conftest import Answer, Case, run_command, run_in_turn
+from tests.how_to.page import Page
 
-PAGE = (ROOT / "docs" / "how-to" / "your-own-task.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(?:python|yaml)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-FILES = {block.split()[1]: block for block in BLOCKS}  # the first line is a comment with the file's name
-LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
-FOLLOWS = " ..."  # in the page's table: the line goes on
-TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
+PAGE = Page("your-own-task")
+FILES = {block.split()[1]: block for block in PAGE.code}  # the first line is a comment with the file's name
 OWN = ("task._target_=my_tasks.Sorting", "layout=my_layout.yaml")
 SHORT = {  # options that make each of the page's commands a matter of seconds
     "plan": ("maximum_steps=2", "planner.samples=8"),
@@ -41,19 +37,12 @@ def in_one_line(answer: Answer) -> str:
     return line.removeprefix("error: ")
 
 
-def is_told(line: str) -> bool:
-    """Whether the page's table has the line, or its beginning."""
-    return any(
-        line == told or (told.endswith(FOLLOWS) and line.startswith(told.removesuffix(FOLLOWS))) for told in TOLD
-    )
-
-
 def test_the_page_has_a_class_a_layout_and_a_program() -> None:
     assert set(FILES) == {"my_tasks.py", "my_layout.yaml", "use_it.py"}
     assert len(FILES["my_tasks.py"].splitlines()) <= 30
 
 
-@pytest.mark.parametrize(("command", "options"), LINES)
+@pytest.mark.parametrize(("command", "options"), PAGE.commands)
 def test_the_commands_of_the_page_work(command: str, options: str, folder: Path) -> None:
     overrides = shlex.split(options)
     done = run_command(command, *overrides, *SHORT[command], folder=folder)
@@ -115,5 +104,5 @@ def test_errors_of_mistakes_are_those_of_the_page(folder: Path) -> None:
         {name: Case("plan", [*overrides, "output=never"]) for name, overrides in chosen.items()}, folder
     )
     told = {name: in_one_line(answer) for name, answer in answers.items()}
-    assert [line for line in told.values() if not is_told(line)] == []
+    assert [line for line in told.values() if not PAGE.tells(line)] == []
     assert not list(folder.glob("*/never"))

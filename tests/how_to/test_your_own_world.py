@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavin_pyro.config.composition import compose, presets_by_name
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.rewriting import sections_of_classes
 from envs.pushing import PushingEnv
-from tests.cavin_pyro.conftest import ROOT, run_command
+from tests.cavin_pyro.conftest import run_command
 from tests.cavin_pyro.shell import ENVIRONMENT
+from tests.how_to.page import Page
 
-PAGE = (ROOT / "docs" / "how-to" / "your-own-world.md").read_text(encoding="utf-8")
-CODE, USE = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-LINES = re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", PAGE, re.MULTILINE)
-FOLLOWS = " ..."  # in the page's table: the line goes on
-TOLD = [line.replace("`", "") for line in re.findall(r"^\| [^|]+ \| (`.+) \|$", PAGE, re.MULTILINE)]
+PAGE = Page("your-own-world")
+CODE, USE = PAGE.code
 SHORT = {  # options that make each of the page's commands a matter of seconds
     "plan": ("maximum_steps=2", "planner.samples=32", "video=false"),
     "evaluate": ("episodes=2", "workers=1", "maximum_steps=2", "planner.samples=32"),
@@ -43,13 +42,6 @@ def lab() -> dict[str, Any]:
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
     return tmp_path
-
-
-def is_told(line: str) -> bool:
-    """Whether the page's table has the line, or its beginning."""
-    return any(
-        line == told or (told.endswith(FOLLOWS) and line.startswith(told.removesuffix(FOLLOWS))) for told in TOLD
-    )
 
 
 def test_the_camera_adds_its_noise_and_the_same_seed_the_same(lab: dict[str, Any]) -> None:
@@ -103,7 +95,7 @@ def test_the_robot_pushes(folder: Path) -> None:
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1\n", "")
 
 
-@pytest.mark.parametrize(("command", "options"), LINES)
+@pytest.mark.parametrize(("command", "options"), PAGE.commands)
 def test_the_commands_of_the_page_work(command: str, options: str, folder: Path) -> None:
     overrides = shlex.split(options)
     done = run_command(command, *overrides, *SHORT[command], folder=folder)
@@ -134,10 +126,13 @@ def test_a_dataset_remembers_the_classes_and_refuses_others(folder: Path) -> Non
 
 def test_the_class_of_a_part_becomes_its_section() -> None:
     words = ["env.camera._target_=my_lab.Mine", "seed=3", "+env.camera.noise=0.1", "++env.camera.names=[a,b]"]
-    assert presets_by_name(words) == ["env.camera={_target_: my_lab.Mine, noise: 0.1, names: [a,b]}", "seed=3"]
+    assert sections_of_classes(words) == ["env.camera={_target_: my_lab.Mine, noise: 0.1, names: [a,b]}", "seed=3"]
     swept = ["env.robot.speed=2", "env.robot._target_=my_lab.One,my_lab.Other"]
-    assert presets_by_name(swept) == ["env.robot={speed: 2, _target_: my_lab.One},{speed: 2, _target_: my_lab.Other}"]
-    assert presets_by_name(["env.camera=kinect2", "env.robot=stick"]) == ["env.camera=kinect2", "env.robot=stick"]
+    assert sections_of_classes(swept) == [
+        "env.robot={speed: 2, _target_: my_lab.One},{speed: 2, _target_: my_lab.Other}"
+    ]
+    names = ["env.camera=kinect2", "env.robot=stick"]
+    assert sections_of_classes(names) == names
     config = compose("evaluate", *words, "env.objects._target_=my_lab.Others")
     assert config.env.camera == {"_target_": "my_lab.Mine", "noise": 0.1, "names": ["a", "b"]}
     assert config.env.objects == {"_target_": "my_lab.Others"} and config.env.segmentation == "mask"
@@ -157,7 +152,7 @@ def test_errors_of_mistakes_are_those_of_the_page(mistake: str, folder: Path) ->
     command, more = ("collect", ()) if mistake == "robot" else ("evaluate", ("task=clearing", *TINY))
     answer = run_command(command, *more, *MISTAKES[mistake], "output=mine", folder=folder)
     (line,) = answer.complaints
-    assert answer.status == 2 and is_told(line.removeprefix("error: ")), line
+    assert answer.status == 2 and PAGE.tells(line.removeprefix("error: ")), line
 
 
 @pytest.mark.parametrize("part", ["robot", "objects", "camera", "segmentation"])
