@@ -47,6 +47,7 @@ from planning import cavin as algorithm
 from planning.extensions.sequential_halving import MostRobust
 from planning.rollouts import returns
 from planning.rollouts.candidates import Candidates
+from planning.rollouts.ranking import SubgoalDistance
 from planning.rollouts.segment import actions_of
 
 LINE_10 = ("f", "simulator")
@@ -91,7 +92,7 @@ class Oracle:
         model: object,
         reward: Any,
         subgoals: State,
-        feature_weight: float,
+        distance: SubgoalDistance,
     ) -> MostRobust:
         """Line 10, in the place of `planning.extensions.sequential_halving.most_robust`."""
         best = scores[0].topk(min(self.candidates, scores.shape[-1])).indices
@@ -100,8 +101,8 @@ class Oracle:
         path = torch.from_numpy(np.stack([self.path(pushes)[:, : here.objects] for pushes in actions]))
         start, mask = here.centers.expand(len(path), -1, -1), here.mask.expand(len(path), -1)
         failed = returns.advance(returns.start(start), reward, start, path, mask).failed
-        distance = torch.where(mask, (path[:, -1] - goal.centers[0]).square().sum(-1), 0.0).sum(-1)
-        cost = distance + later_cost[0, best] + robustness.failure_cost * failed
+        end = goal.map(lambda field: field.expand(len(path), *field.shape[1:]))._replace(centers=path[:, -1])
+        cost = distance(end, path, goal) + later_cost[0, best] + robustness.failure_cost * failed
         cost = torch.where(torch.isfinite(scores[0, best]), cost, torch.inf)
         winner = cost.argmin()
         return MostRobust(best[winner].reshape(1), failed[winner].to(cost.dtype).reshape(1))

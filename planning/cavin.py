@@ -18,13 +18,13 @@ from planning.extensions.nearest_objects import NearestObjects, nearest_objects
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.sequential_halving import most_robust
 from planning.extensions.touchdown import ObservedPoints
-from planning.inputs import check_positive, check_weight
+from planning.inputs import check_fraction, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
 from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
-from planning.rollouts.ranking import best_of, squared_distance
+from planning.rollouts.ranking import SubgoalDistance, best_of
 from planning.rollouts.returns import interpolate
 from planning.rollouts.sampling import sample_codes
 from planning.rollouts.segment import Objective, SegmentRollout, actions_of, select_segment
@@ -46,8 +46,8 @@ class CavinPlanner(SearchingPlanner):
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
-    motion_samples: how many motions to sample at line 8: N in the paper; None takes half of N, and 1 leaves nothing to
-        choose at line 10.
+    motion_samples: how many motions to sample at line 8: N in the paper; None takes a quarter of N, and 1 leaves
+        nothing to choose at line 10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
@@ -58,6 +58,9 @@ class CavinPlanner(SearchingPlanner):
         `first_segment` plans and compares only the executed segment (published implementation).
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
+    running_cost_share: our addition to line 10: share, in [0, 1], of the squared distance to the subgoal after the
+        earlier pushes of a segment (their mean), beside the distance at its end, since the caller may execute the first
+        push and plan again; 0 compares the ends (paper).
     nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
@@ -93,6 +96,7 @@ class CavinPlanner(SearchingPlanner):
         motion_samples: int | None = None,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
+        running_cost_share: float = 0.9,
         nearest_objects: int | None = 2,
         effect_retries: int = 3,
         avoid_failures: bool = True,
@@ -104,13 +108,14 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
+        check_fraction("running_cost_share", running_cost_share)
+        self.motion_samples = max(1, samples // 4) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
         )
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
-        self.feature_weight = feature_weight
+        self.distance = SubgoalDistance(feature_weight, running_cost_share)
         if nearest_objects is not None:
             check_positive("nearest_objects", nearest_objects)
         self.nearest_objects = nearest_objects
@@ -164,7 +169,7 @@ class CavinPlanner(SearchingPlanner):
 
         # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
         ends = effects.score_state.segments.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
-        tracking_cost: Objective = TrackingCost(subgoals, ends, self.feature_weight)
+        tracking_cost: Objective = TrackingCost(subgoals, ends, self.distance)
         reached = effects.score_state.succeeded.take_along_dim(i.unsqueeze(-1), 1)[:, 0]
         tracking_cost = guided_tracking(tracking_cost, self.distance_to_goal, reached)
         if self.avoid_failures:
@@ -188,7 +193,7 @@ class CavinPlanner(SearchingPlanner):
         failures = None
         if self.robustness is not None:
             later_cost = tracking.cost - tracking.executed_cost
-            task = self.model, reward, subgoals, self.feature_weight
+            task = self.model, reward, subgoals, self.distance
             j, failures = most_robust(self.robustness, motions, scores, later_cost, *task)
         chosen = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = chosen.codes[:, 0], chosen.actions[:, 0], chosen.path[:, 0]
@@ -278,14 +283,14 @@ class TrackingState(NamedTuple):
 
 
 class TrackingCost(NamedTuple):
-    """Line 10: squared distance of the predicted states to the chosen subgoals, at the end of every segment.
+    """Line 10: squared distance of the predicted states to the chosen subgoals, segment by segment.
 
     Segments after the end of the chosen effect plan have no subgoal and do not count.
     """
 
     subgoals: State  # [B, K, M, .]
     segments: Tensor  # [B] int64, 1..K: segments until the effect plan ends
-    feature_weight: float
+    distance: SubgoalDistance
 
     def start(self, plans: State) -> TrackingState:
         """The state of candidates without a segment, `plans: [B, n]`."""
@@ -296,7 +301,7 @@ class TrackingCost(NamedTuple):
         """The state after one more segment from `before: [B, n]`."""
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
         subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
-        distance = squared_distance(rollout.states, subgoal, feature_weight=self.feature_weight)
+        distance = self.distance(rollout.states, rollout.path, subgoal)
         cost = state.cost + torch.where(counts, distance, 0.0)
         executed = torch.as_tensor(segment == 0, device=counts.device)
         assert rollout.actions is not None

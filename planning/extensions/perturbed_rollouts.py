@@ -12,14 +12,16 @@ from models.state import State
 from planning.backends.eager import Backend, eager
 from planning.inputs import check_choice, check_positive, check_weight
 from planning.protocol import DynamicsModel, RewardFunction, SampledDynamics
-from planning.rollouts import ranking, returns
+from planning.rollouts import returns
 from planning.rollouts.dynamics import predict_states, sample_states
+from planning.rollouts.ranking import SubgoalDistance
 from planning.rollouts.sampling import noise_each, uniform_each
 
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
 # metres, is then worth 200: a failure earns -100 instead of the +100 at the goal.
 RETURN_WEIGHT = 0.0015
 OUTCOMES = ("perturbed", "sampled")
+ENDS = SubgoalDistance()
 
 
 @dataclass(frozen=True)
@@ -88,13 +90,13 @@ def perturbed_rollouts(
     count: int,
     generators: Sequence[torch.Generator],
     *,
-    feature_weight: float = 0.0,
+    distance: SubgoalDistance = ENDS,
     backend: Backend = eager,
 ) -> tuple[Tensor, Tensor]:
     """Rollouts of `actions: [B, R, T, 4]` by f from `state: [B]`, each perturbed `count` times.
 
-    Returns the square metres to the `goal: [B, 1]` or `[B, R]` (0 without a goal) and whether a rollout fails,
-    `[B, R, count]` each.
+    Returns the square metres to the `goal: [B, 1]` or `[B, R]`, by `distance` (0 without a goal), and whether a rollout
+    fails, `[B, R, count]` each.
     """
     if goal is not None and goal.batch_shape[-1] > 1:
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
@@ -102,8 +104,8 @@ def perturbed_rollouts(
     of_objects = (count, pushes.shape[-2], state.objects, 2)
     if robustness.outcomes == "sampled":
         uniform = _for_each_motion(uniform_each(of_objects, generators, pushes.device), pushes)
-        distance, failed = backend(_sampled_costs, model, reward, state, goal, pushes, uniform, feature_weight)
-        return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
+        costs, failed = backend(_sampled_costs, model, reward, state, goal, pushes, uniform, distance)
+        return costs.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
     starts = _antithetic_noise((*of_objects[:2], 2), generators, pushes.device)
     pushes[..., :2] += robustness.start_noise * _for_each_motion(starts, pushes)
     errors = None
@@ -111,8 +113,8 @@ def perturbed_rollouts(
         noise = _antithetic_noise(of_objects, generators, pushes.device)
         errors = robustness.outcome_noise * _for_each_motion(noise, pushes)
     pushes = pushes.clamp(-1.0, 1.0)
-    distance, failed = backend(_rollout_costs, model, reward, state, goal, pushes, errors, feature_weight)
-    return distance.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
+    costs, failed = backend(_rollout_costs, model, reward, state, goal, pushes, errors, distance)
+    return costs.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
 
 
 def _antithetic_noise(shape: Sequence[int], generators: Sequence[torch.Generator], device: torch.device) -> Tensor:
@@ -134,14 +136,14 @@ def _rollout_costs(
     goal: State | None,
     pushes: Tensor,
     errors: Tensor | None,
-    feature_weight: float,
+    distance: SubgoalDistance,
 ) -> tuple[Tensor, Tensor]:
     """Rollouts of `pushes: [B, n, T, 4]` by f: square metres to the `goal` and whether they fail, `[B, n]` each."""
     plans = state.expand_plans(pushes.shape[1])
     before, mask = plans.centers, plans.mask
-    here, path = predict_states(model, state.expand_plans(1), pushes)
+    end, path = predict_states(model, state.expand_plans(1), pushes)
     possible = path if errors is None else outcomes(before, path, errors)
-    return _costs(reward, before, possible, mask, here, goal, feature_weight)
+    return _costs(reward, before, possible, mask, end, path, goal, distance)
 
 
 def _sampled_costs(
@@ -151,27 +153,28 @@ def _sampled_costs(
     goal: State | None,
     pushes: Tensor,
     uniform: Tensor,
-    feature_weight: float,
+    distance: SubgoalDistance,
 ) -> tuple[Tensor, Tensor]:
     """The same of rollouts that f's distributions sample, which `uniform: [B, n, T, M, 2]` determines."""
     plans = state.expand_plans(pushes.shape[1])
-    here, path = sample_states(model, state.expand_plans(1), pushes, uniform)
-    return _costs(reward, plans.centers, path, plans.mask, here, goal, feature_weight)
+    end, path = sample_states(model, state.expand_plans(1), pushes, uniform)
+    return _costs(reward, plans.centers, path, plans.mask, end, path, goal, distance)
 
 
 def _costs(
     reward: RewardFunction,
     before: Tensor,
-    path: Tensor,
+    possible: Tensor,
     mask: Tensor,
-    last: State,
+    end: State,
+    path: Tensor,
     goal: State | None,
-    feature_weight: float,
+    distance: SubgoalDistance,
 ) -> tuple[Tensor, Tensor]:
-    progress = returns.advance(returns.start(before), reward, before, path, mask)
+    progress = returns.advance(returns.start(before), reward, before, possible, mask)
     if goal is None:
-        return progress.returns.new_zeros(path.shape[:2]), progress.failed
-    return ranking.squared_distance(last, goal, feature_weight=feature_weight), progress.failed
+        return progress.returns.new_zeros(possible.shape[:2]), progress.failed
+    return distance(end, path, goal), progress.failed
 
 
 def outcomes(start: Tensor, path: Tensor, errors: Tensor) -> Tensor:

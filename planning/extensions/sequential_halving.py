@@ -11,9 +11,10 @@ from torch import Tensor
 from models.state import State
 from planning import records
 from planning.backends.eager import Backend, eager
-from planning.extensions.perturbed_rollouts import PerturbedRollouts, perturbed_rollouts
+from planning.extensions.perturbed_rollouts import ENDS, PerturbedRollouts, perturbed_rollouts
 from planning.protocol import DynamicsModel, RewardFunction
 from planning.rollouts.candidates import Candidates
+from planning.rollouts.ranking import SubgoalDistance
 from planning.rollouts.segment import actions_of
 
 
@@ -32,12 +33,12 @@ def most_robust(
     model: DynamicsModel,
     reward: RewardFunction,
     subgoals: State,
-    feature_weight: float,
+    distance: SubgoalDistance,
 ) -> MostRobust:
     """The motion candidate with the lowest cost on average; see `sequential_halving`."""
     problem, actions, goal = motions.problem, motions.at(0, actions_of), subgoals.step(slice(0, 1))
     what = problem.state, goal, scores, actions, later_cost, problem.generators
-    return sequential_halving(robustness, model, reward, *what, feature_weight=feature_weight, backend=problem.backend)
+    return sequential_halving(robustness, model, reward, *what, distance=distance, backend=problem.backend)
 
 
 def sequential_halving(
@@ -51,15 +52,15 @@ def sequential_halving(
     later: Tensor,
     generators: Sequence[torch.Generator],
     *,
-    feature_weight: float = 0.0,
+    distance: SubgoalDistance = ENDS,
     backend: Backend = eager,
 ) -> MostRobust:
     """The motion with the lowest cost on average.
 
     state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
     without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, T, 4]`, the
-    segment that will be executed. later: `[B, N]` square metres, the cost of the segments after it, and of guidance. A
-    motion whose score or whose cost is not finite loses.
+    segment that will be executed. later: `[B, N]` square metres, the cost of the segments after it, and of guidance.
+    distance: to the subgoal. A motion whose score or whose cost is not finite loses.
     """
     best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
     indices, count, done = best.indices, robustness.rollouts, 0
@@ -74,7 +75,7 @@ def sequential_halving(
             fields = indices, infinite, total, failures
             indices, infinite, total, failures = (field.gather(1, going) for field in fields)
             count = robustness.reduction_factor * count
-        distance, failed = perturbed_rollouts(
+        costs, failed = perturbed_rollouts(
             robustness,
             model,
             reward,
@@ -83,10 +84,10 @@ def sequential_halving(
             actions.take_along_dim(indices[..., None, None], dim=1),
             count,
             generators,
-            feature_weight=feature_weight,
+            distance=distance,
             backend=backend,
         )
-        cost = (distance + robustness.failure_cost * failed).sum(-1)
+        cost = (costs + robustness.failure_cost * failed).sum(-1)
         cost = cost + count * later.gather(1, indices)
         total = torch.where(infinite | ~torch.isfinite(cost), torch.inf, total + cost)
         failures = failures + failed.sum(-1)

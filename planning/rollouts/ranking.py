@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,29 @@ def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0
     if feature_weight:
         per_object = per_object + feature_weight * (states.features - goals.features).square().sum(-1)
     return torch.where(goals.mask, per_object, 0.0).sum(-1)
+
+
+class SubgoalDistance(NamedTuple):
+    """How far a segment is from its subgoal: a terminal cost, and a running cost (Algorithm 1, line 10).
+
+    feature_weight: as in `squared_distance`. running_cost_share: in [0, 1], of the squared distance of centres after
+    the earlier steps, their mean; the rest is the distance at the end, which counts alone with 0 (paper).
+    """
+
+    feature_weight: float = 0.0
+    running_cost_share: float = 0.0
+
+    def __call__(self, end: State, path: Tensor, subgoal: State) -> Tensor:
+        """`[...]` square metres, from the last state `end: [...]` and the centres `path: [..., T, M, 3]` metres.
+
+        Their leading dimensions and those of `subgoal: [...]` broadcast.
+        """
+        terminal = squared_distance(end, subgoal, feature_weight=self.feature_weight)
+        if not self.running_cost_share or path.shape[-3] == 1:
+            return terminal
+        earlier = (path[..., :-1, :, :] - subgoal.centers.unsqueeze(-3)).square().sum(-1)
+        running = torch.where(subgoal.mask.unsqueeze(-2), earlier, 0.0).sum(-1).mean(-1)
+        return torch.lerp(terminal, running, self.running_cost_share)
 
 
 def prefer(scores: Tensor, preferred: Tensor) -> Tensor:

@@ -62,6 +62,19 @@ def test_motions_aim_at_the_subgoals(toy: SimpleNamespace) -> None:
     assert (error < 0.025).all()  # metres; pushes are off by 0.035 m per segment and axis before choosing
 
 
+def test_a_running_cost_prefers_motions_whose_first_pushes_go_far(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[START]] * 4)
+
+    def left(share: float) -> torch.Tensor:
+        planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=1024, horizon=3, running_cost_share=share)
+        plan = planner.plan(state, toy.generators(0, 1, 2, 3))
+        return (plan.predicted_centers - plan.subgoals.centers).norm(dim=-1).squeeze(-1)  # [B, T]
+
+    ends, early = left(0.0), left(0.9)
+    assert (early[:, 0] < ends[:, 0]).all()
+    assert (early[:, 2] >= ends[:, 2]).all()  # and pays for it at the end
+
+
 def test_dead_plans_are_replaced_by_copies_of_living_ones(toy: SimpleNamespace) -> None:
     planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=256, horizon=12)
     plan = planner.plan(toy.scenes([[START]]), toy.generators(0))
@@ -213,6 +226,7 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
         ({"samples": -5}, "samples must be at least 1, not -5"),
         ({"motion_horizon": "last"}, "unknown motion_horizon 'last': choose full_horizon or first_segment"),
         ({"feature_weight": -1.0}, "feature_weight must be zero or a positive number, not -1.0"),
+        ({"running_cost_share": 1.5}, "running_cost_share must be between 0 and 1, not 1.5"),
         ({"feature_weight": float("nan")}, "feature_weight must be zero or a positive number, not nan"),
     ],
 )

@@ -55,7 +55,7 @@ def test_the_best_candidates_continue_with_more_rollouts(toy: SimpleNamespace) -
     scores = torch.arange(float(SAMPLES)).expand(2, -1)
     later = torch.stack([torch.arange(float(SAMPLES)), -torch.arange(float(SAMPLES))])  # the last ones are candidates
     given = model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later, toy.generators(0, 1)
-    chosen = sequential_halving(options, *given, feature_weight=0.0, backend=counting).candidate  # type: ignore[arg-type]
+    chosen = sequential_halving(options, *given, backend=counting).candidate  # type: ignore[arg-type]
     assert chosen.tolist() == [32, 63]
     assert [pushes.shape[1] for pushes in rolled_out] == [64, 64, 64]
     often = [[len(set(map(tuple, pushes[:, 0].tolist()))) for pushes in three] for three in rolled_out]
@@ -90,7 +90,7 @@ def test_the_last_candidate_gets_no_more_rollouts(toy: SimpleNamespace) -> None:
     given = toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0)), state, state.map(lambda field: field.unsqueeze(1)), scores
     options = PerturbedRollouts(candidates=5, rollouts=2, rounds=40)
     actions = torch.zeros(1, SAMPLES, 1, 4)
-    sequential_halving(options, *given, actions, scores, toy.generators(0), feature_weight=0.0, backend=counting)  # type: ignore[arg-type]
+    sequential_halving(options, *given, actions, scores, toy.generators(0), backend=counting)  # type: ignore[arg-type]
     assert rolled_out == [10, 8]
 
 
