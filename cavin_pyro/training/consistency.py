@@ -42,11 +42,11 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     count = len(state.mask)
     here = state.expand_plans(1)
     with torch.no_grad():
-        effect_code = _sample(model.effect_prior(state)).unsqueeze(-2)  # [b, 1, C]
+        effect_code = sample(model.effect_prior(state)).unsqueeze(-2)  # [b, 1, C]
         subgoal = model.subgoal(here, effect_code)
     prior = model.motion_prior(here, effect_code).expand((count, motions))
     with torch.no_grad():
-        motion_code = _sample(prior)
+        motion_code = sample(prior)
         pushes = model.actions(here, effect_code=effect_code.expand(-1, motions, -1), motion_code=motion_code)
         ends, _ = predict_states(model, here, pushes)
         density = _log_density(ends, subgoal)
@@ -56,8 +56,8 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     return -each.sum() * (len(window.sequence_mask) / count)
 
 
-def _sample(prior: TorchDistribution) -> Tensor:
-    """A sample; `sample` of torch's normal distributions waits for a GPU, to check their scales."""
+def sample(prior: TorchDistribution) -> Tensor:
+    """A sample of a prior; `sample` of torch's normal distributions waits for a GPU, to check their scales."""
     return prior.rsample() if prior.has_rsample else prior.sample()
 
 

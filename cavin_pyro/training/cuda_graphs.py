@@ -43,7 +43,7 @@ def loss_of(loss: BoundObjective, window: Window) -> Tensor:
     """The loss of a batch `[B]` that is `capturable`, summed over its windows: a scalar."""
     encoded = loss.model.encode(window)
     terms = elbo_terms(loss.model, loss.guide, window, encoded=encoded)
-    return sum((terms | loss.objective.terms_of_model(loss.model, window)).values(), window.actions.new_zeros(()))
+    return sum((terms | loss.terms_of_model(window)).values(), window.actions.new_zeros(()))
 
 
 class CapturedLoss:

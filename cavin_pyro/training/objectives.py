@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 from pyro import poutine
@@ -22,6 +23,7 @@ from torch import Tensor, nn
 from cavin_pyro.training.consistency import consistency_loss
 from cavin_pyro.training.counterfactual import counterfactual_loss
 from cavin_pyro.training.gradients import DifferentiableBound, loss_with_gradients
+from cavin_pyro.training.hindsight import hindsight_loss
 from cavin_pyro.training.rollout import rollout_loss
 from guides.guide import Guide
 from models.model import Model
@@ -33,16 +35,17 @@ COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanFi
 
 
 class Objective:
-    """A bound, with optional weights of its KL terms, their warm-up, and three other terms.
+    """A bound, with optional weights of its KL terms, their warm-up, and four other terms.
 
     loss = -bound(with KL term i weighted by w_i * min(1, (step + 1) / warm_up_steps))
            + counterfactual_weight * counterfactual_loss + rollout_weight * rollout_loss
-           + consistency_weight * consistency_loss
+           + consistency_weight * consistency_loss + hindsight_weight * hindsight_loss
 
     With weights of one, no warm-up and no other term, the defaults, this is the bound and nothing else.
 
     The validation loss, by which training chooses the best checkpoint, is another: -ELBO from one sample of the codes,
-    whatever the bound and its weights, and the rollout and consistency terms. It has no counterfactual term.
+    whatever the bound and its weights, and the rollout, consistency and hindsight terms. It has no counterfactual
+    term.
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: weight of each code's KL term, positive.
@@ -56,6 +59,10 @@ class Objective:
             `cavin_pyro.training.consistency`; it changes the prior of motions alone.
         consistency_motions: how many motions of each effect the consistency term samples. consistency_windows: how many
             windows of a batch enter the consistency term.
+        hindsight_weight: weight of how far subgoals lie from what motions attain, see `cavin_pyro.training.hindsight`;
+            it changes h alone, and its choices are by h as training begins, so it is for fine-tuning.
+        hindsight_motions: how many motions of each effect the hindsight term chooses from. hindsight_windows: how many
+            windows of a batch enter the hindsight term.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
@@ -72,6 +79,9 @@ class Objective:
         consistency_weight: float = 0.0,
         consistency_motions: int = 32,
         consistency_windows: int = 32,
+        hindsight_weight: float = 0.0,
+        hindsight_motions: int = 64,
+        hindsight_windows: int = 16,
     ) -> None:
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
@@ -80,12 +90,14 @@ class Objective:
         self.rollout_weight = rollout_weight
         self.consistency_weight = consistency_weight
         self.consistency_sizes = {"motions": consistency_motions, "windows": consistency_windows}
+        self.hindsight_weight = hindsight_weight
+        self.hindsight_sizes = {"motions": hindsight_motions, "windows": hindsight_windows}
         for name, weight in self.kl_weights.items():
             if name not in CODES:
                 raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
             if not weight > 0:
                 raise ValueError(f"objective.kl_weights.{name} must be positive, not {weight:g}")
-        weights = ("counterfactual_weight", "rollout_weight", "consistency_weight")
+        weights = ("counterfactual_weight", "rollout_weight", "consistency_weight", "hindsight_weight")
         numbers = {name: getattr(self, name) for name in ("warm_up_steps", *weights)}
         if wrong := [name for name, value in numbers.items() if not 0 <= value < math.inf]:
             raise ValueError(f"objective.{wrong[0]} must be 0 or more, not {numbers[wrong[0]]:g}")
@@ -129,6 +141,11 @@ class Objective:
                 "objective consistent needs a model whose motions have a prior of their own, given the effect, and "
                 f"{type(model).__name__} has none: choose model=cascaded"
             )
+        if self.hindsight_weight and set(CODES) - set(model.codes):
+            raise ValueError(
+                "objective hindsight needs a model whose effects have subgoals and motions, and "
+                f"{type(model).__name__} has none: choose model=cascaded"
+            )
         if self.consistency_weight and isinstance(model.get_submodule("prior_of_motions"), StandardPrior):
             raise ValueError(
                 "objective consistent fits the prior of motions, and prior=standard has nothing to fit: choose "
@@ -145,17 +162,11 @@ class Objective:
         ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
         return {name: ramp * self.kl_weights.get(name, 1.0) for name in CODES}
 
-    def terms_of_model(self, model: Model, window: Window) -> dict[str, Tensor]:
-        """The weighted terms beside the bound that read the model alone, summed over the windows `[B]`, scalars."""
-        terms = {}
-        if self.rollout_weight:
-            terms["rollout"] = self.rollout_weight * rollout_loss(model, window)
-        if self.consistency_weight:
-            terms["consistency"] = self.consistency_weight * consistency_loss(model, window, **self.consistency_sizes)
-        return terms
-
     def bind(self, model: Model, guide: Guide) -> BoundObjective:
-        """The loss of one model and guide, as a module with the parameters of both."""
+        """The loss of one model and guide, as a module with the parameters of both.
+
+        With a hindsight term, h as it is now says what effects are asked for.
+        """
         self.check(model, guide)
         return BoundObjective(self, model, guide)
 
@@ -166,11 +177,26 @@ class BoundObjective(nn.Module):
     def __init__(self, objective: Objective, model: Model, guide: Guide) -> None:
         super().__init__()
         self.objective, self.model, self.guide = objective, model, guide
+        # In a tuple, so that it is no part of this module, whose weights are trained and stored.
+        self._reference = (deepcopy(model).requires_grad_(False),) if objective.hindsight_weight else ()
 
     def forward(self, window: Window, step: int) -> Tensor:
         """The loss summed over the windows `[B]`, a scalar, at a step counted from 0."""
         bound = self._bound(window, step)
-        return sum(self.objective.terms_of_model(self.model, window).values(), bound)
+        return sum(self.terms_of_model(window).values(), bound)
+
+    def terms_of_model(self, window: Window) -> dict[str, Tensor]:
+        """The weighted terms beside the bound that read the model alone, summed over the windows `[B]`, scalars."""
+        objective, model, terms = self.objective, self.model, {}
+        if objective.rollout_weight:
+            terms["rollout"] = objective.rollout_weight * rollout_loss(model, window)
+        if objective.consistency_weight:
+            term = consistency_loss(model, window, **objective.consistency_sizes)
+            terms["consistency"] = objective.consistency_weight * term
+        for reference in self._reference:
+            term = hindsight_loss(model, window, reference, **objective.hindsight_sizes)
+            terms["hindsight"] = objective.hindsight_weight * term
+        return terms
 
     def _bound(self, window: Window, step: int) -> Tensor:
         objective = self.objective

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from models.model import Model
-from models.state import Window
+from models.state import State, Window
 
 CENTER_UNIT = 0.005  # metres, a typical error of f after one push
 FEATURE_UNIT = 0.1  # of a vector of unit length
@@ -31,10 +31,15 @@ def rollout_loss(model: Model, window: Window) -> Tensor:
         state = model.next_state(state, window.actions[..., step, :])
         before, after = window.states.step(step), window.states.step(step + 1)
         counts = counts & window.transition_mask[..., step]
-        far = _distance(state.centers, after.centers) / CENTER_UNIT
-        far = far + _distance(state.features, after.features) / FEATURE_UNIT
+        far = distance_in_units(state, after)
         loss = loss + far.where(before.mask & after.mask & counts.unsqueeze(-1), 0.0).sum()
     return loss
+
+
+def distance_in_units(one: State, other: State) -> Tensor:
+    """|center - center| / 5 mm + |feature - feature| / 0.1 of each object: `[..., M]`."""
+    far = _distance(one.centers, other.centers) / CENTER_UNIT
+    return far + _distance(one.features, other.features) / FEATURE_UNIT
 
 
 def _distance(one: Tensor, other: Tensor) -> Tensor:

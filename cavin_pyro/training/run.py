@@ -60,6 +60,11 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     data = data_folders(config.data)
     with user_input():
         objective.check(model, guide)
+    if objective.hindsight_weight and not config.initial:
+        raise UserError(
+            "objective.hindsight_weight fine-tunes: h of initial=FILE says what effects ask for. Give one, or leave "
+            "the weight 0"
+        )
     started = start_from(config, model, guide, geometry) if config.initial else {}
     train_only(config.trained, model, guide)
     signs = _mirror_signs(config.trainer.reflect, geometry, guide)

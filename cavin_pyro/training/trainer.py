@@ -72,7 +72,7 @@ class Trainer:
         self._fixed = None if guide.amortized else fixed_windows(windows, config.batch_size, seed)
         if self._fixed is not None:
             guide(windows.batch(self._fixed))  # makes its parameters
-        self._objective, self._loss = objective, objective.bind(model, guide)
+        self._loss = objective.bind(model, guide)
         self._captured: CapturedLoss | None = None
         self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
         trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
@@ -205,7 +205,7 @@ class Trainer:
                 window = self.windows.batch(part)
                 encoded = self.model.encode(window)
                 bound = elbo_terms(self.model, self.guide, window, encoded=encoded)
-                others = self._objective.terms_of_model(self.model, window)
+                others = self._loss.terms_of_model(window)
                 terms = {name: term.item() for name, term in {**bound, **others}.items()}
                 loss += sum(terms[name] for name in bound)
                 for name in others:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from pyro.infer import Trace_ELBO
-from torch import Tensor, nn
+from torch import Tensor
 
 from cavin_pyro.training.consistency import consistency_loss
 from cavin_pyro.training.objectives import Objective
@@ -18,35 +18,9 @@ from models.priors.conditional import ConditionalPrior
 from models.priors.flow import FlowPrior
 from models.priors.mixture import ObjectMixturePrior
 from models.state import State, Window
+from tests.cavin_pyro.training.small_cascade import SIZES, model_with
 
-SIZES = {"effect_dimension": 5, "motion_dimension": 4, "feature_dimension": 6, "width": 8}
 MOTIONS = 3
-
-
-@pytest.fixture
-def window() -> Window:
-    """Four windows of three pushes, with one, two or three objects."""
-    generator = torch.Generator().manual_seed(5)
-    centers = 0.2 * torch.rand(4, 4, 3, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.5, -0.1, 0.0])
-    features = nn.functional.normalize(torch.randn(4, 4, 3, 6, generator=generator, dtype=torch.float64), dim=-1)
-    mask = (torch.arange(3) < torch.tensor([1, 2, 3, 3])[:, None, None]).expand(4, 4, 3)
-    actions = 2 * torch.rand(4, 3, 4, generator=generator, dtype=torch.float64) - 1
-    every = torch.ones(4, 3, dtype=torch.bool)
-    return Window(State(centers, features, mask), actions, every, every[:, 0])
-
-
-def model_with(kind: type = ConditionalPrior) -> CascadedModel:
-    torch.manual_seed(3)
-    options = {} if kind is not ObjectMixturePrior else {"components": 2}
-    model = CascadedModel(
-        **SIZES,
-        effect_prior=ConditionalPrior(dimension=5, feature_dimension=6, width=8),
-        motion_prior=kind(dimension=4, feature_dimension=6, effect_dimension=5, width=8, **options),
-    )
-    for name, parameter in model.named_parameters():
-        if name.startswith("prior"):
-            nn.init.normal_(parameter, std=0.3)
-    return model.double()
 
 
 def samples(model: CascadedModel, window: Window) -> tuple[Tensor, Tensor]:
@@ -85,60 +59,60 @@ def loss_of(model: CascadedModel, window: Window, **options: int) -> Tensor:
     return consistency_loss(model, window, motions=MOTIONS, **options)
 
 
-def test_it_is_minus_the_logarithm_of_how_likely_the_subgoal_is_reached(window: Window) -> None:
+def test_it_is_minus_the_logarithm_of_how_likely_the_subgoal_is_reached(small_window: Window) -> None:
     model = model_with()
-    expected = -by_hand(model, window).mean(-1).log().sum()
-    assert loss_of(model, window).item() == pytest.approx(expected.item(), rel=1e-9)
+    expected = -by_hand(model, small_window).mean(-1).log().sum()
+    assert loss_of(model, small_window).item() == pytest.approx(expected.item(), rel=1e-9)
 
 
 @pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior, ObjectMixturePrior])
-def test_its_gradient_weights_each_motion_by_how_near_it_comes(kind: type, window: Window) -> None:
+def test_its_gradient_weights_each_motion_by_how_near_it_comes(kind: type, small_window: Window) -> None:
     model = model_with(kind)
-    effect, motion = samples(model, window)
-    density = by_hand(model, window).detach()
-    here, each = window.first.expand_plans(1), effect.unsqueeze(-2)
+    effect, motion = samples(model, small_window)
+    density = by_hand(model, small_window).detach()
+    here, each = small_window.first.expand_plans(1), effect.unsqueeze(-2)
     log_prior = model.motion_prior(here, each).expand((len(effect), MOTIONS)).log_prob(motion)
     surrogate = -(density / density.sum(-1, keepdim=True) * log_prior).sum()
     wanted = torch.autograd.grad(surrogate, list(model.prior_of_motions.parameters()))
-    found = torch.autograd.grad(loss_of(model, window), list(model.parameters()), allow_unused=True)
+    found = torch.autograd.grad(loss_of(model, small_window), list(model.parameters()), allow_unused=True)
     reached = {name: one for (name, _), one in zip(model.named_parameters(), found, strict=True) if one is not None}
     assert {name.split(".")[0] for name in reached} == {"prior_of_motions"}
     for mine, theirs in zip(reached.values(), wanted, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
 
 
-def test_a_part_of_the_windows_stands_for_all(window: Window) -> None:
+def test_a_part_of_the_windows_stands_for_all(small_window: Window) -> None:
     model = model_with()
-    some = window.map(lambda tensor: tensor[:2])
-    scaled = loss_of(model, some).item() * len(window.actions) / 2
-    assert loss_of(model, window, windows=2).item() == pytest.approx(scaled, rel=1e-9)
+    some = small_window.map(lambda tensor: tensor[:2])
+    scaled = loss_of(model, some).item() * len(small_window.actions) / 2
+    assert loss_of(model, small_window, windows=2).item() == pytest.approx(scaled, rel=1e-9)
 
 
-def test_padding_and_later_states_do_not_count(window: Window) -> None:
+def test_padding_and_later_states_do_not_count(small_window: Window) -> None:
     model = model_with()
-    states = window.states
+    states = small_window.states
     later = torch.arange(states.centers.shape[1])[:, None, None] > 0
     padding = ~states.mask.unsqueeze(-1)
     other = states._replace(centers=torch.where(later | padding, 9.0, states.centers))
-    changed = window._replace(states=other)
-    assert loss_of(model, changed).item() == pytest.approx(loss_of(model, window).item(), rel=1e-9)
+    changed = small_window._replace(states=other)
+    assert loss_of(model, changed).item() == pytest.approx(loss_of(model, small_window).item(), rel=1e-9)
 
 
-def test_it_is_added_to_the_bound(window: Window) -> None:
+def test_it_is_added_to_the_bound(small_window: Window) -> None:
     model = model_with()
     guide = CascadedGuide(model, width=8).double()
     losses = []
     for weight in (0.0, 0.3):
         torch.manual_seed(5)
         objective = Objective(Trace_ELBO(max_plate_nesting=1), consistency_weight=weight, consistency_motions=MOTIONS)
-        losses.append(objective.bind(model, guide)(window, 0))
+        losses.append(objective.bind(model, guide)(small_window, 0))
     torch.manual_seed(5)
-    Trace_ELBO(max_plate_nesting=1)(model, guide)(window)  # takes the noise that it took before
-    term = consistency_loss(model, window, motions=MOTIONS)
+    Trace_ELBO(max_plate_nesting=1)(model, guide)(small_window)  # takes the noise that it took before
+    term = consistency_loss(model, small_window, motions=MOTIONS)
     assert (losses[1] - losses[0]).item() == pytest.approx(0.3 * term.item(), rel=1e-9)
 
 
-def test_training_on_it_makes_sampled_motions_come_nearer(window: Window) -> None:
+def test_training_on_it_makes_sampled_motions_come_nearer(small_window: Window) -> None:
     """With h replaced by f along a motion that the prior seldom samples, so that the optimum is known."""
     model = model_with()
     wanted = torch.tensor([2.5, -2.5, 2.0, 2.0], dtype=torch.float64)
@@ -158,13 +132,13 @@ def test_training_on_it_makes_sampled_motions_come_nearer(window: Window) -> Non
     def far() -> float:
         torch.manual_seed(1)
         with torch.no_grad():
-            return sum(consistency_loss(model, window, motions=1).item() for _ in range(20))
+            return sum(consistency_loss(model, small_window, motions=1).item() for _ in range(20))
 
     before = far()
     optimizer = torch.optim.Adam(model.prior_of_motions.parameters(), lr=0.02)
     for _ in range(150):
         optimizer.zero_grad()
-        consistency_loss(model, window, motions=16).backward()
+        consistency_loss(model, small_window, motions=16).backward()
         optimizer.step()
     assert far() < 0.5 * before
 

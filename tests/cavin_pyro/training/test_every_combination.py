@@ -37,6 +37,7 @@ FITTING = {
     "flat": {"flat"},
     "dynamics": {"none"},
 }
+FITTING_MOTIONS = {"consistent", "hindsight"}  # objectives
 COMBINATIONS_WITHOUT_CODES = {
     ("dynamics", "none", "standard", objective)
     for objective in ("trace_elbo", "mean_field_elbo", "trace_graph_elbo", "trace_enum_elbo", "rollout")
@@ -49,7 +50,7 @@ def is_valid(names: tuple[str, str, str, str]) -> bool:
     if model == "dynamics":
         return names in COMBINATIONS_WITHOUT_CODES
     motions_have_a_prior_to_fit = model == "cascaded" and prior != "standard"
-    return guide in FITTING[model] and (objective != "consistent" or motions_have_a_prior_to_fit)
+    return guide in FITTING[model] and (objective not in FITTING_MOTIONS or motions_have_a_prior_to_fit)
 
 
 VALID = [names for names in ALL if is_valid(names)]
