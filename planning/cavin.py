@@ -46,8 +46,8 @@ class CavinPlanner(SearchingPlanner):
     horizon: H steps, a multiple of the model's T.
     optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
-    motion_samples: how many motions to sample at line 8: N in the paper; None takes a quarter of N, and 1 leaves
-        nothing to choose at line 10.
+    motion_samples: how many motions to sample at line 8: N in the paper; None takes half of N, and 1 leaves nothing to
+        choose at line 10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
         implementation).
@@ -59,8 +59,8 @@ class CavinPlanner(SearchingPlanner):
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
     running_cost_share: our addition to line 10: share, in [0, 1], of the squared distance to the subgoal after the
-        earlier pushes of a segment (their mean), beside the distance at its end, since the caller may execute the first
-        push and plan again; 0 compares the ends (paper).
+        earlier pushes of a segment (their mean), beside the distance at its end: fewer pushes reach the goal if the
+        caller plans again after the first, and more episodes fail; 0 compares the ends (paper).
     nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
@@ -96,7 +96,7 @@ class CavinPlanner(SearchingPlanner):
         motion_samples: int | None = None,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
-        running_cost_share: float = 0.9,
+        running_cost_share: float = 0.0,
         nearest_objects: int | None = 2,
         effect_retries: int = 3,
         avoid_failures: bool = True,
@@ -109,7 +109,7 @@ class CavinPlanner(SearchingPlanner):
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
         check_fraction("running_cost_share", running_cost_share)
-        self.motion_samples = max(1, samples // 4) if motion_samples is None else motion_samples
+        self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"

@@ -223,7 +223,7 @@ def plain(
 ) -> CavinPlanner:
     """Algorithm 1 that avoids failures, with those of our additions that the options name."""
     without: dict[str, Any] = {"robustness": None, "idle_distance": 0.0, "warm_start": False, "effect_retries": 0}
-    without |= {"motion_samples": samples, "running_cost_share": 0.0}
+    without["motion_samples"] = samples
     return CavinPlanner(model, reward, samples, horizon, motion_horizon, **{**without, **options})
 
 
