@@ -291,22 +291,25 @@ def test_the_published_rates_are_those_of_the_published_episodes(table: str, pag
 
 
 @pytest.mark.parametrize(
-    ("heading", "table"),
+    ("heading", "table", "name", "kinds"),
     [
-        ("## Today's planner", "shared-noise-episodes.parquet"),
-        ("### With noise of each rollout's own", "reach-episodes.parquet"),
+        ("## Today's planner", "shared-noise-episodes.parquet", "today", 17),
+        ("### Running cost", "running-cost-episodes.parquet", "share-0.9", 10),
+        ("### With noise of each rollout's own", "reach-episodes.parquet", "today", 17),
     ],
 )
-def test_a_published_table_of_all_kinds_of_scenes_is_that_of_its_episodes(heading: str, table: str) -> None:
+def test_a_published_table_of_kinds_of_scenes_is_that_of_its_episodes(
+    heading: str, table: str, name: str, kinds: int
+) -> None:
     folder = ROOT / "docs" / "measurements"
     page = (folder / "success.md").read_text(encoding="utf-8")
     section = page.partition(f"\n{heading}\n")[2].partition("\n### ")[0]
     lines = [[cell.strip() for cell in line.split("|")] for line in section.splitlines()]
     published = [cells[2:7] for cells in lines if len(cells) == 12 and cells[2].isdigit()]
     rows = [line.split("|") for line in run("rates", str(folder / table)).splitlines()]
-    found = [[cell.strip() for cell in cells[5:10]] for cells in rows if cells[1].startswith(" `today:")]
+    found = [[cell.strip() for cell in cells[5:10]] for cells in rows if cells[1].startswith(f" `{name}:")]
     assert published == [[episodes, rate.replace("%", " %"), *ends] for episodes, rate, *ends in found]
-    assert len(published) == 17
+    assert len(published) == kinds
 
 
 def test_training_and_planning_are_timed_on_every_device_of_the_machine() -> None:
