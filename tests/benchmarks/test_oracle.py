@@ -17,6 +17,7 @@ from cavin_pyro.evaluation.factory import make_environment
 from envs.workspace import push_endpoints
 from models.state import State
 from planning import PerturbedRollouts
+from planning.rollouts.ranking import SubgoalDistance
 from tests.benchmarks.loading import load
 from tests.cavin_pyro.conftest import run_script
 
@@ -79,9 +80,8 @@ def test_the_motion_with_the_best_outcome_is_chosen_unless_it_fails(benchmark: A
         oracle = SimpleNamespace(candidates=candidates, path=path)
         scores, later = ends.unsqueeze(0), torch.zeros(1, 4)
         rules = PerturbedRollouts(failure_cost=failure_cost)
-        return int(
-            benchmark.Oracle.choose(oracle, rules, motions, scores, later, None, reward, subgoals, 0.0).candidate
-        )
+        what = motions, scores, later, None, reward, subgoals, SubgoalDistance()
+        return int(benchmark.Oracle.choose(oracle, rules, *what).candidate)
 
     assert chosen(4, failing=-1) == 2
     assert chosen(4, failing=2) == 1
