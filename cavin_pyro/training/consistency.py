@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import torch
-from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from cavin_pyro.training.sampled_effects import sample, sample_effects
 from models.model import Model
 from models.state import State, Window
 from planning.rollouts.dynamics import predict_states
@@ -38,11 +38,9 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
         window: `[B]`, whose first states are read. motions: K. windows: how many of the B are taken, the first; their
             sum is scaled up to B.
     """
-    state = window.first.scene(slice(0, windows))
-    count = len(state.mask)
-    here = state.expand_plans(1)
+    here, effect_code = sample_effects(model, window, windows)
+    count = len(here.mask)
     with torch.no_grad():
-        effect_code = sample(model.effect_prior(state)).unsqueeze(-2)  # [b, 1, C]
         subgoal = model.subgoal(here, effect_code)
     prior = model.motion_prior(here, effect_code).expand((count, motions))
     with torch.no_grad():
@@ -54,11 +52,6 @@ def consistency_loss(model: Model, window: Window, *, motions: int = 32, windows
     # The second factor is 1: it only has the gradient of the prior's density.
     each = (density + log_prior - log_prior.detach()).logsumexp(-1) - math.log(motions)
     return -each.sum() * (len(window.sequence_mask) / count)
-
-
-def sample(prior: TorchDistribution) -> Tensor:
-    """A sample of a prior; `sample` of torch's normal distributions waits for a GPU, to check their scales."""
-    return prior.rsample() if prior.has_rsample else prior.sample()
 
 
 def _log_density(end: State, subgoal: State) -> Tensor:

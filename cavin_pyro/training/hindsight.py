@@ -11,8 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cavin_pyro.training.consistency import sample
 from cavin_pyro.training.rollout import distance_in_units
+from cavin_pyro.training.sampled_effects import sample, sample_effects
 from models.model import Model
 from models.state import Window
 from planning.rollouts.dynamics import sample_states
@@ -31,8 +31,8 @@ def hindsight_loss(model: Model, window: Window, reference: Model, *, motions: i
 
     and the term is the mean over i of the sum over objects of |center of h(s, c) - center of s*_i| / 5 mm +
     |feature - feature| / 0.1, the units of `rollout_loss`. Distances, not squares, because a few pushes end with an
-    object that rolls away. Its gradient reaches h alone, and the state encoder that h reads;
-    the choice and the outcomes have none.
+    object that rolls away. Its gradient reaches h alone, and the state encoder that h reads; the choice and the
+    outcomes have none.
 
     h0 is h of the `reference`, as training began: it says what an effect asks for. By h itself the choice would follow
     h, and subgoals would shrink, step by step, until nothing moves, which is attained exactly.
@@ -41,11 +41,8 @@ def hindsight_loss(model: Model, window: Window, reference: Model, *, motions: i
         window: `[B]`, whose first states are read. reference: another copy of the model, which is not trained.
         motions: K. windows: how many of the B are taken, the first; their sum is scaled up to B.
     """
-    state = window.first.scene(slice(0, windows))
-    count = len(state.mask)
-    here = state.expand_plans(1)
-    with torch.no_grad():
-        effect_code = sample(model.effect_prior(state)).unsqueeze(-2)  # [b, 1, C]
+    here, effect_code = sample_effects(model, window, windows)
+    count = len(here.mask)
     subgoal = model.subgoal(here, effect_code)
     with torch.no_grad():
         wanted = reference.subgoal(here, effect_code).centers

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from cavin_pyro.training.consistency import consistency_loss
 from cavin_pyro.training.objectives import Objective
-from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
 from models.flat import FlatModel
 from models.priors.conditional import ConditionalPrior
@@ -79,37 +78,6 @@ def test_its_gradient_weights_each_motion_by_how_near_it_comes(kind: type, small
     assert {name.split(".")[0] for name in reached} == {"prior_of_motions"}
     for mine, theirs in zip(reached.values(), wanted, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
-
-
-def test_a_part_of_the_windows_stands_for_all(small_window: Window) -> None:
-    model = model_with()
-    some = small_window.map(lambda tensor: tensor[:2])
-    scaled = loss_of(model, some).item() * len(small_window.actions) / 2
-    assert loss_of(model, small_window, windows=2).item() == pytest.approx(scaled, rel=1e-9)
-
-
-def test_padding_and_later_states_do_not_count(small_window: Window) -> None:
-    model = model_with()
-    states = small_window.states
-    later = torch.arange(states.centers.shape[1])[:, None, None] > 0
-    padding = ~states.mask.unsqueeze(-1)
-    other = states._replace(centers=torch.where(later | padding, 9.0, states.centers))
-    changed = small_window._replace(states=other)
-    assert loss_of(model, changed).item() == pytest.approx(loss_of(model, small_window).item(), rel=1e-9)
-
-
-def test_it_is_added_to_the_bound(small_window: Window) -> None:
-    model = model_with()
-    guide = CascadedGuide(model, width=8).double()
-    losses = []
-    for weight in (0.0, 0.3):
-        torch.manual_seed(5)
-        objective = Objective(Trace_ELBO(max_plate_nesting=1), consistency_weight=weight, consistency_motions=MOTIONS)
-        losses.append(objective.bind(model, guide)(small_window, 0))
-    torch.manual_seed(5)
-    Trace_ELBO(max_plate_nesting=1)(model, guide)(small_window)  # takes the noise that it took before
-    term = consistency_loss(model, small_window, motions=MOTIONS)
-    assert (losses[1] - losses[0]).item() == pytest.approx(0.3 * term.item(), rel=1e-9)
 
 
 def test_training_on_it_makes_sampled_motions_come_nearer(small_window: Window) -> None:

@@ -98,37 +98,6 @@ def test_its_gradient_reaches_h_alone(small_window: Window) -> None:
     assert "meta_dynamics" in reached
 
 
-def test_a_part_of_the_windows_stands_for_all(small_window: Window) -> None:
-    model = model_with()
-    some = small_window.map(lambda tensor: tensor[:2])
-    scaled = loss_of(model, some).item() * len(small_window.actions) / 2
-    assert loss_of(model, small_window, windows=2).item() == pytest.approx(scaled, rel=1e-9)
-
-
-def test_padding_and_later_states_do_not_count(small_window: Window) -> None:
-    model = model_with()
-    states = small_window.states
-    later = torch.arange(states.centers.shape[1])[:, None, None] > 0
-    padding = ~states.mask.unsqueeze(-1)
-    other = states._replace(centers=torch.where(later | padding, 9.0, states.centers))
-    changed = small_window._replace(states=other)
-    assert loss_of(model, changed).item() == pytest.approx(loss_of(model, small_window).item(), rel=1e-9)
-
-
-def test_it_is_added_to_the_bound(small_window: Window) -> None:
-    model = model_with()
-    guide = CascadedGuide(model, width=8).double()
-    losses = []
-    for weight in (0.0, 0.3):
-        torch.manual_seed(5)
-        objective = Objective(Trace_ELBO(max_plate_nesting=1), hindsight_weight=weight, hindsight_motions=MOTIONS)
-        losses.append(objective.bind(model, guide)(small_window, 0))
-    torch.manual_seed(5)
-    Trace_ELBO(max_plate_nesting=1)(model, guide)(small_window)  # takes the noise that it took before
-    term = hindsight_loss(model, small_window, model, motions=MOTIONS)
-    assert (losses[1] - losses[0]).item() == pytest.approx(0.3 * term.item(), rel=1e-9)
-
-
 def test_training_on_it_brings_subgoals_to_what_is_attained(small_window: Window) -> None:
     """f moves nothing here, so that no motion reaches a subgoal that moves something."""
     model = model_with()
