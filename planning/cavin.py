@@ -18,21 +18,22 @@ from planning.extensions.nearest_objects import NearestObjects, nearest_objects
 from planning.extensions.perturbed_rollouts import PerturbedRollouts
 from planning.extensions.sequential_halving import most_robust
 from planning.extensions.touchdown import ObservedPoints
-from planning.inputs import check_fraction, check_positive, check_weight
+from planning.inputs import check_choice, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
-from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction
+from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction, about
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
-from planning.rollouts.ranking import SubgoalDistance, best_of
+from planning.rollouts.ranking import END, FIRST_PUSH, SubgoalDistance, best_of
 from planning.rollouts.returns import interpolate
 from planning.rollouts.sampling import sample_codes
 from planning.rollouts.segment import Objective, SegmentRollout, actions_of, select_segment
-from planning.searching import SearchingPlanner, summary
+from planning.searching import AUTO, SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
 # Motions are all sampled for one effect, so few candidates suffice.
 FEW_CANDIDATES = PerturbedRollouts(candidates=64, rounds=2, reduction_factor=8)
+TRACKED = (AUTO, END, FIRST_PUSH)
 
 
 class CavinPlanner(SearchingPlanner):
@@ -58,9 +59,10 @@ class CavinPlanner(SearchingPlanner):
         `first_segment` plans and compares only the executed segment (published implementation).
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
-    running_cost_share: our addition to line 10: share, in [0, 1], of the squared distance to the subgoal after the
-        earlier pushes of a segment (their mean), beside the distance at its end: fewer pushes reach the goal if the
-        caller plans again after the first, and more episodes fail; 0 compares the ends (paper).
+    tracking_at: our addition to line 10: which predicted state is compared with a subgoal: `end`, after the T pushes of
+        a segment (paper), or `first_push`, after the one push that is made before the next plan; `auto` is `first_push`
+        where the goal is about all objects, and `end` where it is about the target, which then breaks its rules more
+        often.
     nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
@@ -96,7 +98,7 @@ class CavinPlanner(SearchingPlanner):
         motion_samples: int | None = None,
         motion_optimizer: str | Optimizer | None = None,
         feature_weight: float = 0.0,
-        running_cost_share: float = 0.0,
+        tracking_at: str = AUTO,
         nearest_objects: int | None = 2,
         effect_retries: int = 3,
         avoid_failures: bool = True,
@@ -108,14 +110,14 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        check_fraction("running_cost_share", running_cost_share)
+        check_choice("tracking_at", tracking_at, TRACKED)
         self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
         )
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
-        self.distance = SubgoalDistance(feature_weight, running_cost_share)
+        self.feature_weight, self.tracking_at = feature_weight, tracking_at
         if nearest_objects is not None:
             check_positive("nearest_objects", nearest_objects)
         self.nearest_objects = nearest_objects
@@ -123,6 +125,14 @@ class CavinPlanner(SearchingPlanner):
             raise ValueError(f"effect_retries must be 0 or more, not {effect_retries}")
         self.effect_retries = effect_retries
         self.avoid_failures = avoid_failures
+
+    @property
+    def distance(self) -> SubgoalDistance:
+        """To the subgoal, in this episode."""
+        at = self.tracking_at
+        if at == AUTO:
+            at = FIRST_PUSH if about(self.reward) == "all" else END
+        return SubgoalDistance(self.feature_weight, at)
 
     @chunked
     @torch.inference_mode()

@@ -185,6 +185,11 @@ class TargetedReward(RewardFunction, Protocol):
         """`target`, which is object 0, or `all`."""
 
 
+def about(reward: RewardFunction) -> str | None:
+    """The objects that the goal is about: `target`, `all`, or None if the reward function does not say."""
+    return reward.about if isinstance(reward, TargetedReward) else None
+
+
 @runtime_checkable
 class PathReward(RewardFunction, Protocol):
     """A reward function that can also evaluate whole paths, which reads every state once instead of twice."""

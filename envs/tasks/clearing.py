@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.tasks.generated import GeneratedLayouts, blocks, paths
-from envs.tasks.step import Step
+from envs.tasks.step import Step, out_of_reach
 from envs.tasks.task import Marking, Task, check_inside
 from envs.tasks.tiles import TileSet, table_distance
 
@@ -18,7 +18,7 @@ from envs.tasks.tiles import TileSet, table_distance
 class Clearing(Task):
     """Push every object out of the region.
 
-    A margin makes the region larger for planners.
+    A margin makes the region larger for planners, and keeps objects within the tool's reach.
 
     Attributes:
         region: the tiles to clear; the target starts within.
@@ -36,6 +36,12 @@ class Clearing(Task):
     def success(self, step: Step) -> Tensor:
         """No object is in the region: [...] bool."""
         return step.all_within(self.region.signed_distance)
+
+    def dead_end(self, step: Step) -> Tensor:
+        """An object is pushed out of the tool's reach within the region, as at the robot's side: [...] bool."""
+        return step.any_comes_into(
+            lambda points: torch.where(self.region.contains(points), out_of_reach(points), -torch.inf)
+        )
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Virtual goals lie at the table's edges: minus the sum, over objects in the region, of the distance to one."""

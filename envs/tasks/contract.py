@@ -34,7 +34,7 @@ def check_functions(task: Task, objects: int) -> None:
     """
     states, mask = torch.zeros(_PLANS, _STEPS + 1, objects, 2), torch.ones(_PLANS, 1, objects, dtype=torch.bool)
     step = Step(states, mask, 0.0)
-    for name in ("success", "violation", "published_violation"):
+    for name in ("success", "violation", "published_violation", "dead_end"):
         value, shape = getattr(task, name)(step), (_PLANS, _STEPS)
         if not (_is_broadcast(value, shape) and value.dtype == torch.bool):
             raise _mismatch(task, name, "bool", shape, value)

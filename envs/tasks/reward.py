@@ -87,7 +87,7 @@ class TaskReward:
         task: in its layout. reward: dense or sparse.
         margin: safety margin in metres for planners, whose predictions err: forbidden regions, and regions to clear,
             grow; regions to stay within shrink. An object that starts within the margin may stay there, but must not
-            come closer.
+            come closer. With a margin, dead ends (`Task.dead_end`) are violations.
         criterion: which rules make a step a violation: `strict`, those of the paper (`Task.violation`), or `published`,
             those of the published implementation for real episodes (`Task.published_violation`).
         device: where the layout's numbers lie, best that of the tensors to evaluate.
@@ -141,7 +141,10 @@ class TaskReward:
         if fallen:
             fall = torch.ones_like(fall)
         violated = self.task.violation if self.criterion == "strict" else self.task.published_violation
-        violation = violated(step) & ~fall
+        violation = violated(step)
+        if self.margin:
+            violation = violation | self.task.dead_end(step)
+        violation = violation & ~fall
         success = self.task.success(step) & ~fall & ~violation
         terms = self.task.terms(step, success, violation | fall, dense=self.dense)
         reward = reduce(add, terms.values())

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from envs.tasks.tiles import table_distance
+from envs.tasks.tiles import box_distance, table_distance
+from envs.workspace import REACH_HIGH, REACH_LOW
 
 Depth = Callable[[Tensor], Tensor]
 """Metres from points [..., 2] to the border of a forbidden place, positive within it: [...]."""
@@ -57,6 +58,11 @@ class Step(NamedTuple):
         """Whether any real object is in a forbidden place, with the margin as in `target_enters`: [..., T] bool."""
         return (self._enters(depth, self.states) & self.mask).any(dim=-1)
 
+    def any_comes_into(self, depth: Depth) -> Tensor:
+        """Whether a push brings any real object into a place, or the margin around it, from outside: [...] bool."""
+        inside = depth(self.states) > -self.margin
+        return (inside[..., 1:, :] & ~inside[..., :-1, :] & self.mask).any(dim=-1)
+
     def all_within(self, depth: Depth) -> Tensor:
         """Whether every real object is more than the margin within a place, by its `depth`: [..., T] bool."""
         return ~(~(depth(self.after) > self.margin) & self.mask).any(dim=-1)
@@ -73,3 +79,8 @@ class Step(NamedTuple):
 def off_table(points: Tensor) -> Tensor:
     """Metres by which points [..., 2] lie off the table, negative on it: [...]."""
     return -table_distance(points)
+
+
+def out_of_reach(points: Tensor) -> Tensor:
+    """Metres by which points [..., 2] lie outside the box that the tool's tip reaches, negative within: [...]."""
+    return -box_distance(points, REACH_LOW, REACH_HIGH)

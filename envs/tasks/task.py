@@ -115,6 +115,13 @@ class Task(ABC):
         """
         return self.violation(step)
 
+    def dead_end(self, step: Step) -> Tensor:
+        """Whether an object comes to where hardly any push moves it to its goal: [...] bool; by default never.
+
+        The environment does not forbid it. For planners with a margin it is a violation.
+        """
+        return torch.zeros_like(step.mask[..., 0])
+
     @abstractmethod
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the remaining distance in metres: [...]; its increase over a step is the dense reward's `progress`.

@@ -149,8 +149,13 @@ def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:
 
 def table_distance(points: Tensor) -> Tensor:
     """Metres by which points [..., 2] lie inside the table's nearest edge, negative off the table: [...]."""
+    return box_distance(points, TABLE_LOW, TABLE_HIGH)
+
+
+def box_distance(points: Tensor, lows: Sequence[float], highs: Sequence[float]) -> Tensor:
+    """Metres by which points [..., 2] lie inside the nearest side of a box, negative outside: [...]."""
     sides = []
-    for axis, (low, high) in enumerate(zip(TABLE_LOW, TABLE_HIGH, strict=True)):  # both at once would be slower
+    for axis, (low, high) in enumerate(zip(lows, highs, strict=True)):  # both at once would be slower
         sides.append(torch.minimum(points[..., axis] - low, high - points[..., axis]))
     return torch.minimum(*sides)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning.protocol import RewardFunction, TargetedReward
+from planning.protocol import RewardFunction, about
 
 
 class NearestObjects(NamedTuple):
@@ -53,8 +53,7 @@ def nearest_objects(state: State, most: int | None, reward: RewardFunction) -> N
 
     All objects in scenes `state: [B]` of up to `most`, and for tasks whose goal is about every object.
     """
-    about_target = isinstance(reward, TargetedReward) and reward.about == "target"
-    if most is None or state.objects <= most or not about_target:
+    if most is None or state.objects <= most or about(reward) != "target":
         return NearestObjects()
     distances = (state.centers[..., :2] - state.centers[:, :1, :2]).norm(dim=-1)  # [B, M] metres
     distances = torch.where(state.mask, distances, torch.inf)

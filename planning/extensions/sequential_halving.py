@@ -35,8 +35,12 @@ def most_robust(
     subgoals: State,
     distance: SubgoalDistance,
 ) -> MostRobust:
-    """The motion candidate with the lowest cost on average; see `sequential_halving`."""
-    problem, actions, goal = motions.problem, motions.at(0, actions_of), subgoals.step(slice(0, 1))
+    """The motion candidate with the lowest cost on average; see `sequential_halving`.
+
+    Rollouts end where their distance to the subgoal counts: after T pushes, or after the first.
+    """
+    problem, goal = motions.problem, subgoals.step(slice(0, 1))
+    actions = motions.at(0, lambda segment: actions_of(segment)[..., : distance.pushes(model.segment_length), :])
     what = problem.state, goal, scores, actions, later_cost, problem.generators
     return sequential_halving(robustness, model, reward, *what, distance=distance, backend=problem.backend)
 

@@ -10,6 +10,8 @@ from torch import Tensor
 from models.state import State
 from planning.inputs import NoFiniteCandidateError
 
+END, FIRST_PUSH = "end", "first_push"
+
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
     """Sum over real objects of the squared distance to their goals: `[...]` square metres.
@@ -24,26 +26,26 @@ def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0
 
 
 class SubgoalDistance(NamedTuple):
-    """How far a segment is from its subgoal: a terminal cost, and a running cost (Algorithm 1, line 10).
+    """How far a segment is from its subgoal (Algorithm 1, line 10).
 
-    feature_weight: as in `squared_distance`. running_cost_share: in [0, 1], of the squared distance of centres after
-    the earlier steps, their mean; the rest is the distance at the end, which counts alone with 0 (paper).
+    feature_weight: as in `squared_distance`, of the features at the end. at: where centres are compared, at the `end`
+    of the segment (paper) or after its `first_push`.
     """
 
     feature_weight: float = 0.0
-    running_cost_share: float = 0.0
+    at: str = END
+
+    def pushes(self, segment_length: int) -> int:
+        """After how many of a segment's T pushes centres are compared."""
+        return segment_length if self.at == END else 1
 
     def __call__(self, end: State, path: Tensor, subgoal: State) -> Tensor:
         """`[...]` square metres, from the last state `end: [...]` and the centres `path: [..., T, M, 3]` metres.
 
         Their leading dimensions and those of `subgoal: [...]` broadcast.
         """
-        terminal = squared_distance(end, subgoal, feature_weight=self.feature_weight)
-        if not self.running_cost_share or path.shape[-3] == 1:
-            return terminal
-        earlier = (path[..., :-1, :, :] - subgoal.centers.unsqueeze(-3)).square().sum(-1)
-        running = torch.where(subgoal.mask.unsqueeze(-2), earlier, 0.0).sum(-1).mean(-1)
-        return torch.lerp(terminal, running, self.running_cost_share)
+        compared = end if self.at == END else end._replace(centers=path[..., 0, :, :])
+        return squared_distance(compared, subgoal, feature_weight=self.feature_weight)
 
 
 def prefer(scores: Tensor, preferred: Tensor) -> Tensor:

@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from envs.layouts import load_task
+from envs.tasks import TaskReward
 from models.state import State
-from planning import Outcome, Plan, RewardFunction
+from planning import CavinPlanner, Outcome, Plan, RewardFunction
 from tests.planning.conftest import same, tensors
 
 START = (0.0, 0.02)  # metres; close above the forbidden half-plane y < 0 of `near_the_edge`
@@ -62,17 +64,29 @@ def test_motions_aim_at_the_subgoals(toy: SimpleNamespace) -> None:
     assert (error < 0.025).all()  # metres; pushes are off by 0.035 m per segment and axis before choosing
 
 
-def test_a_running_cost_prefers_motions_whose_first_pushes_go_far(toy: SimpleNamespace) -> None:
+def test_tracking_at_the_first_push_prefers_motions_that_go_far_at_once(toy: SimpleNamespace) -> None:
     state = toy.scenes([[START]] * 4)
 
-    def left(share: float) -> torch.Tensor:
-        planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=1024, horizon=3, running_cost_share=share)
+    def left(tracking_at: str) -> torch.Tensor:
+        planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=1024, horizon=3, tracking_at=tracking_at)
         plan = planner.plan(state, toy.generators(0, 1, 2, 3))
         return (plan.predicted_centers - plan.subgoals.centers).norm(dim=-1).squeeze(-1)  # [B, T]
 
-    ends, early = left(0.0), left(0.9)
-    assert (early[:, 0] < ends[:, 0]).all()
-    assert (early[:, 2] >= ends[:, 2]).all()  # and pays for it at the end
+    end, first_push = left("end"), left("first_push")
+    assert (first_push[:, 0] < end[:, 0]).all()
+    assert (first_push[:, 2] >= end[:, 2]).all()  # and pays for it at the end
+
+
+def test_by_default_the_first_push_is_tracked_where_the_goal_is_about_all_objects(toy: SimpleNamespace) -> None:
+    def at(reward: RewardFunction, **options: str) -> str:
+        return CavinPlanner(toy.PointMass(), reward, samples=8, horizon=3, **options).distance.at
+
+    clearing, crossing = (TaskReward(load_task(name)) for name in ("clearing", "crossing"))
+    assert at(clearing) == "first_push"
+    assert at(crossing) == "end"
+    assert at(near_the_edge(toy)) == "end"  # it does not say what its goal is about
+    assert at(clearing, tracking_at="end") == "end"
+    assert at(crossing, tracking_at="first_push") == "first_push"
 
 
 def test_dead_plans_are_replaced_by_copies_of_living_ones(toy: SimpleNamespace) -> None:
@@ -226,7 +240,7 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
         ({"samples": -5}, "samples must be at least 1, not -5"),
         ({"motion_horizon": "last"}, "unknown motion_horizon 'last': choose full_horizon or first_segment"),
         ({"feature_weight": -1.0}, "feature_weight must be zero or a positive number, not -1.0"),
-        ({"running_cost_share": 1.5}, "running_cost_share must be between 0 and 1, not 1.5"),
+        ({"tracking_at": "start"}, "unknown tracking_at 'start': choose auto or end or first_push"),
         ({"feature_weight": float("nan")}, "feature_weight must be zero or a positive number, not nan"),
     ],
 )

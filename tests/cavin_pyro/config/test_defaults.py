@@ -33,6 +33,7 @@ PAPER = {  # Algorithm 1 as it is printed
     "planner.robustness": None,
     "planner.idle_distance": 0.0,
     "planner.touchdown_distance": 0.0,
+    "planner.tracking_at": "end",
     "planner.nearest_objects": None,
     "planner.optimizer._target_": "planning.optimizers.Shooting",
     "pushes_per_plan": None,

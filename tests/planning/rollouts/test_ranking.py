@@ -42,14 +42,12 @@ def test_distance_adds_squares_over_real_objects_and_weighs_features(toy: Simple
     assert ranking.squared_distance(state, goal, feature_weight=0.5).tolist() == [26.0 + 0.5 * 4.0]
 
 
-def test_the_running_cost_is_the_mean_over_the_earlier_steps(toy: SimpleNamespace) -> None:
+def test_a_segment_is_compared_at_its_end_or_after_its_first_push(toy: SimpleNamespace) -> None:
     subgoal = toy.scenes([[(0.0, 0.0), (9.0, 9.0)]])
     subgoal.mask[0, 1] = False
-    end = toy.scenes([[(0.0, 1.0), (5.0, 5.0)]])
+    end = toy.scenes([[(0.0, 1.0), (5.0, 5.0)]])._replace(features=subgoal.features + 1.0)
     path = subgoal.centers.unsqueeze(1).repeat(1, 3, 1, 1)
-    path[0, :, 0, 0], path[0, :, 1, 0] = torch.tensor([3.0, 2.0, 7.0]), NAN  # the last of them is not read
-    for share in (0.0, 0.25, 1.0):
-        distance = ranking.SubgoalDistance(running_cost_share=share)(end, path, subgoal)
-        assert distance.tolist() == [(1 - share) * 1.0 + share * (9.0 + 4.0) / 2]
-    one_step = ranking.SubgoalDistance(running_cost_share=0.25)(end, path[:, :1], subgoal)
-    assert one_step.tolist() == [1.0]
+    path[0, :, 0, 0], path[0, :, 1, 0] = torch.tensor([3.0, NAN, NAN]), NAN  # only the first is read, of real objects
+    assert ranking.SubgoalDistance()(end, path, subgoal).tolist() == [1.0]
+    assert ranking.SubgoalDistance(at="first_push")(end, path, subgoal).tolist() == [9.0]
+    assert ranking.SubgoalDistance(2.0, "first_push")(end, path, subgoal).tolist() == [9.0 + 2.0]
