@@ -46,6 +46,17 @@ def test_nothing_is_forbidden_but_the_tables_edge() -> None:
     assert judge((INSIDE, INSIDE), (BESIDE, (0.54, 0.62))).fall
 
 
+def test_planners_keep_objects_within_the_tools_reach_until_they_are_in_the_region() -> None:
+    out_of_reach = (0.82, 0.0)  # the tool reaches x up to 0.80
+    assert judge((FAR, out_of_reach), margin=0.02).violation
+    assert not judge((FAR, out_of_reach)).violation  # the environment forbids nothing
+    assert not judge((out_of_reach, out_of_reach), margin=0.02).violation
+    assert not judge((out_of_reach, FAR), margin=0.02).violation
+    at_the_robot = Gathering(region=[(0, 3)], target_start=[(1, 1)], obstacle_start=[(1, 6)])
+    before, after = torch.tensor([[0.4, 0.0, 0.0]]), torch.tensor([[0.25, 0.0, 0.0]])  # out of reach, in the region
+    assert not TaskReward(at_the_robot, margin=0.02)(before, after, torch.tensor([True])).violation
+
+
 def test_the_dense_term_is_the_way_to_the_region_summed_over_objects() -> None:
     outcome = judge((FAR, BESIDE), (FAR, INSIDE), (INSIDE, INSIDE), reward="dense")
     assert outcome.terms["progress"].item() == pytest.approx(0.18 + 0.20)

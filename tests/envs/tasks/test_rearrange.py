@@ -67,6 +67,14 @@ def test_a_margin_asks_planners_for_more_but_never_for_the_impossible() -> None:
         assert not judge(away(PLACES[0], 1.1 * LEAST_TOLERANCE, 1.0), PLACES[1], margin=margin).success
 
 
+def test_planners_keep_objects_within_the_tools_reach_away_from_their_places() -> None:
+    out_of_reach = (0.82, 0.3)  # the tool reaches x up to 0.80
+    assert judge(out_of_reach, PLACES[1], margin=0.01).violation
+    assert not judge(out_of_reach, PLACES[1]).violation  # the environment forbids nothing
+    there = Rearrange(places=(out_of_reach, PLACES[1]), **LAYOUT)
+    assert not judge(out_of_reach, PLACES[1], task=there, margin=0.01).violation
+
+
 def test_a_place_is_of_one_object() -> None:
     assert judge(*PLACES).success
     assert not judge(*PLACES[::-1]).success
