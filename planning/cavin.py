@@ -60,9 +60,9 @@ class CavinPlanner(SearchingPlanner):
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
         centres only.
     tracking_at: our addition to line 10: which predicted state is compared with a subgoal: `end`, after the T pushes of
-        a segment (paper), or `first_push`, after the one push that is made before the next plan; `auto` is `first_push`
-        where the goal is about all objects, and `end` where it is about the target, which then breaks its rules more
-        often.
+        a segment (paper), or `first_push`, for callers that plan again after each push; `auto` is `first_push` where
+        the goal is about all objects, and `end` where it is about the target, which then breaks its rules more often.
+        Commands take `auto` for `end` if they execute more than one push of a plan.
     nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the

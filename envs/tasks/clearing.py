@@ -39,7 +39,7 @@ class Clearing(Task):
 
     def dead_end(self, step: Step) -> Tensor:
         """An object is pushed out of the tool's reach within the region, as at the robot's side: [...] bool."""
-        return step.any_comes_into(
+        return step.any_moves_into(
             lambda points: torch.where(self.region.contains(points), out_of_reach(points), -torch.inf)
         )
 

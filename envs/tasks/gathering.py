@@ -38,7 +38,7 @@ class Gathering(Task):
 
     def dead_end(self, step: Step) -> Tensor:
         """An object is pushed out of the tool's reach outside of the region: [...] bool."""
-        return step.any_comes_into(
+        return step.any_moves_into(
             lambda points: torch.where(self.region.contains(points), -torch.inf, out_of_reach(points))
         )
 

@@ -124,7 +124,7 @@ class Rearrange(Task):
 
     def dead_end(self, step: Step) -> Tensor:
         """An object is pushed out of the tool's reach away from its place: [...] bool."""
-        return step.any_comes_into(
+        return step.any_moves_into(
             lambda points: torch.where(self.distances(points) <= TOLERANCE, -torch.inf, out_of_reach(points))
         )
 

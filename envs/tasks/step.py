@@ -13,6 +13,8 @@ from torch import Tensor
 from envs.tasks.tiles import box_distance, table_distance
 from envs.workspace import REACH_HIGH, REACH_LOW
 
+STILL = 0.005  # metres; what moves by less is taken to stay where it is
+
 Depth = Callable[[Tensor], Tensor]
 """Metres from points [..., 2] to the border of a forbidden place, positive within it: [...]."""
 
@@ -58,10 +60,14 @@ class Step(NamedTuple):
         """Whether any real object is in a forbidden place, with the margin as in `target_enters`: [..., T] bool."""
         return (self._enters(depth, self.states) & self.mask).any(dim=-1)
 
-    def any_comes_into(self, depth: Depth) -> Tensor:
-        """Whether a push brings any real object into a place, or the margin around it, from outside: [...] bool."""
-        inside = depth(self.states) > -self.margin
-        return (inside[..., 1:, :] & ~inside[..., :-1, :] & self.mask).any(dim=-1)
+    def any_moves_into(self, depth: Depth) -> Tensor:
+        """Whether a push moves any real object into a place or the margin around it, or farther in: [..., T] bool.
+
+        By more than `STILL`: predictions of an object that nothing touches differ by less. What is there may stay.
+        """
+        depths = depth(self.states)
+        before, after = depths[..., :-1, :], depths[..., 1:, :]
+        return ((after > -self.margin) & (after > before + STILL) & self.mask).any(dim=-1)
 
     def all_within(self, depth: Depth) -> Tensor:
         """Whether every real object is more than the margin within a place, by its `depth`: [..., T] bool."""

@@ -20,6 +20,7 @@ from cavin_pyro.storage import checkpoint
 from cavin_pyro.storage.checkpoint import save_checkpoint
 from cavin_pyro.visualization.plan import draw_plan
 from models.networks.pointnet import PointNet
+from planning import CavinPlanner
 from planning.optimizers import OPTIMIZERS
 from planning.searching import SearchingPlanner
 from tests.compiler import needs_a_compiler
@@ -72,6 +73,25 @@ def test_a_baseline_plans_with_the_checkpoint_of_its_name(
     config = checkpoint.load_checkpoint(checkpoints[model]).config
     assert isinstance(runner.planner, SearchingPlanner)
     assert type(runner.planner.model) is type(building.build_model(config))
+    runner.env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "pushes", "tracked"),
+    [
+        ("clearing", "1", "first_push"),
+        ("clearing", "2", "end"),
+        ("clearing", "null", "end"),
+        ("rearrange", "1", "first_push"),
+        ("crossing", "1", "end"),
+    ],
+)
+def test_the_first_push_is_tracked_where_it_alone_is_executed(
+    task: str, pushes: str, tracked: str, make_small_runner: Callable[..., EpisodeRunner]
+) -> None:
+    runner = make_small_runner("cavin", "cascaded", f"task={task}", f"pushes_per_plan={pushes}")
+    assert isinstance(runner.planner, CavinPlanner)
+    assert runner.planner.distance.at == tracked
     runner.env.close()
 
 

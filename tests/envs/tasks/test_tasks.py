@@ -216,8 +216,10 @@ AT_THE_ROBOT = Clearing(region=[(0, 3), (0, 4), (1, 3), (1, 4)], target_start=[(
         ((0.40, 0.0), (0.33, 0.0), False),
         ((0.40, 0.0), (0.31, 0.0), True),  # within the margin
         ((0.40, 0.0), (0.25, 0.0), True),
-        ((0.28, 0.0), (0.26, 0.0), False),  # it was there
-        ((0.26, 0.0), (0.26, 0.1), False),
+        ((0.31, 0.0), (0.25, 0.0), True),  # farther, from within the margin
+        ((0.28, 0.0), (0.26, 0.0), True),
+        ((0.28, 0.0), (0.277, 0.0), False),  # as far as predictions tell
+        ((0.26, 0.0), (0.26, 0.1), False),  # sideways
         ((0.26, 0.0), (0.33, 0.0), False),  # back
         ((0.26, 0.25), (0.26, 0.15), True),  # into the region
         ((0.40, 0.25), (0.25, 0.25), False),  # beside the region, where nothing is left to do

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
 from models.state import State
-from planning import PerturbedRollouts
+from planning import CavinPlanner, PerturbedRollouts
+from planning.extensions import sequential_halving as halving
 from planning.extensions.sequential_halving import sequential_halving
 
 SAMPLES = 64
@@ -156,3 +158,20 @@ def test_without_a_goal_failures_and_the_later_cost_decide(toy: SimpleNamespace)
         return int(sequential_halving(*given, later, toy.generators(0)).candidate)
 
     assert [chosen(cost) for cost in (0.0, 0.1, 0.3)] == [0, 0, 2]
+
+
+def test_rollouts_end_where_their_distance_to_the_subgoal_counts(
+    toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pushes = []
+
+    def watched(*given: Any, **options: Any) -> Any:
+        pushes.append(given[6].shape[-2])  # [B, N, ., 4] actions
+        return sequential_halving(*given, **options)
+
+    monkeypatch.setattr(halving, "sequential_halving", watched)
+    for tracking_at in ("end", "first_push"):
+        reward = toy.GoalDisc(goal=(0.25, 0.05))
+        planner = CavinPlanner(toy.PointMass(), reward, samples=16, horizon=6, tracking_at=tracking_at)
+        planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+    assert pushes == [3, 1]
