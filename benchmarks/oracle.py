@@ -2,10 +2,10 @@
 
 The same scenes twice, by the same planner: once as `evaluate` plays them, once with the simulator in the place of f at
 line 10. Of the motions that f ranks best (--candidates), each is played in a second world with the same objects, put at
-the poses of the real ones; the one whose outcome on the table is closest to the subgoals is executed. For
-`--planner cavin` an outcome along which the task fails costs `planner.robustness.failure_cost`, as in its perturbed
-rollouts, which the simulator replaces. The real episode is not touched. The objects' poses and the simulator are no
-part of what a robot knows: this is a bound, not a method.
+the poses of the real ones; the one whose outcome on the table (`planner.tracking_at`) is closest to the subgoals is
+executed. For `--planner cavin` an outcome along which the task fails costs `planner.robustness.failure_cost`, as in its
+perturbed rollouts, which the simulator replaces. The real episode is not touched. The objects' poses and the simulator
+are no part of what a robot knows: this is a bound, not a method.
 
 Printed are success by the episodes' criterion, which is `published` for the paper's planner and `strict` for ours
 (episodes of `criterion=published` tell both), and of the scenes that both solve the mean pushes and their ratio, with a
@@ -98,7 +98,8 @@ class Oracle:
         best = scores[0].topk(min(self.candidates, scores.shape[-1])).indices
         actions = motions.at(0, actions_of)[0, best].numpy()
         here, goal = motions.problem.state, subgoals.step(0)  # [1]
-        path = torch.from_numpy(np.stack([self.path(pushes)[:, : here.objects] for pushes in actions]))
+        tracked = distance.pushes(actions.shape[1])
+        path = torch.from_numpy(np.stack([self.path(pushes[:tracked])[:, : here.objects] for pushes in actions]))
         start, mask = here.centers.expand(len(path), -1, -1), here.mask.expand(len(path), -1)
         failed = returns.advance(returns.start(start), reward, start, path, mask).failed
         end = goal.map(lambda field: field.expand(len(path), *field.shape[1:]))._replace(centers=path[:, -1])

@@ -21,19 +21,19 @@ from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import check_choice, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
 from planning.plan import Plan
-from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction, about
+from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction, goal_objects
 from planning.rollouts.candidates import Candidates
 from planning.rollouts.dynamics import predict_states
-from planning.rollouts.ranking import END, FIRST_PUSH, SubgoalDistance, best_of
+from planning.rollouts.ranking import AUTO, END, FIRST_PUSH, SubgoalDistance, best_of
 from planning.rollouts.returns import interpolate
 from planning.rollouts.sampling import sample_codes
 from planning.rollouts.segment import Objective, SegmentRollout, actions_of, select_segment
-from planning.searching import AUTO, SearchingPlanner, summary
+from planning.searching import SearchingPlanner, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
 # Motions are all sampled for one effect, so few candidates suffice.
 FEW_CANDIDATES = PerturbedRollouts(candidates=64, rounds=2, reduction_factor=8)
-TRACKED = (AUTO, END, FIRST_PUSH)
+TRACKING = (AUTO, END, FIRST_PUSH)
 
 
 class CavinPlanner(SearchingPlanner):
@@ -61,8 +61,8 @@ class CavinPlanner(SearchingPlanner):
         centres only.
     tracking_at: our addition to line 10: which predicted state is compared with a subgoal: `end`, after the T pushes of
         a segment (paper), or `first_push`, for callers that plan again after each push; `auto` is `first_push` where
-        the goal is about all objects, and `end` where it is about the target, which then breaks its rules more often.
-        Commands take `auto` for `end` if they execute more than one push of a plan.
+        the goal is about all objects and motions are of one segment, else `end`: with `first_push` the target breaks
+        rules more often. Commands replace `auto` by `end` unless `pushes_per_plan=1`.
     nearest_objects: our addition to line 5: where the goal is about the target, plans are about it and the objects
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
@@ -81,8 +81,8 @@ class CavinPlanner(SearchingPlanner):
         what is cached and runs the rest eagerly; `cuda_graphs` captures them on the GPU where the model is. All sample
         noise, from which codes follow, as a warm start does.
 
-    Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer` or
-    `reward_at`, limits out of order, and a weight or a distance that is negative or not finite.
+    Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer`,
+    `reward_at` or `tracking_at`, limits out of order, and a weight or a distance that is negative or not finite.
     """
 
     requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "subgoal", "actions", "next_state"))
@@ -110,7 +110,7 @@ class CavinPlanner(SearchingPlanner):
         if motion_horizon not in MOTION_HORIZONS:
             raise ValueError(f"unknown motion_horizon '{motion_horizon}': choose {' or '.join(MOTION_HORIZONS)}")
         check_weight("feature_weight", feature_weight)
-        check_choice("tracking_at", tracking_at, TRACKED)
+        check_choice("tracking_at", tracking_at, TRACKING)
         self.motion_samples = max(1, samples // 2) if motion_samples is None else motion_samples
         check_positive("motion_samples", self.motion_samples)
         self.motion_optimizer = make_optimizer(
@@ -131,7 +131,8 @@ class CavinPlanner(SearchingPlanner):
         """To the subgoal, in this episode."""
         at = self.tracking_at
         if at == AUTO:
-            at = FIRST_PUSH if about(self.reward) == "all" else END
+            alone = self.motion_segments == 1 and goal_objects(self.reward) == "all"
+            at = FIRST_PUSH if alone else END
         return SubgoalDistance(self.feature_weight, at)
 
     @chunked

@@ -53,7 +53,7 @@ def check_weight(name: str, value: float) -> None:
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Raise ValueError unless a value is one of the choices, which it names."""
     if value not in choices:
-        raise ValueError(f"unknown {name} '{value}': choose {' or '.join(choices)}")
+        raise ValueError(f"unknown {name} '{value}': choose {', '.join(choices[:-1])} or {choices[-1]}")
 
 
 def check_fraction(name: str, value: float, *, positive: bool = False) -> None:

@@ -185,7 +185,7 @@ class TargetedReward(RewardFunction, Protocol):
         """`target`, which is object 0, or `all`."""
 
 
-def about(reward: RewardFunction) -> str | None:
+def goal_objects(reward: RewardFunction) -> str | None:
     """The objects that the goal is about: `target`, `all`, or None if the reward function does not say."""
     return reward.about if isinstance(reward, TargetedReward) else None
 

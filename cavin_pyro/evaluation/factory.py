@@ -38,7 +38,7 @@ from planning import Planner
 from planning.inputs import NoFiniteCandidateError, OptimizerError
 from planning.optimizers import OPTIMIZERS, Shooting
 from planning.protocol import RewardFunction
-from planning.rollouts.ranking import END
+from planning.rollouts import ranking
 from planning.searching import AUTO, SearchingPlanner
 
 CPU = torch.device("cpu")
@@ -197,8 +197,8 @@ def make_planner(
     _check_planner(options, model, path)
     if "compile" in options:
         options["compile"] = argument_compile(config, device, model, path)
-    if options.get("tracking_at") == AUTO and config.pushes_per_plan != 1:
-        options["tracking_at"] = END  # the first push alone counts only where it alone is executed
+    if options.get("tracking_at") == ranking.AUTO and config.pushes_per_plan != 1:
+        options["tracking_at"] = ranking.END  # the first push alone counts only where it alone is executed
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
     with naming("planner", config.planner):

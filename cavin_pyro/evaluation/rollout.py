@@ -150,7 +150,8 @@ def rollout(
 
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
-        pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11).
+        pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
+            planner that tracks the first push (`tracking_at`) is for 1.
         push_decimals: to which planned pushes are rounded (`envs.workspace.executed_push`), so that an episode does not
             depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.

@@ -69,6 +69,10 @@ def stored_options(path: Path) -> dict[str, Any]:
             options.setdefault(f"generated.{name}", default)
     if "planner.horizon" in options:
         options.setdefault("planner.guidance", "none")
+    if "planner.motion_horizon" in options:
+        options.setdefault("planner.tracking_at", "end")
+        if not options.get("planner.running_cost_share"):
+            options.pop("planner.running_cost_share", None)
     if "scale" in options:
         options.setdefault("device", "cpu")
     if "trainer.schedule" in options:

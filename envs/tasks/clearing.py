@@ -18,7 +18,7 @@ from envs.tasks.tiles import TileSet, table_distance
 class Clearing(Task):
     """Push every object out of the region.
 
-    A margin makes the region larger for planners, and keeps objects within the tool's reach.
+    A margin makes the region larger for planners, and keeps objects within reach until they have left it.
 
     Attributes:
         region: the tiles to clear; the target starts within.

@@ -16,7 +16,7 @@ from envs.tasks.tiles import TileSet
 class Gathering(Task):
     """Push every object into the region. Only falls off the table are forbidden.
 
-    A margin makes the region smaller for planners.
+    A margin makes the region smaller for planners, and keeps objects within reach until they have arrived.
 
     Attributes:
         region: the tiles that all objects have to reach; no object starts within.

@@ -34,7 +34,7 @@ class Rearrange(Task):
     equal shape trade places, but noise in the outlines could then also swap objects that differ. A random goal samples
     a place for each object.
 
-    A margin makes the tolerance smaller for planners.
+    A margin makes the tolerance smaller for planners, and keeps objects within reach until they have arrived.
 
     Attributes:
         region: the tiles on which random places lie.

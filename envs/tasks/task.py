@@ -55,8 +55,8 @@ class Task(ABC):
     Attributes:
         name: by default the name of the class in lower case.
         markings: how pictures show the layout; later ones lie on top of earlier ones.
-        about: the objects that the goal is about: the `target` (object 0), or `all`. Pictures show their subgoals, and
-            guidance follows their way.
+        about: the objects that the goal is about: the `target` (object 0), or `all`. Pictures show their subgoals,
+            guidance follows their way, and for `all` the planner tracks the first push (`planner.tracking_at`).
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
         goal_is_shared: whether one place is as good for each object as for another; else guidance follows `potential`.
         goal_varies: whether `of_episode` returns another task in every episode, which planners must not compile.
@@ -116,9 +116,9 @@ class Task(ABC):
         return self.violation(step)
 
     def dead_end(self, step: Step) -> Tensor:
-        """Whether an object comes to where hardly any push moves it to its goal: [...] bool; by default never.
+        """Whether an object enters a place from which hardly any push moves it to its goal: [...] bool.
 
-        The environment does not forbid it. For planners with a margin it is a violation.
+        By default never. The environment does not forbid it. For planners with a margin it is a violation.
         """
         return torch.zeros_like(step.mask[..., 0])
 

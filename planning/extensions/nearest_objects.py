@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning.protocol import RewardFunction, about
+from planning.protocol import RewardFunction, goal_objects
 
 
 class NearestObjects(NamedTuple):
@@ -53,7 +53,7 @@ def nearest_objects(state: State, most: int | None, reward: RewardFunction) -> N
 
     All objects in scenes `state: [B]` of up to `most`, and for tasks whose goal is about every object.
     """
-    if most is None or state.objects <= most or about(reward) != "target":
+    if most is None or state.objects <= most or goal_objects(reward) != "target":
         return NearestObjects()
     distances = (state.centers[..., :2] - state.centers[:, :1, :2]).norm(dim=-1)  # [B, M] metres
     distances = torch.where(state.mask, distances, torch.inf)

@@ -62,9 +62,9 @@ def sequential_halving(
     """The motion with the lowest cost on average.
 
     state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
-    without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, T, 4]`, the
-    segment that will be executed. later: `[B, N]` square metres, the cost of the segments after it, and of guidance.
-    distance: to the subgoal. A motion whose score or whose cost is not finite loses.
+    without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, n, 4]`, the
+    pushes to roll out, of the segment that will be executed. later: `[B, N]` square metres, the cost of the segments
+    after it, and of guidance. distance: to the subgoal. A motion whose score or whose cost is not finite loses.
     """
     best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
     indices, count, done = best.indices, robustness.rollouts, 0

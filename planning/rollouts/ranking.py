@@ -10,7 +10,7 @@ from torch import Tensor
 from models.state import State
 from planning.inputs import NoFiniteCandidateError
 
-END, FIRST_PUSH = "end", "first_push"
+AUTO, END, FIRST_PUSH = "auto", "end", "first_push"  # where motions are compared with a subgoal
 
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
@@ -28,8 +28,8 @@ def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0
 class SubgoalDistance(NamedTuple):
     """How far a segment is from its subgoal (Algorithm 1, line 10).
 
-    feature_weight: as in `squared_distance`, of the features at the end. at: where centres are compared, at the `end`
-    of the segment (paper) or after its `first_push`.
+    feature_weight: as in `squared_distance`, of the features at the end of what is rolled out. at: where centres are
+    compared, at the `end` of the segment (paper) or after its `first_push`.
     """
 
     feature_weight: float = 0.0

@@ -240,7 +240,7 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
         ({"samples": -5}, "samples must be at least 1, not -5"),
         ({"motion_horizon": "last"}, "unknown motion_horizon 'last': choose full_horizon or first_segment"),
         ({"feature_weight": -1.0}, "feature_weight must be zero or a positive number, not -1.0"),
-        ({"tracking_at": "start"}, "unknown tracking_at 'start': choose auto or end or first_push"),
+        ({"tracking_at": "start"}, "unknown tracking_at 'start': choose auto, end or first_push"),
         ({"feature_weight": float("nan")}, "feature_weight must be zero or a positive number, not nan"),
     ],
 )

@@ -107,7 +107,8 @@ class EpisodeConfig(DeviceOptions):
     )
     margin: float = option(
         0.02,
-        "safety margin of the planner's reward, at most half a tile; predictions err by about this much",
+        "safety margin of the planner's reward, at most half a tile; predictions err by about this much; 0 also allows "
+        "dead ends",
         unit="metres",
         minimum=0,
         maximum=TILE_SIDE / 2,

@@ -82,6 +82,9 @@ def stored_configuration(folders: Sequence[Path], row: Row) -> DictConfig:
             if not Path(config.checkpoint).exists():
                 own = training_folder(folder, cell.method, row["training_seed"]) / "checkpoint.safetensors"
                 config.checkpoint = str(own)
+            if "motion_horizon" in config.planner and "tracking_at" not in config.planner:
+                config.planner.tracking_at = "end"  # older versions knew no other
+                config.planner.pop("running_cost_share", None)
             return config
     raise UserError(
         f"no evaluate/{cell.name}-{row['training_seed']}/config.yaml in {', '.join(map(str, folders))}: pictures need "

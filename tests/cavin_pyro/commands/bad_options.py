@@ -218,7 +218,7 @@ BAD_OPTIONS = [
     ("plan", "planner.optimizer=cem planner.samples=3", "4 iterations need at least as many samples, not 3"),
     ("plan", "planner.motion_optimizer=cemm", "unknown planner.motion_optimizer 'cemm': choose from shooting, cem, "),
     ("plan", "planner.feature_weight=-1", "planner.feature_weight must be zero or a positive number, not -1"),
-    ("plan", "planner.tracking_at=start", "unknown planner.tracking_at 'start': choose auto or end or first_push"),
+    ("plan", "planner.tracking_at=start", "unknown planner.tracking_at 'start': choose auto, end or first_push"),
     ("plan", "planner.motion_samples=0", "planner.motion_samples must be at least 1, not 0"),
     ("plan", "planner.idle_distance=-1", "planner.idle_distance must be zero or a positive number, not -1"),
     ("plan", "planner.warm_start=3", "planner.warm_start must be true or false, not 3"),

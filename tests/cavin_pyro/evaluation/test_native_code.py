@@ -84,3 +84,20 @@ def test_a_run_that_did_not_round_pushes_is_not_resumed_with_rounding(tmp_path: 
     with pytest.raises(UserError, match=r"holds a run with push_decimals=None, not 3: resume with the same options"):
         check_same_run(tmp_path, config, ignore=("output",))
     check_same_run(tmp_path, compose("evaluate", f"output={tmp_path}", "push_decimals=null"), ignore=("output",))
+
+
+def test_a_run_of_before_the_first_push_was_tracked_compared_ends(tmp_path: Path) -> None:
+    for planner, fits in (("paper", True), ("cavin", False)):
+        folder = tmp_path / planner
+        folder.mkdir()
+        config = compose("evaluate", f"planner={planner}", f"output={folder}")
+        before = config.copy()
+        del before.planner["tracking_at"]  # of versions that knew no such option
+        OmegaConf.update(before, "planner.running_cost_share", 0.0, force_add=True)
+        write_config(folder, before)
+        (folder / "episodes.jsonl").write_text("{}\n")
+        if fits:
+            check_same_run(folder, config, ignore=("output",))
+            continue
+        with pytest.raises(UserError, match=r"holds a run with planner.tracking_at=end, not auto: resume with"):
+            check_same_run(folder, config, ignore=("output",))

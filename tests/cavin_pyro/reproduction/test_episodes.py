@@ -168,3 +168,17 @@ def test_a_moved_reproduction_has_its_own_checkpoint_and_one_without_the_cell_is
         UserError, match=r"no evaluate/cavin-paper-crossing-sparse-3-1/config.yaml in .*: pictures need"
     ):
         stored_configuration([home], {**one, "training_seed": 1})
+
+
+def test_an_evaluation_of_before_the_first_push_was_tracked_is_replayed_with_ends(
+    small_run: tuple[Path, list[dict[str, Any]]], tmp_path: Path
+) -> None:
+    home, (one, _) = small_run
+    shutil.copytree(home, tmp_path / "older")
+    path = next((tmp_path / "older" / "evaluate").glob("*/config.yaml"))
+    lines = path.read_text().splitlines()
+    (place,) = (number for number, line in enumerate(lines) if line.strip().startswith("tracking_at:"))
+    lines[place] = "  running_cost_share: 0.0"
+    path.write_text("\n".join(lines))
+    older = stored_configuration([tmp_path / "older"], one)
+    assert older.planner == stored_configuration([home], one).planner
