@@ -294,6 +294,7 @@ def test_the_published_rates_are_those_of_the_published_episodes(table: str, pag
     ("heading", "table", "name", "kinds"),
     [
         ("## Today's planner", "shared-noise-episodes.parquet", "today", 17),
+        ("### The first push", "first-push-episodes.parquet", "today", 7),
         ("### Running cost", "running-cost-episodes.parquet", "share-0.9", 10),
         ("### With noise of each rollout's own", "reach-episodes.parquet", "today", 17),
     ],
