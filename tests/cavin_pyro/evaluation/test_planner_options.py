@@ -39,7 +39,7 @@ SMALL = ["maximum_steps=3", "objects=2", "planner.samples=16", "planner.horizon=
 
 def multiplies_in_bfloat16() -> bool:
     """Whether this processor rounds products to bfloat16 where torch may: not all have instructions for it."""
-    left, right = torch.rand(2, 64, 64, generator=torch.Generator().manual_seed(0))
+    left, right = torch.rand(2, 512, 512, generator=torch.Generator().manual_seed(0))
     exact = left @ right
     torch.set_float32_matmul_precision("medium")
     rounded = left @ right
