@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.tasks.generated import GeneratedLayouts, blocks, paths
-from envs.tasks.step import Step, out_of_reach
+from envs.tasks.step import Step
 from envs.tasks.task import Marking, Task, check_inside
 from envs.tasks.tiles import TileSet, table_distance
 
@@ -39,9 +39,7 @@ class Clearing(Task):
 
     def dead_end(self, step: Step) -> Tensor:
         """An object is pushed out of the tool's reach within the region, as at the robot's side: [...] bool."""
-        return step.any_moves_into(
-            lambda points: torch.where(self.region.contains(points), out_of_reach(points), -torch.inf)
-        )
+        return step.any_leaves_reach(lambda points: ~self.region.contains(points))
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Virtual goals lie at the table's edges: minus the sum, over objects in the region, of the distance to one."""

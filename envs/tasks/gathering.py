@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from envs.tasks.step import Step, out_of_reach
+from envs.tasks.step import Step
 from envs.tasks.task import Marking, Task, check_apart
 from envs.tasks.tiles import TileSet
 
@@ -38,9 +38,7 @@ class Gathering(Task):
 
     def dead_end(self, step: Step) -> Tensor:
         """An object is pushed out of the tool's reach outside of the region: [...] bool."""
-        return step.any_moves_into(
-            lambda points: torch.where(self.region.contains(points), -torch.inf, out_of_reach(points))
-        )
+        return step.any_leaves_reach(self.region.contains)
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the sum, over objects outside of the region, of the distance to it."""

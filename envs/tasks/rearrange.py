@@ -15,7 +15,7 @@ from torch import Tensor
 from envs.goals import Goal, assign, read_goal, sample_places
 from envs.markings import Place, TileGroup
 from envs.observation import Observation
-from envs.tasks.step import Step, out_of_reach
+from envs.tasks.step import Step
 from envs.tasks.task import Marking, Task
 from envs.tasks.tiles import TileSet
 from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW
@@ -124,9 +124,7 @@ class Rearrange(Task):
 
     def dead_end(self, step: Step) -> Tensor:
         """An object is pushed out of the tool's reach away from its place: [...] bool."""
-        return step.any_moves_into(
-            lambda points: torch.where(self.distances(points) <= TOLERANCE, -torch.inf, out_of_reach(points))
-        )
+        return step.any_leaves_reach(lambda points: self.distances(points) <= TOLERANCE)
 
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the sum, over objects, of the distance to the object's place."""

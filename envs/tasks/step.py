@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from envs.tasks.tiles import box_distance, table_distance
@@ -60,12 +61,15 @@ class Step(NamedTuple):
         """Whether any real object is in a forbidden place, with the margin as in `target_enters`: [..., T] bool."""
         return (self._enters(depth, self.states) & self.mask).any(dim=-1)
 
-    def any_moves_into(self, depth: Depth) -> Tensor:
-        """Whether a push moves any real object into a place or the margin around it, or farther in: [..., T] bool.
+    def any_leaves_reach(self, arrived: Callable[[Tensor], Tensor]) -> Tensor:
+        """Whether a push moves any real object out of the tool's reach, the margin included, or farther: [..., T] bool.
 
-        By more than `STILL`: predictions of an object that nothing touches differ by less. What is there may stay.
+        By more than `STILL`: predictions of an object that nothing touches differ by less. What lies there may stay.
+
+        Args:
+            arrived: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
         """
-        depths = depth(self.states)
+        depths = torch.where(arrived(self.states), -torch.inf, _out_of_reach(self.states))
         before, after = depths[..., :-1, :], depths[..., 1:, :]
         return ((after > -self.margin) & (after > before + STILL) & self.mask).any(dim=-1)
 
@@ -87,6 +91,6 @@ def off_table(points: Tensor) -> Tensor:
     return -table_distance(points)
 
 
-def out_of_reach(points: Tensor) -> Tensor:
+def _out_of_reach(points: Tensor) -> Tensor:
     """Metres by which points [..., 2] lie outside the box that the tool's tip reaches, negative within: [...]."""
     return -box_distance(points, REACH_LOW, REACH_HIGH)

@@ -154,12 +154,18 @@ def test_a_replay_that_ends_otherwise_than_in_the_table_is_told(small_run: tuple
             replay([home], {**one, f"published_{name}": value}, "published")
 
 
+def copied(home: Path, folder: Path) -> Path:
+    """The configuration of the one evaluation in a copy of a reproduction."""
+    shutil.copytree(home, folder)
+    (path,) = (folder / "evaluate").glob("*/config.yaml")
+    return path
+
+
 def test_a_moved_reproduction_has_its_own_checkpoint_and_one_without_the_cell_is_told(
     small_run: tuple[Path, list[dict[str, Any]]], tmp_path: Path
 ) -> None:
     home, (one, _) = small_run
-    shutil.copytree(home, tmp_path / "moved")
-    path = next((tmp_path / "moved" / "evaluate").glob("*/config.yaml"))
+    path = copied(home, tmp_path / "moved")
     stored = stored_configuration([home], one).checkpoint
     path.write_text(path.read_text().replace(stored, "/gone/checkpoint.safetensors"))
     moved = stored_configuration([tmp_path / "moved"], one)
@@ -174,8 +180,7 @@ def test_an_evaluation_of_before_the_first_push_was_tracked_is_replayed_with_end
     small_run: tuple[Path, list[dict[str, Any]]], tmp_path: Path
 ) -> None:
     home, (one, _) = small_run
-    shutil.copytree(home, tmp_path / "older")
-    path = next((tmp_path / "older" / "evaluate").glob("*/config.yaml"))
+    path = copied(home, tmp_path / "older")
     lines = path.read_text().splitlines()
     (place,) = (number for number, line in enumerate(lines) if line.strip().startswith("tracking_at:"))
     lines[place] = "  running_cost_share: 0.0"

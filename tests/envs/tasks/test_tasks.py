@@ -206,41 +206,6 @@ def test_a_margin_widens_the_region_to_clear() -> None:
     assert judge(CLEARING, [tile(2, 3)], [well_out], margin=0.02).success
 
 
-# A region up to the robot's side of the table, x 0.22 to 0.52 and y -0.11 to 0.19. The tool reaches x from 0.30 on.
-AT_THE_ROBOT = Clearing(region=[(0, 3), (0, 4), (1, 3), (1, 4)], target_start=[(1, 3)], obstacle_start=[(1, 4)])
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "dead_end"),
-    [
-        ((0.40, 0.0), (0.33, 0.0), False),
-        ((0.40, 0.0), (0.31, 0.0), True),  # within the margin
-        ((0.40, 0.0), (0.25, 0.0), True),
-        ((0.31, 0.0), (0.25, 0.0), True),  # farther, from within the margin
-        ((0.28, 0.0), (0.26, 0.0), True),
-        ((0.28, 0.0), (0.277, 0.0), False),  # as far as predictions tell
-        ((0.26, 0.0), (0.26, 0.1), False),  # sideways
-        ((0.26, 0.0), (0.33, 0.0), False),  # back
-        ((0.26, 0.25), (0.26, 0.15), True),  # into the region
-        ((0.40, 0.25), (0.25, 0.25), False),  # beside the region, where nothing is left to do
-    ],
-)
-def test_planners_keep_what_is_in_the_region_to_clear_within_the_tools_reach(
-    before: Point, after: Point, dead_end: bool
-) -> None:
-    for others in ([], [tile(1, 3)]):
-        with_margin = judge(AT_THE_ROBOT, [before, *others], [after, *others], margin=0.02)
-        assert bool(with_margin.violation) == dead_end
-        assert not judge(AT_THE_ROBOT, [before, *others], [after, *others]).violation  # the environment forbids nothing
-
-
-def test_a_region_that_the_tool_reaches_has_no_dead_ends() -> None:
-    generator = torch.Generator().manual_seed(0)
-    low, high = torch.tensor([0.3, -0.5, 0.0]), torch.tensor([0.8, 0.5, 0.1])
-    before, after = (low + (high - low) * torch.rand(200, 2, 3, generator=generator) for _ in range(2))
-    assert not TaskReward(CLEARING, margin=0.02)(before, after, torch.ones(200, 2, dtype=torch.bool)).violation.any()
-
-
 # Each: task, what is judged (violation or fall), and points of the target further and further out: 25, 15,
 # 10 and 5 mm from what is forbidden, and 5 mm into it.
 OUTWARDS = {
