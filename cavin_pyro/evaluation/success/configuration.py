@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -91,9 +92,16 @@ def planner_mismatch(fitted: Mapping[str, Any], now: Mapping[str, Any]) -> list[
     differing = [name for name in fitted if name not in now or now[name] != fitted[name]]
     younger = set(now) - set(fitted)
     if younger:
-        usual = flat_options(OmegaConf.to_container(compose("evaluate"), resolve=True))
+        usual = _usual_options()
         differing += [name for name in sorted(younger) if name not in usual or usual[name] != now[name]]
     return differing
+
+
+@functools.cache  # every fit in a file asks for it
+def _usual_options() -> dict[str, Any]:
+    """The options of `evaluate` without overrides but for its output, by their dotted names."""
+    usual = compose("evaluate", "output=unused")  # finding the usual folder would take two more compositions
+    return flat_options(OmegaConf.to_container(usual, resolve=True))
 
 
 def joined(scenes: Sequence[Scenes]) -> list[Scenes]:
