@@ -1,7 +1,7 @@
 # make demo   sets up .venv once, then plans and executes an episode of each task with the shipped checkpoint
 # make test   sets up what the tests need once, then runs the checks and the tests
-# make soak   runs the tests that make test leaves out: whole families, of which it runs a representative; then 2,000
-#             faults of the disk and 100,000 plans, each of which goes on after its log in runs/soak
+# make soak   runs the tests that make test leaves out, since two slow cores have 15 minutes for it; then 2,000 faults of
+#             the disk and 100,000 plans, each of which goes on after its log in runs/soak
 # make docs   builds the documentation as a site, site/index.html, and checks every link in it
 # make clean  removes .venv and what tools leave behind
 #
@@ -9,26 +9,26 @@
 PYTHON ?= $(shell for python in python3.11 python3.10; do \
 	"$$python" -c 'import ensurepip, venv' >/dev/null 2>&1 && { command -v "$$python"; break; }; done)
 
+# For the tests pip compiles nothing in advance, which takes a minute: a module is compiled when it is first imported, and
+# kept, which this variable would forbid.
+unexport PYTHONDONTWRITEBYTECODE
+
 bin := .venv/bin
 install := $(bin)/python -m pip install --disable-pip-version-check --no-input --constraint constraints.txt
 # Each marker is written when its installation has succeeded and removed before the next one begins, so that
 # what a broken installation left behind is thrown away, never used.
 installed := .venv/installed
 installed_for_tests := .venv/installed-for-tests
-# The variable switches off a notice about what comes after Material for MkDocs: docs/reference/dependencies.md.
-build_docs := NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict
+with_extras := '.[test,docs]'
+checks := lint format types imports docs
 
-.PHONY: demo test soak docs clean
+.PHONY: demo test soak clean $(checks)
 
 demo: $(installed)
 	$(bin)/python -m cavin_pyro.demo
 
 test: $(installed_for_tests)
-	$(bin)/ruff check .
-	$(bin)/ruff format --check .
-	$(bin)/mypy
-	$(bin)/lint-imports
-	$(build_docs)
+	$(MAKE) --no-print-directory --jobs 2 --output-sync $(checks)
 	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 soak: $(installed_for_tests)
@@ -37,22 +37,39 @@ soak: $(installed_for_tests)
 	OMP_NUM_THREADS=1 $(bin)/python -m tests.cavin_pyro.faults --count 2000 --log runs/soak/faults.jsonl
 	OMP_NUM_THREADS=1 $(bin)/python benchmarks/long_runs.py --turns 100000 --log runs/soak/long_runs.jsonl
 
-docs: $(installed_for_tests)
-	$(build_docs)
+lint: $(installed_for_tests)
+	$(bin)/ruff check .
 
-$(installed): pyproject.toml constraints.txt
+format: $(installed_for_tests)
+	$(bin)/ruff format --check .
+
+types: $(installed_for_tests)
+	$(bin)/mypy
+
+imports: $(installed_for_tests)
+	$(bin)/lint-imports
+
+# The variable switches off a notice about what comes after Material for MkDocs: docs/reference/dependencies.md.
+docs: $(installed_for_tests)
+	NO_MKDOCS_2_WARNING=1 $(bin)/mkdocs build --strict
+
+# Installs into .venv, which is made anew unless what lies there is whole.
+define set_up
 	$(if $(PYTHON),,$(error Python 3.11 or 3.10 with its venv module is needed and neither was found; install it, or say where it is: make PYTHON=/path/to/python3.11))
 	@"$(PYTHON)" -c 'import sys; (3, 10) <= sys.version_info[:2] <= (3, 11) or sys.exit("$(PYTHON) is Python %d.%d; 3.11 or 3.10 is needed: make PYTHON=/path/to/python3.11" % sys.version_info[:2])'
 	@echo "Setting up .venv with $(PYTHON): this once, for a few minutes"
-	"$(PYTHON)" -m venv $(if $(wildcard $@),,--clear) .venv
+	"$(PYTHON)" -m venv $(if $(wildcard $(installed)),,--clear) .venv
 	@rm -f $(installed) $(installed_for_tests)
 	$(install) pip setuptools
-	$(install) --no-build-isolation --editable .
+	$(install) --no-build-isolation $(1)
+endef
+
+$(installed): pyproject.toml constraints.txt
+	$(call set_up,--editable .)
 	@touch $@
 
-$(installed_for_tests): $(installed)
-	@rm -f $(installed) $(installed_for_tests)
-	$(install) --no-build-isolation --editable '.[test,docs]'
+$(installed_for_tests): pyproject.toml constraints.txt
+	$(call set_up,--no-compile --editable $(with_extras))
 	@touch $(installed) $@
 
 clean:

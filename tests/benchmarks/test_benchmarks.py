@@ -40,11 +40,13 @@ def run(name: str, *arguments: str) -> str:
     return ended.output
 
 
+@pytest.mark.soak
 def test_training_by_hand_has_the_same_loss_and_is_timed_against_pyro() -> None:
     printed = run("training", "8")  # asserts that both losses are equal
     assert re.search(r"batch 8: Pyro [\d.]+ ms, hand-written torch [\d.]+ ms, ratio [\d.]+", printed)
 
 
+@pytest.mark.soak
 def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
     *_, alone, together = run("plans", "--quick", "--no-flat", "--no-compile").splitlines()
     # samples, objects, batch, GFLOP per plan, matrix GFLOP/s, ms per plan (the fastest), share of the matrix rate
@@ -53,6 +55,7 @@ def test_a_plan_is_timed_and_its_operations_are_counted() -> None:
     assert all(float(line.split()[5]) > 0.0 for line in (alone, together))
 
 
+@pytest.mark.soak
 def test_episodes_of_two_processes_have_the_same_pushes() -> None:
     tiny = ("task=clearing", "objects=1", "planner.samples=8", "planner.horizon=6", "maximum_steps=2")
     title, rounded, planned = run("rounding", *tiny, "--episodes", "2", "--ways", "again").splitlines()
@@ -179,6 +182,7 @@ def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_ep
     assert refused.status == 2 and refused.errors == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
 
 
+@pytest.mark.soak
 def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:
     few = ("--objects", "2", "6", "--neighbours", "4", "9", "--nearest", "0", "2", "--repetitions", "1")
     _, *rows = run("many_objects", *few, "--options", "planner.samples=8", "planner.horizon=6").splitlines()
@@ -198,6 +202,7 @@ def test_pushes_at_the_start_of_a_scene_are_counted() -> None:
     assert sum(int(line.split()[0]) for line in lines[3:]) == 2
 
 
+@pytest.mark.soak
 def test_samples_are_set_against_success_and_a_finished_setting_is_not_run_again(tmp_path: Path) -> None:
     few = ["planner.horizon=6", "maximum_steps=2", "--methods", "cavin", "--planners", "paper", "--episodes", "1"]
     few += ["--workers", "1", "--timed", "1", "--output", str(tmp_path)]
@@ -226,6 +231,7 @@ def test_rows_of_networks_are_counted_for_every_planner_of_a_method() -> None:
     assert counted["`without_effects`"][0] == 0
 
 
+@pytest.mark.soak
 def test_predictions_are_set_against_what_nobody_could_predict(tmp_path: Path) -> None:
     options = ("--objects", "3", "6", "--neighbours", "4", "--picture", str(tmp_path / "a.png"))
     printed = run("accuracy", "contact", "--episodes", "2", "--redraws", "2", *options)
@@ -259,12 +265,14 @@ def _floors(group: str, printed: str) -> tuple[str, str]:
     return hidden, turned
 
 
+@pytest.mark.soak
 def test_cans_and_cups_that_are_turned_end_elsewhere() -> None:
     printed = run("accuracy", "mpc", "--episodes", "3", "--redraws", "2", "--seed", "10000", "--place-error", "0")
     hidden, turned = _floors("cans and cups", printed)
     assert hidden != turned
 
 
+@pytest.mark.soak
 def test_pushes_of_a_model_are_others_than_the_heuristics() -> None:
     options = ("mpc", "--episodes", "1", "--redraws", "1", "--seed", "10000")
     heuristic, chosen = run("accuracy", *options), run("accuracy", *options, "--policy", "model", "--pusher", "cavin")
@@ -313,6 +321,7 @@ def test_a_published_table_of_kinds_of_scenes_is_that_of_its_episodes(
     assert len(published) == kinds
 
 
+@pytest.mark.soak
 def test_training_and_planning_are_timed_on_every_device_of_the_machine() -> None:
     first, *lines = [line for line in run("devices", "--quick").splitlines() if line]
     assert first.startswith("torch ")
@@ -326,6 +335,7 @@ def test_training_and_planning_are_timed_on_every_device_of_the_machine() -> Non
     assert all(float(row.split("|")[2]) > 0.0 for row in rows)
 
 
+@pytest.mark.soak
 def test_plans_are_timed_beside_a_reference() -> None:
     small, large = "planner.samples=8 planner.robustness=null", "planner.samples=2048"
     options = ("--tasks", "insertion", "--scenes", "3", "--repetitions", "1")

@@ -51,6 +51,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "together.parquet"
 
 
+@pytest.mark.soak
 def test_the_factor_that_matters_is_named_and_the_one_that_does_not_is_zero(table: Path) -> None:
     given = (f"{name}={table.parent / name}" for name in ("few", "many"))
     ended = run_script(FILE, str(table), "--collect", *given, folder=ROOT)
@@ -75,6 +76,7 @@ def test_trainings_are_resampled_not_only_scenes(factors: Any) -> None:
     assert mean == 0.5 and 0.38 < low < 0.45 and 0.55 < high < 0.62
 
 
+@pytest.mark.soak
 def test_a_way_without_all_scenes_is_refused(table: Path, tmp_path: Path) -> None:
     rows = [{**one, "data": name} for name in ("few", "many") for one in episodes(name)]
     schema = SCHEMA.append(pyarrow.field("data", pyarrow.string()))

@@ -37,6 +37,7 @@ def test_a_quantity_that_rises_is_told_from_noise(rising: str | None, long_runs:
     assert [one.name for one in long_runs.slopes(measured) if one.rises] == ([rising] if rising else [])
 
 
+@pytest.mark.soak
 def test_turns_stay_flat_and_leaks_on_purpose_do_not(long_runs: Any) -> None:
     """In so few turns only large slopes can be told: a leak is of 8 MB, a file and a simulation a turn."""
     flat = long_runs.slopes(list(long_runs.measure(16, 1)), memory_limit=3000.0, time_limit=2.0)

@@ -125,6 +125,7 @@ def test_the_interval_of_a_ratio_covers_the_truth_and_not_more(benchmark: Any) -
     assert low < 1.2 < high and low < ratio < high and high - low < 0.15
 
 
+@pytest.mark.soak
 def test_the_papers_planner_is_judged_by_both_criteria() -> None:
     small = ("planner.samples=8", "planner.horizon=3", "maximum_steps=4")
     given = ("--episodes", "1", "--objects", "2", "--candidates", "2", "--seed", "5", *small)
@@ -135,6 +136,7 @@ def test_the_papers_planner_is_judged_by_both_criteria() -> None:
     assert all(re.match(r"[01] of 1: ", cell) for row in rows for cell in row[4:6])
 
 
+@pytest.mark.soak
 def test_a_second_run_goes_on_after_the_episodes_of_a_log(tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
 

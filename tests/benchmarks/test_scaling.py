@@ -59,6 +59,7 @@ def test_lengths_are_pushes_of_real_episodes_by_seed(scaling: Any) -> None:
     assert all(one % 0.5 == 0.0 and 0.5 <= one <= 30.0 for one in made)
 
 
+@pytest.mark.soak
 def test_the_table_has_a_line_for_every_number_of_workers() -> None:
     costs = ("--start", "5", "--push", "0.5", "--main", "0.01")
     line = [sys.executable, "benchmarks/scaling.py", "--episodes", "20", "--workers", "1", "16", *costs]

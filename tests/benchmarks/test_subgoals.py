@@ -19,6 +19,7 @@ def benchmark() -> Any:
     return load("subgoals")
 
 
+@pytest.mark.soak
 def test_no_choice_leaves_less_than_the_simulators(tmp_path: Path, benchmark: Any) -> None:
     log = tmp_path / "log.jsonl"
 

@@ -1,8 +1,9 @@
 """The commands of README and documentation, taken from the pages.
 
-Every command is composed. Those of the README, the tutorial and the how-to pages run in short sizes, in this order and
-in one folder. The pages about parts of one's own have tests in tests/how_to, which run theirs. Commands that need files
-from publishers (`env.assets=`) and those of the measurements are composed only.
+Every command is composed, those of the measurements in `make soak` only. Those of the README also run, in short sizes,
+in this order and in one folder; in `make soak` those of the tutorial and the how-to pages after them. The pages about
+parts of one's own have tests in tests/how_to, which run theirs. Commands that need files from publishers
+(`env.assets=`) and those of the measurements are composed only.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from tests.test_repository import PROJECT
 
 LINES = [line for page in PAGES for line in commands(page)]
 EACH_ONCE = [*{line.tokens: line for line in LINES}.values()]
-TUTORIAL_AND_HOW_TO = (
-    "docs/tutorial/first-plan.md",
+TUTORIAL = "docs/tutorial/first-plan.md"
+HOW_TO = (
     *(f"docs/how-to/{page}.md" for page in ("collect-and-train", "check-a-model", "evaluate-and-compare")),
     *(f"docs/how-to/{page}.md" for page in ("plan-faster-or-farther", "see-a-plan")),
 )
@@ -54,7 +55,13 @@ def test_braces_and_brackets_are_quoted(page: Path) -> None:
     assert not [one for one in said if bare.search(one)]
 
 
-@pytest.mark.parametrize("line", composable(EACH_ONCE), ids=str)
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, id=str(line), marks=pytest.mark.soak if "measurements" in line.page else [])
+        for line in composable(EACH_ONCE)
+    ],
+)
 def test_the_command_composes(line: Line) -> None:
     assert line.command is not None
     compose(line.command, *line.options)
@@ -103,5 +110,10 @@ def run_in_order(pages: Sequence[str], folder: Path) -> None:
         assert answer.status == 0, f"{line}\n{answer.errors}"
 
 
+def test_the_commands_of_the_readme_run_in_order(tmp_path: Path) -> None:
+    run_in_order(["README.md"], tmp_path)
+
+
+@pytest.mark.soak
 def test_the_commands_of_readme_tutorial_and_how_to_pages_run_in_order(tmp_path: Path) -> None:
-    run_in_order(["README.md", *TUTORIAL_AND_HOW_TO], tmp_path)
+    run_in_order(["README.md", TUTORIAL, *HOW_TO], tmp_path)

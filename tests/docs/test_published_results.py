@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from cavin_pyro.reproduction.results import PAGE, write_results
 from cavin_pyro.reproduction.table import CRITERIA, TABLE, Row, read_table
@@ -21,7 +23,20 @@ def rows() -> list[Row]:
     return read_table(PUBLISHED / TABLE)
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+@pytest.fixture(autouse=True)
+def figures_are_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What takes most of the time; tests/cavin_pyro/reproduction draws them."""
+
+    def save_empty(figure: Figure, target: Any, **_: Any) -> None:
+        Path(target).touch()
+
+    monkeypatch.setattr(Figure, "savefig", save_empty)
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [pytest.param(one, id=one.name, marks=[] if one == PUBLISHED else pytest.mark.soak) for one in FOLDERS],
+)
 def test_the_page_of_results_is_what_the_table_of_episodes_says(folder: Path, tmp_path: Path) -> None:
     rows, page = read_table(folder / TABLE), (folder / PAGE).read_text()
     (command,) = re.findall(r"^    (python -m cavin_pyro\.reproduce .*)$", page, re.M)
@@ -64,6 +79,7 @@ def test_the_explanation_of_the_reports_quotes_rows_of_the_measurements() -> Non
     assert not [row for row in rows if row not in measured.splitlines()]
 
 
+@pytest.mark.soak
 def test_the_page_shows_what_the_table_of_factors_says() -> None:
     factors, page = load("factors"), (PUBLISHED.parent / "reproduction.md").read_text().splitlines()
     rows = factors.stored(PUBLISHED / "factors.parquet")

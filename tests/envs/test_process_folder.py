@@ -28,6 +28,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("method", [None, "fork", "spawn"])
 def test_no_folder_is_left_when_a_process_ends(tmp_path: Path, method: str | None) -> None:
     script = tmp_path / "script.py"

@@ -326,6 +326,7 @@ def episode(name: str) -> bytes:
     return content
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", ARMS)
 def test_equal_seeds_and_actions_give_equal_observations_here_and_in_another_process(name: str) -> None:
     script = (

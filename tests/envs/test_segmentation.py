@@ -318,6 +318,7 @@ print(hashed.hexdigest())
 """
 
 
+@pytest.mark.soak
 def test_a_seed_and_actions_give_the_same_observations_again_and_in_another_process() -> None:
     hashes = []
     for runs in (1, 2):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
+
+import pytest
 
 from tests.cavin_pyro.conftest import ROOT
 
@@ -31,6 +34,12 @@ class Page:
     @property
     def commands(self) -> list[tuple[str, str]]:
         return re.findall(r"^python -m cavin_pyro\.(\w+) (.*)$", self.text, re.MULTILINE)
+
+    @property
+    def cases(self) -> list[Any]:
+        """The commands as parameters of a test, of which `make test` runs the first and `make soak` the others."""
+        first, *others = self.commands
+        return [first, *(pytest.param(*command, marks=pytest.mark.soak) for command in others)]
 
     def tells(self, message: str) -> bool:
         """Whether a table of the page has the message, or its beginning."""

@@ -60,10 +60,13 @@ def test_the_class_is_short(name: str, most: int) -> None:
     assert found.end_lineno is not None and found.end_lineno - found.lineno + 1 <= most
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("name", "target", "expected"),
-    [("mine/", "MyGuide", ["check", "plan"]), ("mine-prior/", "MyPrior", ["plan"])],
-    ids=["guide", "prior"],
+    [
+        pytest.param("mine/", "MyGuide", ["check", "plan"], id="guide"),
+        pytest.param("mine-prior/", "MyPrior", ["plan"], id="prior"),
+    ],
 )
 def test_the_commands_of_the_page_work_and_need_trust(
     name: str, target: str, expected: list[str], folder: Path

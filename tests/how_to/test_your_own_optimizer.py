@@ -54,7 +54,7 @@ def test_it_goes_on_from_the_last_plan(toy: Any) -> None:
     assert planner.plan(state, toy.generators(2), last).expected_success.all()
 
 
-@pytest.mark.parametrize(("command", "options"), PAGE.commands)
+@pytest.mark.parametrize(("command", "options"), PAGE.cases)
 def test_the_commands_of_the_page_work(command: str, options: str, tmp_path: Path) -> None:
     (tmp_path / "my_lab.py").write_text(CODE, encoding="utf-8")
     overrides = shlex.split(options)

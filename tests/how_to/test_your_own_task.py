@@ -42,7 +42,7 @@ def test_the_page_has_a_class_a_layout_and_a_program() -> None:
     assert len(FILES["my_tasks.py"].splitlines()) <= 30
 
 
-@pytest.mark.parametrize(("command", "options"), PAGE.commands)
+@pytest.mark.parametrize(("command", "options"), PAGE.cases)
 def test_the_commands_of_the_page_work(command: str, options: str, folder: Path) -> None:
     overrides = shlex.split(options)
     done = run_command(command, *overrides, *SHORT[command], folder=folder)

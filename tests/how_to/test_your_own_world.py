@@ -87,6 +87,7 @@ def test_the_objects_lie_on_the_table_at_their_size(lab: dict[str, Any]) -> None
         env.close()
 
 
+@pytest.mark.soak
 def test_the_robot_pushes(folder: Path) -> None:
     (folder / "use_it.py").write_text(USE + "print(CountingRobot.pushes)\n", encoding="utf-8")
     ended = subprocess.run(
@@ -95,7 +96,7 @@ def test_the_robot_pushes(folder: Path) -> None:
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1\n", "")
 
 
-@pytest.mark.parametrize(("command", "options"), PAGE.commands)
+@pytest.mark.parametrize(("command", "options"), PAGE.cases)
 def test_the_commands_of_the_page_work(command: str, options: str, folder: Path) -> None:
     overrides = shlex.split(options)
     done = run_command(command, *overrides, *SHORT[command], folder=folder)
@@ -104,6 +105,7 @@ def test_the_commands_of_the_page_work(command: str, options: str, folder: Path)
     assert any((folder / output).iterdir())
 
 
+@pytest.mark.soak
 def test_a_dataset_remembers_the_classes_and_refuses_others(folder: Path) -> None:
     camera = ("env.camera._target_=my_lab.NoisyCamera", "+env.camera.noise=0.003")
     shared = (*SHORT["collect"], "output=data")

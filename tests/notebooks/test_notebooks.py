@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 from itertools import pairwise
@@ -17,6 +18,7 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 KERNEL = "python3"  # ipykernel's own name for the interpreter that it is imported in
+OFTEN = ("3",)  # numbers of notebooks that `make test` runs; of the others it imports what they import
 TIME_LIMIT = 300  # seconds per cell; a whole notebook takes half a minute
 
 every_notebook = pytest.mark.parametrize("path", [pytest.param(path, id=path.stem) for path in NOTEBOOKS])
@@ -61,6 +63,18 @@ def test_a_notebook_is_stored_without_outputs(path: Path) -> None:
 
 
 @every_notebook
+def test_what_a_notebook_imports_is_there(path: Path) -> None:
+    lines = "\n".join(cell.source for cell in code_cells(read(path))).splitlines()
+    written = ast.parse("\n".join(line for line in lines if not line.startswith("%")))
+    imports = [node for node in ast.walk(written) if isinstance(node, ast.Import | ast.ImportFrom)]
+    assert imports
+    exec(compile(ast.Module(imports, type_ignores=[]), path.name, "exec"), {})
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=[] if path.stem[0] in OFTEN else pytest.mark.soak) for path in NOTEBOOKS],
+)
 def test_a_notebook_runs_and_opens_on_a_picture(path: Path, kernel: AsyncKernelManager, tmp_path: Path) -> None:
     notebook = read(path)
     folder = tmp_path / "elsewhere"

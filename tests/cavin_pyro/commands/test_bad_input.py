@@ -27,6 +27,16 @@ BAD, MORE = [*BAD_OPTIONS, *BAD_FILES], [*MORE_BAD_OPTIONS, *MORE_BAD_FILES]
 assert tuple(GOOD) == COMMANDS
 
 
+def form_of(said: str) -> str:
+    """A message without its names and numbers."""
+    return re.sub(r"'[^']*'|\S*[\d./=_@]\S*", "~", said)
+
+
+FIRST: dict[str, int] = {}  # the case that is the first of its form
+for number, (_, _, said) in enumerate(BAD):
+    FIRST.setdefault(form_of(said), number)
+
+
 def name_of(command: str, overrides: str) -> str:
     return f"{command} {overrides}"
 
@@ -79,7 +89,11 @@ def test_the_options_without_the_bad_ones_are_valid(command: str, answers: Simpl
 @pytest.mark.parametrize(
     ("command", "overrides", "said"),
     [
-        *(pytest.param(*row, id=name_of(*row[:2])) for row in BAD),
+        # Of messages that differ in names and numbers alone, `make test` sees one.
+        *(
+            pytest.param(*row, id=name_of(*row[:2]), marks=[] if FIRST[form_of(row[2])] == number else pytest.mark.soak)
+            for number, row in enumerate(BAD)
+        ),
         *(pytest.param(*row, id=name_of(*row[:2]), marks=pytest.mark.soak) for row in MORE),
     ],
 )

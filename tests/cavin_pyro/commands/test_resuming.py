@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 from omegaconf import DictConfig
 from safetensors.torch import load_file
@@ -37,6 +38,7 @@ def kill_after(shell: SimpleNamespace, command: str, overrides: list[str], folde
     assert process.wait() == -signal.SIGKILL  # it had neither failed nor ended before
 
 
+@pytest.mark.soak
 def test_training_killed_twice_equals_an_unbroken_run(
     shell: SimpleNamespace, own_pushes: Path, checkpoint_file: Path, tmp_path: Path
 ) -> None:
@@ -78,6 +80,7 @@ def without_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if name != "planning_ms"} for row in rows]
 
 
+@pytest.mark.soak
 def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
     shell: SimpleNamespace, configure: Callable[..., DictConfig], checkpoint_file: Path, tmp_path: Path
 ) -> None:

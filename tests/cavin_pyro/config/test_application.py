@@ -208,6 +208,7 @@ def test_a_foreign_package_in_the_folder_from_which_a_command_is_run(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.soak
 def test_folders_of_the_same_name_that_are_no_packages_do_no_harm(shell: SimpleNamespace, tmp_path: Path) -> None:
     for package in PACKAGES:
         (tmp_path / package).mkdir()

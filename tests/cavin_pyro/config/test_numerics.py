@@ -55,6 +55,7 @@ def test_matrix_products_round_their_factors_to_the_named_precision(name: str) -
     assert min(float((product - expected).abs().max()) for expected in allowed[name]) < 1e-3
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(
     sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "mallopt"), reason="the C library has no such option"
 )
@@ -66,7 +67,7 @@ def test_freed_memory_is_kept_however_often_that_is_asked_for() -> None:
     assert once < before / 100 and twice < before / 100
 
 
-@pytest.mark.parametrize(("given", "threads"), [(None, 1), ("2", 2)])
+@pytest.mark.parametrize(("given", "threads"), [(None, 1), pytest.param("2", 2, marks=pytest.mark.soak)])
 def test_a_command_computes_in_one_thread_unless_the_environment_says_otherwise(
     given: str | None, threads: int, tmp_path: Path
 ) -> None:

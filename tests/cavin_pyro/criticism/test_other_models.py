@@ -22,6 +22,7 @@ SECTIONS_OF_CODES = {
 }
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     "name", ["dynamics", *(pytest.param(name, marks=pytest.mark.soak) for name in ("flat", "single_latent"))]
 )

@@ -13,6 +13,9 @@ import torch
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "pyro.md"
 
 
+pytestmark = pytest.mark.soak
+
+
 @pytest.fixture(scope="module")
 def values(pushes: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The names that the examples leave behind."""

@@ -28,6 +28,7 @@ def data_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file() and path.name not in apart}
 
 
+@pytest.mark.soak
 def test_a_run_killed_twice_equals_an_unbroken_one(shell: SimpleNamespace, tmp_path: Path) -> None:
     overrides = ["transitions=40", "steps=2", "episodes_per_shard=1", "seed=5"]
     broken, whole = tmp_path / "broken", tmp_path / "whole"
@@ -138,7 +139,7 @@ def test_scans_and_builtin_shapes_are_collected_together(
     assert drawn == {"mug", "ycb/mug", "ycb/brick"}
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_missing_and_damaged_files_are_collected_again(
     workers: int, small: SimpleNamespace, own_pushes: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,6 +155,7 @@ def test_missing_and_damaged_files_are_collected_again(
     assert repair(small.pushes, own_pushes) == 0
 
 
+@pytest.mark.soak
 def test_a_collection_that_lacks_a_file_ends_in_one_line_that_says_how_to_repair_it(
     shell: SimpleNamespace, tmp_path: Path
 ) -> None:
@@ -245,6 +247,7 @@ def test_a_scene_without_room_is_a_user_error(small: SimpleNamespace, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.soak
 def test_a_killed_worker_and_sigterm_end_a_collection_in_one_line_and_keep_its_files(
     shell: SimpleNamespace, tmp_path: Path
 ) -> None:

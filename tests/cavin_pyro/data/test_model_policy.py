@@ -105,6 +105,7 @@ def test_the_seed_determines_the_pushes_whatever_the_number_of_threads(
     assert not np.array_equal(chosen(pusher, observation, 5, MOTIONS), two)
 
 
+@pytest.mark.soak
 def test_a_collection_by_a_model_is_the_same_for_any_number_of_workers(
     small: SimpleNamespace, pushes: Path, tmp_path: Path
 ) -> None:

@@ -77,6 +77,7 @@ def pointnet() -> PointNet:
     return PointNet().requires_grad_(False).eval()
 
 
+@pytest.mark.soak
 def test_ten_times_the_data_fit_in_the_same_memory(folders: dict[int, Path], pointnet: PointNet) -> None:
     held(folders[6], pointnet)  # imports and caches
     (most, after), (most_of_ten, after_of_ten) = (held(folders[shards], pointnet) for shards in (6, 60))

@@ -76,6 +76,7 @@ def test_what_moves_farther_than_the_histogram_counts_in_its_last_bin() -> None:
     assert summary.farthest[-1] == 1
 
 
+@pytest.mark.soak
 def test_a_dataset_is_drawn(pushes: Path, tmp_path: Path) -> None:
     one, drawn = DataSummary(), []
     one.add(episode())

@@ -39,7 +39,8 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Any:
     [
         ("clearing", "dense", traced),
         ("insertion", "sparse", traced),
-        pytest.param("crossing", "sparse", compiled, marks=needs_a_compiler),
+        ("crossing", "sparse", traced),
+        pytest.param("crossing", "sparse", compiled, marks=[needs_a_compiler, pytest.mark.soak]),
     ],
 )
 def test_compiled_rewards_equal_those_of_the_environment(task: str, reward: str, native: Callable[..., Any]) -> None:

@@ -78,16 +78,10 @@ def test_one_rollout_tells_how_it_ends_by_either_criterion() -> None:
     pointnet, ended = PointNet(), []
     for criterion in ("strict", "published"):
         env = PushingEnv(task="crossing", objects=5, maximum_steps=30, criterion=criterion)
-        ended.append(
-            next(
-                one
-                for seed in range(10, 40)
-                if (one := rollout(env, RandomPlanner(), pointnet, seed=seed)).strict()[0] == "violation"
-            )
-        )
+        ended.append(rollout(env, RandomPlanner(), pointnet, seed=30))  # of seeds 10 to 39 the only one that leaves it
         env.close()
     strict, published = ended
-    assert strict.seed == published.seed and strict.outcome == "violation"
+    assert strict.outcome == "violation"
     assert strict.strict() == published.strict() == ("violation", len(strict.transitions), strict.total_reward)
     assert happened(published)[: len(strict.transitions) - 1] == happened(strict)[:-1]
     assert len(published.transitions) > len(strict.transitions)

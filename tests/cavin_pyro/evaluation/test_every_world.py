@@ -1,7 +1,8 @@
 """Every world that the options `env.*` can select, in every task, under Gymnasium's checker.
 
 The choices are read from `cavin_pyro.config.world`, so that a new robot, object set, camera or segmentation is tried
-without a line here. Every two choices meet in some world; `CAVIN_EVERY_WORLD=1` tries all combinations.
+without a line here. Every two choices meet in some world; `CAVIN_EVERY_WORLD=1` tries all combinations. Those with an
+arm are tried by `make soak`; tests/envs/test_robots.py has arms in `make test`, too.
 
 Meshes are looked for in `CAVIN_ASSETS`, by default `../shared/assets` beside the repository.
 """
@@ -51,7 +52,14 @@ def covering(worlds: list[World]) -> list[World]:
 WORLDS = every_world() if os.environ.get("CAVIN_EVERY_WORLD") else covering(every_world())
 
 
-@pytest.fixture(params=WORLDS, ids=lambda world: "-".join(world.values()))
+@pytest.fixture(
+    params=[
+        pytest.param(
+            world, id="-".join(world.values()), marks=[] if world["env.robot"] == "stick" else pytest.mark.soak
+        )
+        for world in WORLDS
+    ]
+)
 def env(request: pytest.FixtureRequest, configure: Any) -> Iterator[PushingEnv]:
     choices = [f"{name}={value}" for name, value in request.param.items()]
     assets = [f"env.assets={REAL_ASSETS}"] if REAL_ASSETS.is_dir() else []

@@ -21,7 +21,9 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda")
 PLANNERS = ("cavin", "cavin_evolution", "cavin_without_effects", "paper", "sectar", "cvae_mpc", "mpc")
 
 
-@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize(
+    "planner", [name if name == "cavin" else pytest.param(name, marks=pytest.mark.soak) for name in PLANNERS]
+)
 def test_plan_alone_loads_native_code_by_itself(planner: str) -> None:
     """Results of many episodes must not depend on what lies in one machine's cache."""
     for command, usual in (("plan", "auto"), ("evaluate", False), ("demo", False)):

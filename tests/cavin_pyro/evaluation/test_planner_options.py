@@ -105,12 +105,12 @@ def test_the_first_push_is_tracked_where_it_alone_is_executed(
     runner.env.close()
 
 
-# `make test` runs every optimizer with Algorithm 1, and every other planner with two optimizers in turn.
+# `make test` runs every optimizer with Algorithm 1, and every second of the other planners with one optimizer in turn.
 PAIRS = [
     pytest.param(planner, optimizer, marks=() if often else pytest.mark.soak)
     for row, planner in enumerate(sorted(FITTING))
     for column, optimizer in enumerate(sorted(OPTIMIZERS))
-    for often in [planner == "cavin" or column in (row, (row + 3) % len(OPTIMIZERS))]
+    for often in [planner == "cavin" or (column == row % len(OPTIMIZERS) and row % 2)]
 ]
 
 

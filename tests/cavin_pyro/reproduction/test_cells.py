@@ -54,7 +54,9 @@ def test_scenes_of_different_scales_are_different() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize(
+    "scale", [name if name == "smoke" else pytest.param(name, marks=pytest.mark.soak) for name in SCALES]
+)
 def test_every_command_line_of_a_stage_is_accepted(method: str, scale: str) -> None:
     (stage, *_) = trainings(SCALES[scale], ROOT, [method])
     config = compose(stage.command, *stage.options, f"output={stage.folder}")

@@ -127,7 +127,7 @@ def small_run(configure: Callable[..., DictConfig], tmp_path_factory: pytest.Tem
     return home, [episode_row(one, line) for line in evaluate(config, folder)]
 
 
-@pytest.mark.parametrize("criterion", ["strict", "published"])
+@pytest.mark.parametrize("criterion", ["strict", pytest.param("published", marks=pytest.mark.soak)])
 def test_chosen_episodes_are_replayed_and_drawn_below_one_another(
     criterion: str, small_run: tuple[Path, list[dict[str, Any]]], tmp_path: Path
 ) -> None:
@@ -141,6 +141,7 @@ def test_chosen_episodes_are_replayed_and_drawn_below_one_another(
     assert both - imageio.imread(found[0]).shape[0] == pytest.approx(120 * 2.2, abs=2)
 
 
+@pytest.mark.soak
 def test_a_replay_that_ends_otherwise_than_in_the_table_is_told(small_run: tuple[Path, list[dict[str, Any]]]) -> None:
     home, (one, _) = small_run
     assert replay([home], one, "published").episode.total_reward == one["published_return"]

@@ -28,13 +28,21 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in RESULTS}
 
 
-def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again(
-    shell: SimpleNamespace, tmp_path: Path
-) -> None:
-    first = shell.run_command("reproduce", *WHOLE, folder=tmp_path)
+@pytest.fixture(scope="module")
+def reproduced(shell: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which WHOLE has run once."""
+    folder = tmp_path_factory.mktemp("reproduced")
+    first = shell.run_command("reproduce", *WHOLE, folder=folder, stages="forked")
     assert first.status == 0, first.errors
     assert "whole/results.md" in first.output and "whole/figure-paper-strict.png" in first.output
-    home, made = tmp_path / "whole", contents(tmp_path / "whole")
+    return folder
+
+
+def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again(
+    shell: SimpleNamespace, reproduced: Path
+) -> None:
+    home = reproduced / "whole"
+    made = contents(home)
     finished = {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
     episodes = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
     assert len(finished) == 1 and len(episodes) == 3
@@ -42,21 +50,29 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     cut.write_bytes(episodes[cut][:-20])  # as a machine that lost its power leaves it
     for name in RESULTS:
         (home / name).unlink()
-    later = {"folder": tmp_path, "stages": "forked"}  # the first run has started each with an interpreter of its own
-    again = shell.run_command("reproduce", *WHOLE, **later)
+    again = shell.run_command("reproduce", *WHOLE, folder=reproduced, stages="forked")
     assert again.status == 0, again.errors
     assert contents(home) == made
     assert finished == {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
+    other = shell.run_command("reproduce", "scale=smoke", "output=whole", folder=reproduced)
+    assert other.status == 2 and "holds a run with" in other.complaints[0]
+
+
+@pytest.mark.soak
+def test_a_reproduction_grows_and_extends_a_table_and_takes_models_that_are_there(
+    shell: SimpleNamespace, reproduced: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(reproduced / "whole", tmp_path / "whole")
+    home, made = tmp_path / "whole", contents(tmp_path / "whole")
+    episodes = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
+    later = {"folder": tmp_path, "stages": "forked"}
     more = shell.run_command("reproduce", *WHOLE, "bottom_episodes=2", **later)
     assert more.status == 0, more.errors
     longer = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
-    assert all(longer[path].startswith(kept) for path, kept in episodes.items() if path != cut)
+    assert all(longer[path].startswith(kept) for path, kept in episodes.items())
     assert sum(text.count(b"\n") for text in longer.values()) == 3 + 1
-    assert [run["command"].split()[-1] for run in json.loads((home / "provenance.json").read_text())] == [
-        "output=whole",
-        "output=whole",
-        "bottom_episodes=2",
-    ]
+    *before, last = (run["command"].split()[-1] for run in json.loads((home / "provenance.json").read_text()))
+    assert {*before} == {"output=whole"} and last == "bottom_episodes=2"
     models = tmp_path / "models"
     models.mkdir()
     shutil.copy(home / "train" / "mpc-0" / "checkpoint.safetensors", models / "mpc-0.safetensors")
@@ -81,11 +97,9 @@ def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again
     lacking = shell.run_command("reproduce", "scale=minimal", "models=models", "output=lacking", folder=tmp_path)
     expected = "models=models holds no cavin-0.safetensors: choose other methods, or train it"
     assert lacking.status == 2 and expected in lacking.complaints[0]
-    other = shell.run_command("reproduce", "scale=smoke", "output=whole", folder=tmp_path)
-    assert other.status == 2 and "holds a run with" in other.complaints[0]
 
 
-@pytest.mark.soak
+@pytest.mark.soak  # here each stage starts with an interpreter of its own
 def test_a_reproduction_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace, tmp_path: Path) -> None:
     whole = shell.run_command("reproduce", *TWO_METHODS, "workers=1", "output=whole", folder=tmp_path)
     assert whole.status == 0, whole.errors

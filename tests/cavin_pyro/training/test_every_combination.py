@@ -54,14 +54,15 @@ def is_valid(names: tuple[str, str, str, str]) -> bool:
 
 
 VALID = [names for names in ALL if is_valid(names)]
-# Of the combinations, `make test` trains those in which every two choices meet that could disagree with one another:
-# each guide with each prior, and each objective with each guide in turn. `make soak` trains all.
+# Representatives are combinations in which every two choices meet that could disagree with one another: each guide with
+# each prior, and each objective with each guide in turn. `make test` trains most of them, `make soak` all combinations.
 TURNS = {(names[1], names[2]): [] for names in VALID}
 for names in VALID:
     TURNS[names[1], names[2]].append(names)
 REPRESENTATIVES = {names for names in VALID if names[0] == "dynamics"} | {
     fitting[(GUIDES.index(guide) + PRIORS.index(prior)) % len(fitting)] for (guide, prior), fitting in TURNS.items()
 }
+OFTEN = {names for names in REPRESENTATIVES if names[3] not in FITTING_MOTIONS}  # which have tests of their own
 STEPS = TrainerConfig(steps=40, batch_size=16, learning_rate=1e-2, validate_every=40, validation_windows=64)
 
 
@@ -147,17 +148,16 @@ def test_sections_of_their_own_are_those_of_one_composition_for_one_combination_
 
 @pytest.mark.parametrize(
     "names",
-    [
-        pytest.param(names, id="-".join(names), marks=() if names in REPRESENTATIVES else pytest.mark.soak)
-        for names in VALID
-    ],
+    [pytest.param(names, id="-".join(names), marks=() if names in OFTEN else pytest.mark.soak) for names in VALID],
 )
 def test_compatible_combinations_learn(names: tuple[str, str, str, str], windows: WindowTable, tmp_path: Path) -> None:
     before, after = losses(composed(*names), windows, tmp_path)
     assert math.isfinite(after) and after < before - 1
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model", [model if model == "cascaded" else pytest.param(model, marks=pytest.mark.soak) for model in MODELS]
+)
 def test_incompatible_combinations_are_refused_in_one_line(model: str) -> None:
     for names in ALL:
         if names[0] == model and names not in VALID:

@@ -75,6 +75,7 @@ def steps(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.soak
 def test_a_recording_holds_the_world_the_observations_and_the_plans(rerun: Any, folder: Path) -> None:
     recording = rerun.dataframe.load_recording(folder / "episode.rrd")
     found = {(column.entity_path, column.component) for column in recording.schema().component_columns()}
@@ -91,6 +92,7 @@ def test_a_recording_holds_the_world_the_observations_and_the_plans(rerun: Any, 
     assert not [path for path in folder.iterdir() if "partial" in path.name]
 
 
+@pytest.mark.soak
 def test_arrows_are_drawn_where_the_tool_moved(changing: Callable, steps: list[dict[str, str]]) -> None:
     origins, vectors = (
         changing("world/plan/pushes", "Arrows3D:origins"),
@@ -105,6 +107,7 @@ def test_arrows_are_drawn_where_the_tool_moved(changing: Callable, steps: list[d
         np.testing.assert_allclose(start[0, :2] + way[0, :2], last, atol=1e-3)
 
 
+@pytest.mark.soak
 def test_candidates_have_the_colours_of_their_returns(changing: Callable) -> None:
     positions = changing("world/plan/candidates", "Points3D:positions")
     colors = changing("world/plan/candidates", "Points3D:colors")
@@ -112,6 +115,7 @@ def test_candidates_have_the_colours_of_their_returns(changing: Callable) -> Non
     assert all(len(places) > 10 for places in positions.values())
 
 
+@pytest.mark.soak
 def test_physics_is_recorded_at_the_videos_moments(changing: Callable, steps: list[dict[str, str]]) -> None:
     poses = changing("world/robot/body_3/base", TRANSLATION)  # after the table and two objects
     carried_out = sum(not int(step["unsafe"]) for step in steps)

@@ -110,6 +110,7 @@ def test_the_tool_gets_behind_the_target_where_it_starts() -> None:
     assert sum(pushed) >= 19  # of 20
 
 
+@pytest.mark.soak
 def test_slots_are_on_every_side_that_the_tool_reaches() -> None:
     goals = {goal for seed in range(200) for goal in generated("insertion", seed, tiles=5).goal}
     assert {row for row, column in goals if column == 1} >= {1, 2, 3}  # the right end

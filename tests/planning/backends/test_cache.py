@@ -99,6 +99,7 @@ def test_what_is_not_kept_is_computed_directly_and_said_once(tmp_path: Path) -> 
     assert line.startswith(NO_NATIVE_CODE)
 
 
+@pytest.mark.soak
 @needs_a_compiler
 def test_a_function_that_is_not_kept_runs_beside_one_that_is(tmp_path: Path) -> None:
     numbers = torch.arange(3.0)
@@ -116,6 +117,7 @@ def test_others_can_neither_read_nor_write_it(made: tuple[Path, str]) -> None:
     assert stat.S_IMODE(library.parent.stat().st_mode) == 0o700
 
 
+@pytest.mark.soak
 @needs_a_compiler
 def test_other_weights_make_other_code(made: tuple[Path, str], tmp_path: Path) -> None:
     library = library_in(made[0])
@@ -127,7 +129,7 @@ def test_other_weights_make_other_code(made: tuple[Path, str], tmp_path: Path) -
 
 
 @needs_a_compiler
-def test_damaged_code_is_never_loaded_and_made_anew(made: tuple[Path, str], tmp_path: Path) -> None:
+def test_damaged_code_is_never_loaded(made: tuple[Path, str], tmp_path: Path) -> None:
     library = library_in(made[0])
     whole, key = library.read_bytes(), library.stem
     cache = CodeCache(tmp_path / "native")
@@ -141,7 +143,15 @@ def test_damaged_code_is_never_loaded_and_made_anew(made: tuple[Path, str], tmp_
     copy.rename(tmp_path / "native" / ("0" * 64 + ".so"))
     (tmp_path / "native" / ("0" * 64 + ".so")).write_bytes(whole)
     assert cache.load("0" * 64) is None  # of another key
-    copy.write_bytes(flipped)
+
+
+@pytest.mark.soak
+@needs_a_compiler
+def test_damaged_code_is_made_anew(made: tuple[Path, str], tmp_path: Path) -> None:
+    library = library_in(made[0])
+    whole, key = library.read_bytes(), library.stem
+    cache = CodeCache(tmp_path / "native")
+    (tmp_path / "native" / library.name).write_bytes(bytes([*whole[:5000], whole[5000] ^ 1, *whole[5001:]]))
     printed, complaints = finish(start(tmp_path))
     assert printed.startswith(made[1]) and "compiling" in complaints
     assert cache.load(key) is not None
@@ -194,6 +204,7 @@ def test_a_folder_that_others_could_have_filled_is_refused(tmp_path: Path, monke
         CodeCache(tmp_path)
 
 
+@pytest.mark.soak
 @needs_a_compiler
 def test_a_refused_folder_is_one_line_and_code_is_made_for_the_process(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

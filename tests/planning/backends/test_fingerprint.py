@@ -128,6 +128,7 @@ def test_a_state_that_nobody_sees_has_no_fingerprint(value: object) -> None:
         fingerprint([{"inside": value}])
 
 
+@pytest.mark.soak
 def test_fingerprints_are_equal_in_every_process_until_a_source_changes(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("from beside import helper\ndef mine(x):\n    return helper(x)\n")
     (tmp_path / "beside.py").write_text("def helper(x):\n    return x + 1\n")

@@ -148,7 +148,7 @@ def test_a_copy_of_a_part_in_the_same_order_stays() -> None:
 
 
 @pytest.mark.parametrize(("margin", "equivariant"), [(None, False), (0.35, False), (None, True)])
-@pytest.mark.parametrize("objects", [1, 2, 4])
+@pytest.mark.parametrize("objects", [2, *(pytest.param(count, marks=pytest.mark.soak) for count in (1, 4))])
 def test_an_f_that_sees_contact_says_the_same(objects: int, margin: float | None, equivariant: bool) -> None:
     torch.set_float32_matmul_precision("highest")
     sizes = {"object_width": 16, "pair_width": 8, "shape_width": 8}

@@ -109,7 +109,12 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+OFTEN = ("as it is", "moves of all segments", "linear schedule", "a bad proposal")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in OFTEN else pytest.param(case, marks=pytest.mark.soak) for case in CASES]
+)
 def test_the_estimate_of_z_is_unbiased(toy: SimpleNamespace, case: str) -> None:
     evidence = estimate(problem_of(toy, warm_start=warm_start()), **CASES[case])
     off, error = deviation(evidence.log_evidence, log_z(1.0))
@@ -122,7 +127,7 @@ def without_ratio(proposal: Any, candidates: Any) -> tuple[Tensor, Tensor]:
     return noise, torch.zeros_like(ratios)
 
 
-@pytest.mark.parametrize("proposal", ["last_plan", Shifted()])
+@pytest.mark.parametrize("proposal", [pytest.param("last_plan", marks=pytest.mark.soak), Shifted()])
 def test_weights_without_prior_over_proposal_are_found_out(
     toy: SimpleNamespace, proposal: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +157,7 @@ def test_an_adaptive_temperature_is_reported_and_its_estimate_is_near_the_z_of_t
     torch.testing.assert_close(evidence.log_evidence.float(), known, rtol=0, atol=0.3)
 
 
+@pytest.mark.soak
 def test_weighted_plans_have_the_moments_of_the_posterior(toy: SimpleNamespace) -> None:
     # Unbiased is not only Z but also Z times the mean of a function of the resampled plans, here their last noise.
     problem = problem_of(toy, warm_start=warm_start())
@@ -197,6 +203,7 @@ def test_the_best_proposal_and_the_best_value_give_z_with_a_single_particle(toy:
     assert without.log_evidence.std() > 0.01
 
 
+@pytest.mark.soak
 def test_ended_plans_count_once_and_failures_keep_their_return(toy: SimpleNamespace) -> None:
     # A segment fails with probability 1/2 (below the line), else succeeds within the disc's upper half, else goes on.
     # A failure within the disc's lower half earns both rewards, -1 in total.

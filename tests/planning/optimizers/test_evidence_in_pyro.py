@@ -81,6 +81,7 @@ def evidence_of(toy: SimpleNamespace, temperature: float, **options: Any) -> Evi
     return evidence
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("temperature", [1.0, 2.0])
 def test_importance_of_pyro_and_sequential_monte_carlo_agree(toy: SimpleNamespace, temperature: float) -> None:
     model, reward, state = small_model(), Near(toy), scene(toy)
@@ -99,6 +100,7 @@ def test_importance_of_pyro_and_sequential_monte_carlo_agree(toy: SimpleNamespac
     assert abs(float(ratios.mean()) - 1) < 3.5 * error
 
 
+@pytest.mark.soak
 def test_another_prior_is_found_out(toy: SimpleNamespace) -> None:
     # The same comparison, with codes of N(0, I) in the program: it must not agree.
     model, reward, state = small_model(), Near(toy), scene(toy)

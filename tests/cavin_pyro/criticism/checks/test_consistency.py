@@ -126,6 +126,7 @@ def test_a_model_whose_subgoals_oppose_its_pushes_is_detected(oracle: Oracle) ->
         assert way["prediction"] == right["prediction"]  # its f is as good
 
 
+@pytest.mark.soak
 def test_a_model_whose_subgoals_move_nothing_gives_no_number_and_says_so() -> None:
     section = assess_consistency(
         context_of(Oracle(wish=lambda before, after: before)), scenes=SCENES, objects=OBJECTS, samples=2
@@ -276,6 +277,7 @@ def test_plans_depend_on_their_seed(table: State) -> None:
     assert actions[0] == actions[1] != actions[2]
 
 
+@pytest.mark.soak
 def test_a_scene_depends_on_its_seed_and_number_alone(small: SimpleNamespace) -> None:
     context = context_of(small.parts()["model"].requires_grad_(False))
     both = list(subgoal_rollouts(context, scenes=2, objects=2, samples=2))

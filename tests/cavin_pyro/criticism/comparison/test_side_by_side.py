@@ -101,6 +101,7 @@ def test_a_pair_has_the_windows_that_both_held_out(small: SimpleNamespace, pushe
     assert check_pair(compose("check", *paths.values(), *data)) and not check_pair(compose("check", *data))
 
 
+@pytest.mark.soak
 def test_sections_run_again_where_the_other_checkpoint_changes_the_common_windows(
     small: SimpleNamespace, pushes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

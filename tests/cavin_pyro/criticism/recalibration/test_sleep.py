@@ -56,8 +56,11 @@ def level(context: CheckContext) -> str:
     return verdict.level
 
 
-@pytest.mark.parametrize("wake_weight", [0.0, 1.0])
-@pytest.mark.parametrize("stretch, shift", [(0.4, 0.0), (2.5, 0.0), (0.7, 0.5)])
+@pytest.mark.parametrize("wake_weight", [0.0, pytest.param(1.0, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    "stretch, shift",
+    [(0.4, 0.0), *(pytest.param(*pair, marks=pytest.mark.soak) for pair in ((2.5, 0.0), (0.7, 0.5)))],
+)
 def test_a_guide_that_fails_is_mended(
     stretch: float, shift: float, wake_weight: float, scenes: SimpleNamespace
 ) -> None:

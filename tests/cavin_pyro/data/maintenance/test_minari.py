@@ -59,6 +59,7 @@ def test_minari_loads_every_episode(
         assert dataset.action_space.contains(episode.actions[0])
 
 
+@pytest.mark.soak
 def test_the_folder_may_be_relative(
     minari: Any, data: Callable, pushes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -67,7 +68,7 @@ def test_the_folder_may_be_relative(
     assert [path.name for path in (tmp_path / "pushes-v0").iterdir()] == ["data"]
 
 
-@pytest.mark.parametrize("kilobytes", [2, 20, 60])
+@pytest.mark.parametrize("kilobytes", [20, *(pytest.param(size, marks=pytest.mark.soak) for size in (2, 60))])
 def test_a_disk_that_is_full_ends_an_export_in_one_line(
     minari: Any, shell: SimpleNamespace, pushes: Path, tmp_path: Path, kilobytes: int
 ) -> None:
@@ -91,6 +92,7 @@ def test_a_result_is_not_overwritten_and_has_a_name_that_minari_takes(
     assert status == 2 and "holds a dataset already" in errors
 
 
+@pytest.mark.soak
 def test_a_refused_export_leaves_nothing(minari: Any, data: Callable, own_pushes: Path, tmp_path: Path) -> None:
     shard_path(own_pushes, 2).unlink()
     status, _, errors = data("export", own_pushes, "--to", tmp_path / "made" / "pushes-v0")
@@ -114,6 +116,7 @@ def test_without_minari_one_line_tells_how_to_get_it(
     assert errors.endswith("pip install -c constraints.txt '.[minari]'")
 
 
+@pytest.mark.soak
 def test_nothing_else_imports_minari() -> None:
     program = "import sys, cavin_pyro.data.__main__, cavin_pyro.data.maintenance.export\nprint('minari' in sys.modules)"
     answer = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)

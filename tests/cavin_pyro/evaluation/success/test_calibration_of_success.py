@@ -58,6 +58,7 @@ def test_the_brier_score_is_the_sum_of_its_parts_and_the_base_rate_has_no_skill(
     assert calibration([[float(np.mean(ends))]] * 900, ends).skill == pytest.approx(0.0)
 
 
+@pytest.mark.soak
 def test_the_interval_holds_the_error_of_many_more_episodes() -> None:
     truth = calibration(*episodes(30_000, sharpness=2.0)).error.value
     found: list[Calibration] = [calibration(*episodes(150, seed=seed, sharpness=2.0)) for seed in range(40)]
