@@ -32,9 +32,7 @@ def form_of(said: str) -> str:
     return re.sub(r"'[^']*'|\S*[\d./=_@]\S*", "~", said)
 
 
-FIRST: dict[str, int] = {}  # the case that is the first of its form
-for number, (_, _, said) in enumerate(BAD):
-    FIRST.setdefault(form_of(said), number)
+FIRST = {form_of(said): number for number, (_, _, said) in reversed([*enumerate(BAD)])}  # the first case of each form
 
 
 def name_of(command: str, overrides: str) -> str:

@@ -23,9 +23,7 @@ SECTIONS_OF_CODES = {
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(
-    "name", ["dynamics", *(pytest.param(name, marks=pytest.mark.soak) for name in ("flat", "single_latent"))]
-)
+@pytest.mark.parametrize("name", ["dynamics", "flat", "single_latent"])
 def test_a_check_runs_all_sections_or_says_which_do_not_apply(
     name: str, small: SimpleNamespace, shell: SimpleNamespace, pushes: Path, tmp_path: Path
 ) -> None:
