@@ -4,10 +4,8 @@ Reads jobs, a line of JSON each, and prints the exit status of each. A job has `
 and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder; or
 `script` and `overrides`, which runs as `python <script> <overrides>`; or `cases`, which run in turn in one process,
 each from its own `folder`, with their answers as JSON in `output`.
-With `file_limit`, no file can grow beyond so many bytes; after `limit` seconds a job ends by SIGALRM. With `stages`
-"forked", `reproduce` starts no interpreters; with `pictures` "blank", matplotlib draws none. With `faults`, a part of
-the environment, the disk fails at a chosen call (faults/shim.py), both hold as well, and nothing is composed that an
-earlier such job has composed.
+With `file_limit`, no file can grow beyond so many bytes. With `stages` "forked", `reproduce` starts no interpreters;
+with `pictures` "blank", matplotlib draws none.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ import gc
 import importlib
 import io
 import json
-import multiprocessing
 import os
 import resource
 import runpy
@@ -27,9 +24,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NoReturn
 
 from hydra.core.plugins import Plugins
@@ -37,9 +33,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from cavin_pyro.config.composition import check_overrides
-from cavin_pyro.launching import workers
-from tests.cavin_pyro.faults.composed import Composed
-from tests.cavin_pyro.faults.forked_stages import fork_stages
+from tests.cavin_pyro.forked_stages import fork_stages
 
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
@@ -72,49 +66,20 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
 LIMIT = 300  # seconds per job
 
 
-def _forking() -> SimpleNamespace:
-    """A context whose workers are forks, without a new interpreter each. Of their pipes they keep their own ends alone.
-
-    With a copy of the parent's end a worker would never see it closed, and the parent would wait for the worker.
-    """
-    fork, opened = multiprocessing.get_context("fork"), []
-
-    def pipe() -> tuple[Any, Any]:
-        ours, theirs = fork.Pipe()
-        opened.append(ours)
-        return ours, theirs
-
-    def process(*, target: Callable[..., None], **options: Any) -> Any:
-        def work(*arguments: Any) -> None:
-            for one in opened:
-                one.close()
-            target(*arguments)
-
-        return fork.Process(target=work, **options)
-
-    return SimpleNamespace(Pipe=pipe, Process=process)
-
-
 def main() -> None:
     gc.disable()  # what imports make stays
     for name in IMPORTED:
         importlib.import_module(name)
     _warm_up()
     gc.enable()
-    composed = Composed()
     for line in sys.stdin:
         gc.freeze()  # so that children's collections neither look at all of this nor copy it
         child = os.fork()
         if not child:
-            job = json.loads(line)
-            if "faults" in job:
-                composed.use()
-                run_and_end(job)
-            run(job)
+            run(json.loads(line))
             return
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
-        composed.learn()
 
 
 def _warm_up() -> None:
@@ -125,7 +90,7 @@ def _warm_up() -> None:
 
 
 def run(job: dict[str, Any]) -> None:
-    signal.alarm(job.get("limit", LIMIT))
+    signal.alarm(LIMIT)
     writing = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if job.get("append") else os.O_TRUNC)
     for number, (path, flags) in enumerate(
         [(os.devnull, os.O_RDONLY), (job["output"], writing), (job["errors"], writing)]
@@ -134,14 +99,9 @@ def run(job: dict[str, Any]) -> None:
     os.chdir(job["folder"])
     if job.get("file_limit"):  # as inherited by a command that a user starts under `ulimit -f`
         resource.setrlimit(resource.RLIMIT_FSIZE, (job["file_limit"], resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-    if "faults" in job:
-        os.environ.update(job["faults"])
-        if ctypes.CDLL(None).fault_arm() != 0:
-            raise RuntimeError(f"the disk cannot fail so: {job['faults']}")
-        workers.multiprocessing = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda _: _forking()})
-    if "faults" in job or job.get("pictures") == "blank":  # how they reach the disk is tested, not what they show
+    if job.get("pictures") == "blank":  # how they reach the disk is tested, not what they show
         Figure.savefig = save_blank
-    if job.get("command") == "reproduce" and ("faults" in job or job.get("stages") == "forked"):
+    if job.get("command") == "reproduce" and job.get("stages") == "forked":
         fork_stages(run_and_end)
     if "cases" in job:
         sys.path[0] = ""  # the folder of each case
