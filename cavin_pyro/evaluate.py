@@ -17,10 +17,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
     from cavin_pyro.evaluation.evaluation import NOT_COMPARED, evaluate, merge, seeds_of
     from cavin_pyro.evaluation.factory import make_runner, planner_name
-    from cavin_pyro.evaluation.plan_summary import plan_summary
-    from cavin_pyro.evaluation.statistics import summarize, table
-    from cavin_pyro.evaluation.success.sentences import calibration_of, sentence
-    from cavin_pyro.evaluation.success.sentences import record as calibration_record
+    from cavin_pyro.evaluation.statistics import plan_summary, summarize, table
     from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import atomic_write, output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
@@ -38,10 +35,8 @@ def main(config: DictConfig) -> None:
         results = summarize((merge if config.merge else evaluate)(config, folder))
         scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
         text = table(results, f"{scene}, {planner_name(config)}")
-        calibration = calibration_of(results["per_episode"])
-        results["calibration"] = calibration_record(calibration)
-        for said in (plan_summary(results["per_episode"], config), sentence(calibration, runner.probability)):
-            text += f"\n{said}" if said else ""
+        if said := plan_summary(results["per_episode"], config):
+            text += f"\n{said}"
         if others:
             comparison = compare(results["per_episode"], others)
             results["comparison"] = record(comparison, Path(config.compare))

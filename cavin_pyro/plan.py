@@ -14,8 +14,7 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.factory import announce_objects, announce_waiting, make_runner
-    from cavin_pyro.evaluation.plan_summary import plan_summary_of_episode
-    from cavin_pyro.evaluation.success.sentences import sentence_of_episode
+    from cavin_pyro.evaluation.statistics import plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -38,8 +37,8 @@ def main(config: DictConfig) -> None:
         native = isinstance(runner.planner, SearchingPlanner) and runner.planner.backend.native
         write_json(folder / "results.json", {**row, "native_code": native, "provenance": provenance()})
         print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
-        for said in (plan_summary_of_episode(row, config), sentence_of_episode(row, runner.probability)):
-            print(said, end="\n" * bool(said))
+        if said := plan_summary([row], config):
+            print(said)
         for name in episode_files(video=config.video, viewer=config.viewer):
             print(f"  {folder / name}")
 

@@ -201,11 +201,10 @@ class CavinPlanner(SearchingPlanner):
             tracking, scores = prefer_no_failure(motions.score_state)
         scores = self.prefer_free(scores, motions.at(0, actions_of), observed)
         j = best_of(scores, "distances of motion plans to the subgoals")
-        failures = None
         if self.robustness is not None:
             later_cost = tracking.cost - tracking.executed_cost
             task = self.model, reward, subgoals, self.distance
-            j, failures = most_robust(self.robustness, motions, scores, later_cost, *task)
+            j = most_robust(self.robustness, motions, scores, later_cost, *task)
         chosen = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = chosen.codes[:, 0], chosen.actions[:, 0], chosen.path[:, 0]
         a_star, path = self.idle_last(a_star, path, s_t, observed)
@@ -218,7 +217,7 @@ class CavinPlanner(SearchingPlanner):
             motion_codes=z_star,
             subgoals=subgoals,
             predicted_centers=path,
-            **summary(effects, i, self.distance_to_goal, failures),
+            **summary(effects, i),
         )
 
 

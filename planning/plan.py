@@ -22,18 +22,6 @@ class Evidence(NamedTuple):
     particles: Tensor  # [B] int64: the largest possible effective sample size
 
 
-class SuccessPredictors(NamedTuple):
-    """By-products of a search that help to predict success; NaN where a planner does not compute one.
-
-    `Plan.expected_success`, `expected_return` and `segments` are further predictors.
-    """
-
-    reaching: Tensor  # [B] share of all candidates that reach the goal by the model, as far as they were rolled out
-    failures: Tensor  # [B] share of the perturbed rollouts of the chosen motion that fail
-    distance_to_goal: Tensor  # [B] metres left to the goal from the observed state (`planner.guidance=layout`)
-    distance_to_goal_after: Tensor  # [B] metres left at the end of the chosen plan, by the model
-
-
 class Plan(NamedTuple):
     """The chosen plan of every environment, and the candidates (for pictures).
 
@@ -58,4 +46,6 @@ class Plan(NamedTuple):
     noise: Tensor  # [B, K, D] of the searched codes or pushes, or [B, 0, 0]; see `extensions.warm_start`
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
     evidence: Evidence | None = None  # of the search by return; None for optimizers that do not sample by weights
-    success_predictors: SuccessPredictors | None = None  # None for planners that predict nothing
+    # [B] share of the candidates that reach the goal by the model, as far as they were rolled out; None for planners
+    # that predict nothing
+    share_reaching_goal: Tensor | None = None

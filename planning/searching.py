@@ -20,7 +20,7 @@ from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, pr
 from planning.extensions.warm_start import chosen_noise, warm_start_noise
 from planning.inputs import check_horizon, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
-from planning.plan import Plan, SuccessPredictors
+from planning.plan import Plan
 from planning.protocol import (
     DistanceToGoal,
     DynamicsModel,
@@ -195,40 +195,20 @@ def _backend(compile: bool | str, tracing: Callable[[], AbstractContextManager[N
     return Compiled(tracing=tracing, make=compile is True) if compile else eager
 
 
-def summary(
-    candidates: Candidates, best: Tensor, distance_to_goal: DistanceToGoal | None, failures: Tensor | None = None
-) -> dict[str, Any]:
-    """The fields of a `Plan` about its search, from `segments` to `success_predictors`.
+def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
+    """The fields of a `Plan` about its search.
 
     candidates: `[B, N]`, evaluated by cumulative reward, guided or not. best: `[B]` int64, index of the chosen one.
-    distance_to_goal: that guided the search. failures: `[B]` share of the chosen motion's perturbed rollouts that fail.
     """
     progress = candidates.score_state
     environments = torch.arange(len(best), device=best.device)
-    chosen = candidates.take(best.unsqueeze(-1))
     return {
         "segments": progress.segments[environments, best],
         "expected_return": progress.earned[environments, best],
         "expected_success": progress.succeeded[environments, best],
-        "noise": chosen_noise(chosen),
+        "noise": chosen_noise(candidates.take(best.unsqueeze(-1))),
         "candidate_centers": candidates.centers,
         "candidate_returns": progress.earned,
         "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,
-        "success_predictors": _success_predictors(candidates, chosen, distance_to_goal, failures),
+        "share_reaching_goal": progress.succeeded.float().mean(-1),
     }
-
-
-def _success_predictors(
-    candidates: Candidates, chosen: Candidates, distance_to_goal: DistanceToGoal | None, failures: Tensor | None
-) -> SuccessPredictors:
-    """For `candidates: [B, N]` and the `chosen: [B, 1]` one."""
-    here, mask = candidates.problem.state.centers, candidates.problem.state.mask
-    unknown = here.new_full(mask.shape[:1], torch.nan)
-    return SuccessPredictors(
-        reaching=candidates.score_state.succeeded.to(here.dtype).mean(-1),
-        failures=unknown if failures is None else failures,
-        distance_to_goal=unknown if distance_to_goal is None else distance_to_goal(here, mask),
-        distance_to_goal_after=(
-            unknown if distance_to_goal is None else distance_to_goal(chosen.plans.centers[:, 0], mask)
-        ),
-    )

@@ -16,7 +16,6 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, announce_waiting, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
-from cavin_pyro.evaluation.success.predictors import columns_of
 from cavin_pyro.launching.launcher import Launcher, as_launcher, chosen_launcher, of_shard
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
@@ -133,17 +132,13 @@ def episode_row(episode: Episode) -> Row:
         "plans": len(episode.plan_records),
         "plans_reaching_goal": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
-        "success_predictors": columns_of([record.success_predictors for record in episode.plan_records]),
-        "success_probability": _probabilities(episode),
+        "shares_reaching_goal": [_rounded(record.share_reaching_goal) for record in episode.plan_records],
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }
 
 
-def _probabilities(episode: Episode) -> list[float] | None:
-    """Of success, for each plan; None if some plan has none."""
-    told = [record.success_probability for record in episode.plan_records]
-    known = [round(one, 4) for one in told if one is not None]
-    return known if known and len(known) == len(told) else None
+def _rounded(share: float | None) -> float | None:
+    return None if share is None else round(share, 4)
 
 
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from cavin_pyro.config.world import check_world, object_ranges, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.native_code import argument_compile, check_native_code, searches
 from cavin_pyro.evaluation.rollout import Episode, rollout
-from cavin_pyro.evaluation.success.probability import NO_PROBABILITY, Probability, probability_for
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.models import model_of
@@ -57,7 +55,6 @@ class EpisodeRunner:
     geometry: Geometry
     pushes_per_plan: int | None  # as in `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
-    probability: Probability = NO_PROBABILITY  # of success, which each plan is given
     push_decimals: int | None = PUSH_DECIMALS  # as in `cavin_pyro.evaluation.rollout.rollout`
 
     @property
@@ -77,7 +74,6 @@ class EpisodeRunner:
             "pushes_per_plan": self.pushes_per_plan,
             "push_decimals": self.push_decimals,
             "device": self.device,
-            "probability": self.probability,
         }
         options = usual | options
         try:
@@ -170,14 +166,11 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
         )
 
 
-def make_planner(
-    config: DictConfig, reward: RewardFunction, device: torch.device, *, wrap: Callable[[Model], Any] | None = None
-) -> tuple[Planner, Geometry]:
+def make_planner(config: DictConfig, reward: RewardFunction, device: torch.device) -> tuple[Planner, Geometry]:
     """Build the planner with the checkpoint's model, and the geometric features of the checkpoint.
 
     Args:
         device: of the model. The geometric features stay on the CPU, so that states are the same for every device.
-        wrap: makes of the model what the planner gets in its place, to observe its calls.
 
     Raises:
         UserError: a checkpoint that cannot be used, or a planner that refuses its options.
@@ -202,13 +195,11 @@ def make_planner(
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
     with naming("planner", config.planner):
-        return construct(options, model=wrap(model) if wrap else model, reward=reward, **optimizers), geometry
+        return construct(options, model=model, reward=reward, **optimizers), geometry
 
 
-def make_runner(
-    config: DictConfig, *, render: bool = False, wrap: Callable[[Model], Any] | None = None
-) -> EpisodeRunner:
-    """Build an environment and a planner, and run episodes with them; for `wrap` see `make_planner`.
+def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
+    """Build an environment and a planner, and run episodes with them.
 
     Raises:
         UserError: as `check_options`, `make_environment` and `make_planner`, or a layout without room for the objects.
@@ -221,8 +212,7 @@ def make_runner(
     try:
         with user_input():
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin, device=device)
-        planner, geometry = make_planner(config, reward, device, wrap=wrap)
-        probability = probability_for(config)
+        planner, geometry = make_planner(config, reward, device)
         if config.pushes_per_plan is not None:
             whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
@@ -233,9 +223,7 @@ def make_runner(
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(
-        env, planner, geometry, config.pushes_per_plan, device, probability, config.get("push_decimals")
-    )
+    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan, device, config.get("push_decimals"))
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.evaluation.success.predictors import PredictorValues, success_predictors
 from envs.pushing import ObservationDict, PushingEnv
 from envs.randomness import planner_seed
 from envs.workspace import PUSH_DECIMALS, executed_push
@@ -33,8 +32,6 @@ class PlanRecord:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
         milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
         clouds: [M, 256, 3] metres, as observed, if a photograph was asked for.
-        success_predictors: what the plan tells about success; None if its planner predicts nothing.
-        success_probability: of the episode; None where no fit is known.
     """
 
     step: int
@@ -44,14 +41,20 @@ class PlanRecord:
     milliseconds: float
     photograph: NDArray[np.uint8] | None = None
     clouds: NDArray[np.float32] | None = None
-    success_predictors: PredictorValues | None = None
-    success_probability: float | None = None
 
     @property
-    def chance(self) -> str:
-        """The probability of success, to append to a line; "" where none is known."""
-        known = self.success_probability
-        return "" if known is None else f", success {100 * known:.0f} %"
+    def share_reaching_goal(self) -> float | None:
+        """Share of the plan's candidates that reach the goal by the model; None if its planner predicts nothing."""
+        share = self.plan.share_reaching_goal
+        return None if share is None else float(share[0])
+
+    @property
+    def prospect(self) -> str:
+        """The share of candidates that reach the goal, to append to a line; "" if the planner predicts nothing."""
+        share = self.share_reaching_goal
+        if share is None:
+            return ""
+        return f", {100 * share:.1f} % of candidates reach the goal" if share else ", no candidate reaches the goal"
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,6 @@ def rollout(
     pushes_per_plan: int | None = None,
     push_decimals: int | None = PUSH_DECIMALS,
     photograph: bool = False,
-    probability: Callable[[Sequence[PredictorValues]], float | None] | None = None,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
 ) -> Episode:
@@ -155,7 +157,6 @@ def rollout(
         push_decimals: to which planned pushes are rounded (`envs.workspace.executed_push`), so that an episode does not
             depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
-        probability: of success, from what the episode's plans have told so far; None leaves it out.
         callbacks: called in this order; without any, no frame is computed.
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
 
@@ -186,17 +187,7 @@ def rollout(
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
             clouds=observation["clouds"] if photograph else None,
-            success_predictors=success_predictors(
-                plan,
-                step=len(episode.transitions),
-                pushes_left=env.maximum_steps - len(episode.transitions),
-                distance=-float(env.task.potential(state.centers[0, :, :2].cpu(), state.mask[0].cpu())),
-                mask=observation["mask"],
-            ),
         )
-        if probability is not None and record.success_predictors is not None:
-            told = [one.success_predictors for one in episode.plan_records if one.success_predictors is not None]
-            record = replace(record, success_probability=probability([*told, record.success_predictors]))
         episode.plan_records.append(record)
         for callback in callbacks:
             callback.on_plan(record)

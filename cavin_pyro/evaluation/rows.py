@@ -10,7 +10,6 @@ from typing import Any
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.rollout import OUTCOMES
-from cavin_pyro.evaluation.success.predictors import SUCCESS_PREDICTORS
 
 Row = dict[str, Any]
 
@@ -27,19 +26,8 @@ def _outcome(value: Any) -> bool:
     return value in OUTCOMES
 
 
-def _success_predictors(value: Any) -> bool:
-    """One list per name, all of one length; or none, of a planner that predicts nothing."""
-    if value is None:
-        return True
-    if not isinstance(value, Mapping) or set(value) != set(SUCCESS_PREDICTORS):
-        return False
-    columns = list(value.values())
-    numbers = all(isinstance(column, list) and all(one is None or _number(one) for one in column) for column in columns)
-    return numbers and len({len(column) for column in columns}) == 1
-
-
-def _probabilities(value: Any) -> bool:
-    return value is None or (isinstance(value, list) and all(_number(one) and 0.0 <= one <= 1.0 for one in value))
+def _shares(value: Any) -> bool:
+    return isinstance(value, list) and all(one is None or (_number(one) and 0.0 <= one <= 1.0) for one in value)
 
 
 ALWAYS: dict[str, Callable[[Any], bool]] = {
@@ -58,24 +46,20 @@ LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not writ
     "strict_return": _number,
     "plans": _count,
     "plans_reaching_goal": _count,
-    "success_predictors": _success_predictors,
-    "success_probability": _probabilities,
+    "shares_reaching_goal": _shares,
 }
-RENAMED = {  # in the files of older versions: old name, new name
-    "hopeful_plans": "plans_reaching_goal",
-    "prospects": "success_predictors",
-    "way": "allowed_distance",
-    "way_after": "allowed_distance_after",
-}
+RENAMED = {"hopeful_plans": "plans_reaching_goal"}  # in the files of older versions: old name, new name
+DROPPED = {"prospects", "success_predictors", "success_probability"}  # of older versions
 
 
 def with_current_names(row: Any) -> Any:
-    """A stored row under the names of this version, those of its success predictors too; anything else as it is."""
+    """A stored row under the names of this version, without what it no longer has; anything else as it is."""
     if not isinstance(row, Mapping):
         return row
     return {
-        name if RENAMED.get(name, name) in row else RENAMED[name]: with_current_names(value)
+        name if RENAMED.get(name, name) in row else RENAMED[name]: value
         for name, value in row.items()
+        if name not in DROPPED
     }
 
 

@@ -1,11 +1,12 @@
-"""Rates with intervals."""
+"""Statistics of evaluations: rates with intervals, a table, and how many plans reach the goal by the model."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from omegaconf import DictConfig
 from scipy.stats import binomtest
 
 Rate = dict[str, float]
@@ -65,3 +66,27 @@ def table(results: dict[str, Any], title: str) -> str:
             row = " ".join(f"{values[key]:9.{digits}f}" for key in ("mean", "median", "p95"))
             lines.append(f"{name:16}{row[1:]}{unit}")
     return "\n".join(lines)
+
+
+def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
+    """How many candidates of the plans in rows of results reach the goal, and what to try where none of a plan does.
+
+    Empty for planners that predict nothing.
+    """
+    episodes = [[share for share in row.get("shares_reaching_goal") or () if share is not None] for row in rows]
+    shares = [share for episode in episodes for share in episode]
+    if not shares:
+        return ""
+    line = f"{100 * sum(shares) / len(shares):.1f} % of candidates reached the goal according to the model"
+    if not (without := sum(share == 0.0 for share in shares)):
+        return f"{line}, some in each of {len(shares)} plans"
+    never = sum(bool(episode) and not any(episode) for episode in episodes)
+    episodes_without = f", in {never} of {len(rows)} episodes in no plan" if len(rows) > 1 and never else ""
+    return f"{line}; in {without} of {len(shares)} plans none did{episodes_without}: {_advice(config)}"
+
+
+def _advice(config: DictConfig) -> str:
+    others = "" if config.reward == "dense" else " or reward=dense"
+    guided = config.planner.get("guidance", "none") != "none"
+    what = "a longer one" if guided else "planner.guidance=layout, a longer one"
+    return f"the goal may lie beyond planner.horizon={config.planner.horizon} pushes; try {what}{others}"

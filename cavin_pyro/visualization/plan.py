@@ -100,7 +100,7 @@ def draw_plan_record(
     view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)
     draw_overlay(panel, record, task, view, scale, reached)
     about = evidence_text(record.plan)
-    title = f"after {counted(record.step)}{record.chance}{_error(record, reached)}"
+    title = f"after {counted(record.step)}{record.prospect}{_error(record, reached)}"
     panel.set_title("\n".join([title, about] if about else [title]), fontsize=10)
 
 

@@ -41,8 +41,8 @@ class EpisodeProgress(EpisodeCallback):
 
 
 def about_plan(record: PlanRecord) -> str:
-    """How long a plan took, and the probability of success that it gives, if one is known."""
-    return f"planned in {record.milliseconds / 1e3:.2f} s{record.chance}"
+    """How long a plan took, and how many of its candidates reach the goal, if it predicts anything."""
+    return f"planned in {record.milliseconds / 1e3:.2f} s{record.prospect}"
 
 
 def ended(transition: Transition) -> bool:

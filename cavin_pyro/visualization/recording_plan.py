@@ -75,7 +75,7 @@ def log_plan(stream: rr.RecordingStream, record: PlanRecord, task: Task) -> None
     expected = float(record.plan.expected_return[0])
     expectation = "" if np.isnan(expected) else f", expected return {expected:.0f}"
     about = f", {evidence_text(record.plan)}" if record.plan.evidence is not None else ""
-    line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{record.chance}{about}"
+    line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{record.prospect}{about}"
     stream.log("log", rr.TextLog(line))
 
 

@@ -100,7 +100,8 @@ def episode_files(*, video: bool, viewer: str | None = None) -> list[str]:
 
 
 def write_steps(path: Path, episode: Episode) -> None:
-    """One line per push: action, reward, what it did; with a plan's first push its time and probability of success.
+    """One line per push: action, reward, what it did; with a plan's first push its time and the share of
+    its candidates that reach the goal by the model.
 
     A plan by inference (`planner.optimizer=smc`) also has its estimate of log Z, its temperature, and the fewest
     effective samples after any segment; see `planning.plan.Evidence`.
@@ -110,7 +111,7 @@ def write_steps(path: Path, episode: Episode) -> None:
         writer = csv.writer(file)
         writer.writerow(
             ["step", "x", "y", "dx", "dy", "reward", "success", "violation", "fall", "unsafe", "ineffective"]
-            + ["subgoal_distance_m", "planning_ms", "success_probability", *EVIDENCE_COLUMNS]
+            + ["subgoal_distance_m", "planning_ms", "share_reaching_goal", *EVIDENCE_COLUMNS]
         )
         for transition in episode.transitions:
             flags = (
@@ -127,8 +128,8 @@ def write_steps(path: Path, episode: Episode) -> None:
             )
             record = planned.get(transition.step - 1)
             took = "" if record is None else f"{record.milliseconds:.1f}"
-            probability = None if record is None else record.success_probability
-            chance = "" if probability is None else f"{probability:.3f}"
+            share = None if record is None else record.share_reaching_goal
+            reaching = "" if share is None else f"{share:.4f}"
             writer.writerow(
                 [
                     transition.step,
@@ -136,7 +137,7 @@ def write_steps(path: Path, episode: Episode) -> None:
                     transition.reward,
                     *(int(flag) for flag in flags),
                 ]
-                + [distance, took, chance, *_evidence(record)]
+                + [distance, took, reaching, *_evidence(record)]
             )
 
 

@@ -59,12 +59,10 @@ class PushSearch(SearchingPlanner):
         scores, pushes = torch.where(finite, candidates.returns, -torch.inf), candidates.at(0, actions_of)
         scores = self.prefer_free(scores, pushes, observed)
         best = best_of(scores, "returns of push sequences")
-        failures = None
         if self.robustness is not None:
             scores = prefer(scores, candidates.score_state.succeeded)
             what = state, None, scores, pushes, -RETURN_WEIGHT * scores, generators
-            robust = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
-            best, failures = robust
+            best = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
         chosen = candidates.take(best.unsqueeze(-1))
         actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
         actions, path = self.idle_last(actions, path, state, observed)
@@ -76,5 +74,5 @@ class PushSearch(SearchingPlanner):
             motion_codes=codes if self.has_codes else no_codes,
             subgoals=state.map(lambda field: field[:, None][:, :0]),
             predicted_centers=path,
-            **summary(candidates, best, self.distance_to_goal, failures),
+            **summary(candidates, best),
         )

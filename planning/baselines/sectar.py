@@ -12,7 +12,7 @@ from models.state import State
 from planning.backends.chunking import chunked
 from planning.cavin import EffectSpace
 from planning.extensions.perturbed_rollouts import RETURN_WEIGHT
-from planning.extensions.sequential_halving import MostRobust, sequential_halving
+from planning.extensions.sequential_halving import sequential_halving
 from planning.extensions.touchdown import ObservedPoints
 from planning.inputs import NoFiniteCandidateError
 from planning.plan import Plan
@@ -66,12 +66,10 @@ class SectarPlanner(SearchingPlanner):
             pushes = self._actions(here, effects.at(0, lambda segment: segment.rollout.code))
             returns = self.prefer_free(returns, pushes, observed)
         best = best_of(returns, "returns of effect plans")
-        failures = None
         if self.robustness is not None:
             returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
-            finite, robust = torch.isfinite(returns).any(-1), self._most_robust(effects, returns, generators)
-            best = torch.where(finite, robust.candidate, best)
-            failures = torch.where(finite, robust.failures, torch.nan)
+            robust = self._most_robust(effects, returns, generators)
+            best = torch.where(torch.isfinite(returns).any(-1), robust, best)
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
         # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
@@ -90,11 +88,11 @@ class SectarPlanner(SearchingPlanner):
             motion_codes=effect_codes.new_empty(len(actions), 0, 0),
             subgoals=chosen.states.map(lambda field: field[:, 0]),
             predicted_centers=centers,
-            **summary(effects, best, self.distance_to_goal, failures),
+            **summary(effects, best),
         )
 
-    def _most_robust(self, effects: Candidates, returns: Tensor, generators: Sequence[torch.Generator]) -> MostRobust:
-        """The effect plan whose first segment costs least on average; needs `robustness`.
+    def _most_robust(self, effects: Candidates, returns: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+        """The effect plan whose first segment costs least on average, `[B]` int64; needs `robustness`.
 
         returns: `[B, N]`, -inf for plans that are not to be chosen.
         """
@@ -111,5 +109,4 @@ class SectarPlanner(SearchingPlanner):
         )
         what = state, subgoals, scores, actions, -RETURN_WEIGHT * scores, generators
         chosen = sequential_halving(robustness, self.model, self.reward, *what, backend=self.backend)
-        index = best.indices.gather(1, chosen.candidate.unsqueeze(-1)).squeeze(1)
-        return MostRobust(index, chosen.failures)
+        return best.indices.gather(1, chosen.unsqueeze(-1)).squeeze(1)

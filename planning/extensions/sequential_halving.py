@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,13 +17,6 @@ from planning.rollouts.ranking import SubgoalDistance
 from planning.rollouts.segment import actions_of
 
 
-class MostRobust(NamedTuple):
-    """The motion with the lowest cost on average."""
-
-    candidate: Tensor  # [B] int64, its index
-    failures: Tensor  # [B] share of its rollouts that failed
-
-
 def most_robust(
     robustness: PerturbedRollouts,
     motions: Candidates,
@@ -34,8 +26,8 @@ def most_robust(
     reward: RewardFunction,
     subgoals: State,
     distance: SubgoalDistance,
-) -> MostRobust:
-    """The motion candidate with the lowest cost on average; see `sequential_halving`.
+) -> Tensor:
+    """The motion candidate with the lowest cost on average, `[B]` int64; see `sequential_halving`.
 
     Rollouts end where their distance to the subgoal counts: after T pushes, or after the first.
     """
@@ -58,8 +50,8 @@ def sequential_halving(
     *,
     distance: SubgoalDistance = ENDS,
     backend: Backend = eager,
-) -> MostRobust:
-    """The motion with the lowest cost on average.
+) -> Tensor:
+    """The motion with the lowest cost on average, `[B]` int64.
 
     state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
     without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, n, 4]`, the
@@ -70,14 +62,12 @@ def sequential_halving(
     indices, count, done = best.indices, robustness.rollouts, 0
     infinite = ~torch.isfinite(best.values)
     total = torch.zeros_like(best.values)  # cost of all rollouts so far
-    failures = torch.zeros_like(best.values)  # how many of them failed
     for number in range(robustness.rounds):
         if number and total.shape[-1] == 1:
             break  # one candidate is left
         if number:
             going = (total / done).topk(max(1, total.shape[-1] // robustness.reduction_factor), largest=False).indices
-            fields = indices, infinite, total, failures
-            indices, infinite, total, failures = (field.gather(1, going) for field in fields)
+            indices, infinite, total = (field.gather(1, going) for field in (indices, infinite, total))
             count = robustness.reduction_factor * count
         costs, failed = perturbed_rollouts(
             robustness,
@@ -94,7 +84,5 @@ def sequential_halving(
         cost = (costs + robustness.failure_cost * failed).sum(-1)
         cost = cost + count * later.gather(1, indices)
         total = torch.where(infinite | ~torch.isfinite(cost), torch.inf, total + cost)
-        failures = failures + failed.sum(-1)
         done += count
-    winner = total.argmin(-1, keepdim=True)
-    return MostRobust(indices.gather(1, winner).squeeze(1), failures.gather(1, winner).squeeze(1) / done)
+    return indices.gather(1, total.argmin(-1, keepdim=True)).squeeze(1)

@@ -15,7 +15,6 @@ from cavin_pyro.data.collection import CollectionConfig, collect
 from cavin_pyro.reproduction.scales import SCALES, TINY_TRAINING
 from cavin_pyro.reproduction.stages import preparation
 from tests.cavin_pyro.conftest import run_script
-from tests.cavin_pyro.evaluation.success.made_up import evaluation
 from tests.cavin_pyro.shell import ENVIRONMENT
 
 ROOT = Path(__file__).parents[2]
@@ -69,18 +68,6 @@ def test_training_from_a_file_makes_the_weights_of_training_from_memory() -> Non
     assert small.startswith("500 pushes") and large.startswith("5000 pushes")
     assert all(re.search(r"[\d.]+ MB held, read in [\d.]+ s$", line) for line in (small, large))
     assert re.search(r"speed [\d.]+; weights equal$", steps)
-
-
-@pytest.mark.soak
-def test_allocations_of_perturbed_rollouts_are_compared() -> None:
-    lines = run(
-        "perturbed_rollouts", "--problems", "1", "--episodes", "1", "--pushes", "1", "--truth", "16"
-    ).splitlines()
-    assert lines[0] == "1 of 2 plans"
-    rows = [line.split() for line in lines[2:]]
-    assert {row[0] for row in rows} == {"independent", "shared"}
-    assert all(int(row[1]) * int(row[2]) * int(row[3]) == int(row[5]) for row in rows)
-    assert all(float(row[6]) >= 0.0 and row[7].endswith("%") for row in rows)
 
 
 def test_collection_reports_where_its_time_goes() -> None:
@@ -162,26 +149,6 @@ def test_variants_of_the_baselines_are_trained_and_compared(tmp_path: Path) -> N
     assert run("tuning", str(home), *options, *fast) == printed
 
 
-def test_a_fit_of_the_probability_of_success_is_written_and_reported_on_other_episodes(tmp_path: Path) -> None:
-    fitted, fresh, other = (
-        evaluation(tmp_path / "fit", 400),
-        evaluation(tmp_path / "fresh", 400, seed=1),
-        evaluation(tmp_path / "other", 20, "planner.horizon=60"),
-    )
-    file, picture = str(tmp_path / "fit.json"), tmp_path / "reliability.png"
-    printed = run("success_probability", "fit", file, str(fitted))
-    assert re.search(r"^default: \d+ of 400 episodes succeeded, \d+ plans$", printed, re.M)
-    lines = run("success_probability", "report", file, str(fresh), str(other), "--picture", str(picture)).splitlines()
-    table = {line.split(" | ")[0].strip("| "): line.split(" | ")[1:] for line in lines[2:]}
-    assert list(table) == ["all", "planner: default", "fresh"]  # the other planner was not fitted
-    assert table["all"][0] == "400" and float(table["all"][4].split()[0]) < 0.08
-    assert picture.stat().st_size > 10_000
-    halves = [run("success_probability", "report", file, str(fresh), "--half", half) for half in ("first", "second")]
-    assert [text.splitlines()[2].split(" | ")[1] for text in halves] == ["200", "200"] and halves[0] != halves[1]
-    refused = run_script(ROOT / "benchmarks" / "success_probability.py", "fit", file, str(tmp_path), folder=ROOT)
-    assert refused.status == 2 and refused.errors == f"{tmp_path} holds no evaluation: give folders of evaluate\n"
-
-
 @pytest.mark.soak
 def test_plans_for_more_objects_are_timed_with_each_number_of_neighbours() -> None:
     few = ("--objects", "2", "6", "--neighbours", "4", "9", "--nearest", "0", "2", "--repetitions", "1")
@@ -215,20 +182,6 @@ def test_samples_are_set_against_success_and_a_finished_setting_is_not_run_again
     assert [row[:3] for row in rows] == [["| CAVIN", "paper", "8"], ["| CAVIN", "paper", "16"]]
     assert sum("*" in row[4] for row in rows) == 1  # neither succeeds in two pushes: the faster one
     assert (tmp_path / "samples.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.soak
-def test_rows_of_networks_are_counted_for_every_planner_of_a_method() -> None:
-    rows = [line.strip("| ").split(" | ") for line in run("model_evaluations", "--methods", "cavin").splitlines()[2:]]
-    counted = {row[1]: [int(count.replace(",", "")) for count in row[2:]] for row in rows}
-    assert counted["`paper`"] == [
-        10240,
-        10240,
-        30720,
-        51200,
-    ]  # N samples, K = 10 segments, T = 3
-    assert counted["`one_motion`"] == [10240, 10, 30, 10280]
-    assert counted["`without_effects`"][0] == 0
 
 
 @pytest.mark.soak

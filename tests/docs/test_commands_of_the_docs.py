@@ -100,8 +100,6 @@ def run_in_order(pages: Sequence[str], folder: Path) -> None:
             short.remove("planner.samples=8")
         if "planner.compile=true" in line.options:
             short.append("planner.compile=false")
-        if any(word.startswith("success_probability=") for word in line.options):  # a benchmark writes the file
-            short.append("success_probability=null")
         if "device=cuda" in line.options and not torch.cuda.is_available():
             short.append("device=auto")
         cases[f"{number}/.."] = Case(line.command, [*line.options, *short])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from planning.plan import Plan, SuccessPredictors
+from planning.plan import Plan
 from tests.cavin_pyro.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "how-to" / "plan-from-python.md").read_text(encoding="utf-8")
@@ -55,7 +55,6 @@ def test_the_loop_by_hand_makes_the_pushes_of_the_helpers(values: dict[str, Any]
 def test_the_page_names_every_field_of_a_plan() -> None:
     named = {name for row in re.findall(r"^\| (`[^|]+) \|[^|]*\| ", PAGE, re.M) for name in re.findall(r"`(\w+)`", row)}
     assert named >= set(Plan._fields)
-    assert {*re.findall(r"`(\w+)`", PAGE)} >= set(SuccessPredictors._fields)
 
 
 def test_shapes_of_a_plan_are_those_of_the_page(values: dict[str, Any]) -> None:
@@ -77,7 +76,7 @@ def test_the_helpers_of_the_page_are_there(values: dict[str, Any]) -> None:
     """Their names stand without a package, so tests/docs does not look for them."""
     record, transition = values["episode"].plan_records[0], values["episode"].transitions[0]
     for one, names in (
-        (record, ("plan", "step", "centers", "mask", "milliseconds", "success_probability")),
+        (record, ("plan", "step", "centers", "mask", "milliseconds")),
         (transition, ("action", "reward", "centers", "unsafe", "ineffective")),
     ):
         assert all(f"`{name}`" in PAGE and hasattr(one, name) for name in names)

@@ -126,12 +126,6 @@ class EpisodeConfig(DeviceOptions):
         "the planner's own, such as sectar for planner=sectar",
         group="model",
     )
-    success_probability: str | None = option(
-        None,
-        "file with the fit of your planner's probability of success, of benchmarks/success_probability.py; by default "
-        "the shipped one",
-        group="planning",
-    )
     trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
     env: WorldConfig = field(default_factory=WorldConfig)
     seed: int = seed_option("seed of the scene and of the planner", group="run")

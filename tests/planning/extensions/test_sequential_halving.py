@@ -57,7 +57,7 @@ def test_the_best_candidates_continue_with_more_rollouts(toy: SimpleNamespace) -
     scores = torch.arange(float(SAMPLES)).expand(2, -1)
     later = torch.stack([torch.arange(float(SAMPLES)), -torch.arange(float(SAMPLES))])  # the last ones are candidates
     given = model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later, toy.generators(0, 1)
-    chosen = sequential_halving(options, *given, backend=counting).candidate  # type: ignore[arg-type]
+    chosen = sequential_halving(options, *given, backend=counting)  # type: ignore[arg-type]
     assert chosen.tolist() == [32, 63]
     assert [pushes.shape[1] for pushes in rolled_out] == [64, 64, 64]
     often = [[len(set(map(tuple, pushes[:, 0].tolist()))) for pushes in three] for three in rolled_out]
@@ -108,7 +108,7 @@ def test_as_many_tries_shared_out_in_rounds_find_better_motions_than_equal_share
     for options in ({"rollouts": 12, "rounds": 1}, {"rollouts": 4, "rounds": 3}):
         robustness = PerturbedRollouts(candidates=SAMPLES, outcome_noise=0.0, start_noise=0.3, **options)
         given = Unlucky(), reward, state, goal, scores, actions, scores, generators
-        chosen = sequential_halving(robustness, *given).candidate
+        chosen = sequential_halving(robustness, *given)
         failing.append(actions[range(40), chosen, 0, 2].mean())
     assert failing[1] < 0.8 * failing[0]
 
@@ -121,7 +121,7 @@ def test_shared_noise_orders_motions_that_noise_of_their_own_would_confuse(toy: 
     order = torch.randperm(SAMPLES, generator=torch.Generator().manual_seed(0))
     given = model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, torch.zeros(40, SAMPLES), actions[:, order]
     robustness = PerturbedRollouts(candidates=SAMPLES, rounds=1, outcome_noise=0.0, start_noise=0.1)
-    chosen = sequential_halving(robustness, Slipping(), *given[1:], torch.zeros(40, SAMPLES), generators).candidate
+    chosen = sequential_halving(robustness, Slipping(), *given[1:], torch.zeros(40, SAMPLES), generators)
     assert (order[chosen] == 0).all()
 
 
@@ -133,7 +133,7 @@ def test_each_candidate_may_have_its_own_goal(toy: SimpleNamespace) -> None:
 
     def chosen(goal: State) -> list[int]:
         given = options, model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later
-        return sequential_halving(*given, toy.generators(0, 1)).candidate.tolist()
+        return sequential_halving(*given, toy.generators(0, 1)).tolist()
 
     shared = state.map(lambda field: field.unsqueeze(1))
     own = shared.map(lambda field: field.expand(-1, SAMPLES, *field.shape[2:]).clone())
@@ -155,7 +155,7 @@ def test_without_a_goal_failures_and_the_later_cost_decide(toy: SimpleNamespace)
     def chosen(cost: float) -> int:
         options = PerturbedRollouts(candidates=3, failure_cost=cost)
         given = options, model, toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=-0.01), state, None, -later, actions
-        return int(sequential_halving(*given, later, toy.generators(0)).candidate)
+        return int(sequential_halving(*given, later, toy.generators(0)))
 
     assert [chosen(cost) for cost in (0.0, 0.1, 0.3)] == [0, 0, 2]
 

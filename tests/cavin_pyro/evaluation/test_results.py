@@ -1,0 +1,169 @@
+"""Rows of finished episodes on disk, their statistics, and two methods on the same scenes."""
+
+from __future__ import annotations
+
+import json
+import math
+from math import comb
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.comparison import Comparison, compare, earlier_rows, sentences
+from cavin_pyro.evaluation.rows import finished_episodes
+from cavin_pyro.evaluation.statistics import plan_summary, spread, summarize, table, wilson
+
+ROW: dict[str, Any] = {
+    "seed": 10,
+    "outcome": "success",
+    "steps": 4,
+    "return": 7.5,
+    "strict_outcome": "violation",
+    "strict_steps": 2,
+    "strict_return": 1.5,
+    "unsafe": 0,
+    "ineffective": 1,
+    "plans": 2,
+    "plans_reaching_goal": 2,
+    "shares_reaching_goal": [0.25, None],
+    "subgoal_distance": None,
+    "planning_ms": [1.5, 2],
+}
+
+
+def written(folder: Path, *rows: Any) -> Path:
+    path = folder / "episodes.jsonl"
+    path.write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    return path
+
+
+def test_whole_rows_are_read_also_of_older_versions(tmp_path: Path) -> None:
+    older = {name: value for name, value in ROW.items() if not name.startswith(("strict", "plans", "shares"))}
+    path = written(tmp_path, ROW, {**older, "seed": 11, "hopeful_plans": 3, "prospects": {}}, ROW)
+    with open(path, "a") as file:
+        file.write('{"seed": 12, "outc')  # cut off by a kill
+    assert finished_episodes(path) == {10: ROW, 11: {**older, "seed": 11, "plans_reaching_goal": 3}}
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ([1], "it is no section"),
+        ({"seed": 11}, "'outcome' is missing"),
+        ({**ROW, "outcom": "success"}, "'outcom' is unknown"),
+        ({**ROW, "seed": 11, "outcome": "sucess"}, 'outcome cannot be "sucess"'),
+        ({**ROW, "seed": True}, "seed cannot be true"),
+        ({**ROW, "seed": 11, "return": float("nan")}, "return cannot be NaN"),
+        ({**ROW, "seed": 11, "steps": -1}, "steps cannot be -1"),
+        ({**ROW, "seed": 11, "planning_ms": 5}, "planning_ms cannot be 5"),
+        ({**ROW, "seed": 11, "shares_reaching_goal": [1.5]}, "shares_reaching_goal cannot be [1.5]"),
+        ({**ROW, "steps": 5}, "an earlier line has another episode with seed 10"),
+    ],
+)
+def test_a_line_that_is_no_episode_is_named(row: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError) as refused:
+        finished_episodes(written(tmp_path, ROW, row))
+    assert f"episodes.jsonl, line 2 is no episode ({said})" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    # Published examples: 95 % score intervals, to four digits.
+    [(0, 10, 0.0, 0.2775), (8, 10, 0.4902, 0.9433), (10, 10, 0.7225, 1.0), (81, 263, 0.2553, 0.3662)],
+)
+def test_wilsons_interval_is_the_published_one(successes: int, trials: int, low: float, high: float) -> None:
+    rate = wilson(successes, trials)
+    assert rate["rate"] == successes / trials
+    assert (rate["low"], rate["high"]) == pytest.approx((low, high), abs=6e-5)
+
+
+def test_the_spread_of_one_to_a_hundred() -> None:
+    values = spread(list(np.random.default_rng(0).permutation(np.arange(1.0, 102.0))))
+    assert values == {"mean": 51.0, "median": 51.0, "p95": 96.0}
+
+
+def test_a_summary_has_a_rate_for_every_outcome() -> None:
+    outcomes = ["success"] * 6 + ["violation", "fall", "timeout", "timeout"]
+    rows = [{**ROW, "seed": seed, "outcome": outcome, "steps": seed + 1} for seed, outcome in enumerate(outcomes)]
+    rows[0]["subgoal_distance"] = 0.1  # the other episodes ended within their first segment
+    results = summarize(rows)
+    rates = {name: results[name]["rate"] for name in ("success", "violation", "fall", "timeout")}
+    assert rates == {"success": 0.6, "violation": 0.1, "fall": 0.1, "timeout": 0.2}
+    assert results["success"] == wilson(6, 10)
+    assert results["steps"] == spread([float(number) for number in range(1, 11)])
+    assert results["planning_ms"]["mean"] == 1.75 and results["subgoal_distance"]["mean"] == 0.1
+    assert "success            60.0 %   31.3 to  83.2 %" in table(results, "crossing")
+    assert summarize(rows[1:])["subgoal_distance"] is None
+
+
+def plans(*shares: float | None) -> dict[str, Any]:
+    return {**ROW, "shares_reaching_goal": list(shares)}
+
+
+def test_plans_without_a_candidate_that_reaches_the_goal_are_counted() -> None:
+    config = compose("evaluate", "reward=sparse")
+    assert plan_summary([plans(0.5, 1.0)], config).endswith("some in each of 2 plans")
+    said = plan_summary([plans(0.0, 0.5)], config)
+    assert said.startswith("25.0 % of candidates reached the goal") and "in 1 of 2 plans none did: " in said
+    said = plan_summary([plans(0.0, 0.0), plans(0.5)], config)
+    assert "in 2 of 3 plans none did, in 1 of 2 episodes in no plan: " in said and "planner.horizon=30" in said
+    assert plan_summary([plans(None), {"outcome": "success"}], config) == ""
+
+
+def ended(successes: list[bool], first: int = 0) -> list[dict[str, Any]]:
+    return [
+        {"seed": seed, "outcome": "success" if success else "timeout"} for seed, success in enumerate(successes, first)
+    ]
+
+
+def test_scenes_are_counted_by_the_methods_that_solve_them() -> None:
+    one = ended([True, True, True, False, False, True])
+    result = compare(one, ended([True, False, False, True, False, True]))
+    assert (result.both, result.one_alone, result.other_alone, result.neither) == (2, 2, 1, 1)
+    assert sentences(result, Path("other")).startswith("success in the 6 scenes of both: 66.7 % here, 50.0 % in other")
+    assert compare(ended([True] * 5), ended([False] * 5, first=3)[::-1]) == Comparison(0, 2, 0, 0, 0.5)
+    with pytest.raises(UserError, match="no seed in common"):
+        compare(ended([True] * 3), ended([True] * 3, first=3))
+
+
+@given(st.integers(0, 20), st.integers(0, 20))
+def test_the_test_is_the_binomial_one_of_the_scenes_that_only_one_solves(alone: int, others: int) -> None:
+    one = ended([True] * alone + [False] * others + [True, False])
+    other = ended([False] * alone + [True] * others + [True, False])
+    count = alone + others
+    lower = sum(comb(count, k) for k in range(min(alone, others) + 1)) / 2**count
+    assert math.isclose(compare(one, other).p_value, min(1.0, 2 * lower))
+
+
+def test_damaged_results_are_not_compared_with(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("seed: 3\n")
+    for rows in ({"a": 1}, [{**ROW, "outcome": "sucess"}], "text"):
+        (tmp_path / "results.json").write_text(json.dumps({"per_episode": rows}))
+        with pytest.raises(UserError, match=r"holds damaged results \(.*\): evaluate it again"):
+            earlier_rows(tmp_path, OmegaConf.create({}))
+
+
+def test_an_evaluation_is_compared_on_the_command_line(shell: SimpleNamespace, tmp_path: Path) -> None:
+    overrides = ["planner=random", "objects=1", "maximum_steps=2", "workers=1"]
+    evaluation = lambda *more: shell.run_command("evaluate", *overrides, *more, folder=tmp_path)  # noqa: E731
+    assert evaluation("episodes=2", "output=one").status == 0
+    answer = evaluation("episodes=3", "output=two", "compare=one")
+    assert answer.status == 0, answer.errors
+    assert "neither 2; exact McNemar test p = 1" in answer.output
+    found = json.loads((tmp_path / "two" / "results.json").read_text())["comparison"]
+    assert found == {"against": "one", "both": 0, "one_alone": 0, "other_alone": 0, "neither": 2, "p_value": 1.0}
+    for more, said in (
+        (["compare=one", "task=clearing"], "compare=one has task._target_=envs.tasks.crossing.Crossing, not"),
+        (["compare=nowhere"], "compare=nowhere is no finished evaluation"),
+    ):
+        answer = evaluation("episodes=2", "output=three", *more)
+        assert answer.status == 2
+        assert said in answer.errors and answer.errors.count("\n") == 1
