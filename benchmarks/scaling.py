@@ -29,7 +29,6 @@ from omegaconf import OmegaConf
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation import evaluation
 from cavin_pyro.evaluation.factory import make_runner
-from cavin_pyro.launching.cluster import JOBS_PER_CPU
 
 ROOT = Path(__file__).parents[1]
 EPISODES = ROOT / "docs" / "measurements" / "reproduction" / "episodes.parquet"
@@ -204,7 +203,7 @@ def main() -> None:
             f"so that it can keep {most:,.0f} workers busy\n\n{HEAD}"
         )
         for sample in samples:
-            ahead = JOBS_PER_CPU - 1 if launcher == "ray" else 0
+            ahead = 1 if launcher == "ray" else 0
             print("\n".join(report(sample, arguments.workers, start=start, main=main_seconds, ahead=ahead)))
 
 

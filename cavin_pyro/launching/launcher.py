@@ -1,19 +1,32 @@
-"""Where a command's jobs run: the options `launcher`, `address` and `workers`."""
+"""Where a command's jobs run: in worker processes of this machine, or on a Ray cluster; results are the same.
+
+Ray is an optional extra, imported here alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from itertools import islice
+from typing import Any, TypeVar
 
 from omegaconf import DictConfig
 
-from cavin_pyro.config.errors import UserError
-from cavin_pyro.launching.cluster import in_cluster
-from cavin_pyro.launching.workers import in_workers
+from cavin_pyro.config.errors import UserError, WorkerError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+Submit = Callable[[Any], Future[Any]]
+
+GROUP_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}  # which a terminal or a scheduler sends to all processes
+RESUME = "what was finished is kept: rerun the same command to resume"
 
 
 @dataclass(frozen=True)
@@ -32,10 +45,93 @@ class Launcher:
     def run(
         self, function: Callable[[Job], Result], jobs: Iterable[Job], *, ordered: bool = False
     ) -> Generator[tuple[int, Result], None, None]:
-        """Yield the number of each job and what the function makes of it; see `in_workers` and `in_cluster`."""
-        if self.name == "ray":
-            return in_cluster(function, jobs, self.address, ordered=ordered)
-        return in_workers(function, jobs, self.workers, ordered=ordered)
+        """Yield the number of each job and what the function makes of it, in other processes.
+
+        Close the iterator (`contextlib.closing`) when leaving it early: that ends the jobs.
+
+        Args:
+            function: importable by its name. jobs: may be endless; few are taken before their turn.
+            ordered: in the order of the jobs, instead of as they finish.
+
+        Raises:
+            WorkerError: a worker was killed, or a cluster lost a job several times.
+            UserError: Ray is not installed, or there is no cluster at `address`.
+            Exception: whatever the function raises, with the worker's traceback as its cause.
+        """
+        where = _cluster(function, self.address) if self.name == "ray" else _processes(function, self.workers)
+        queue, submitted = enumerate(jobs), dict[Future[Result], int]()
+        with where as (submit, limit):
+            while True:
+                for number, job in islice(queue, max(0, limit() - len(submitted))):
+                    submitted[submit(job)] = number
+                if not submitted:
+                    return
+                finished = [next(iter(submitted))] if ordered else [*wait(submitted, None, FIRST_COMPLETED).done]
+                for future in sorted(finished, key=lambda one: one.exception() is not None):  # results before errors
+                    yield submitted.pop(future), future.result()
+
+
+@contextmanager
+def _processes(function: Callable[[Any], Any], workers: int) -> Iterator[tuple[Submit, Callable[[], int]]]:
+    """How to submit a job to worker processes, and how many at a time."""
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+
+    def submit(job: Any) -> Future[Any]:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, GROUP_SIGNALS)  # new workers leave them to this process
+        try:
+            return pool.submit(function, job)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    try:
+        yield submit, lambda: 2 * workers
+        pool.shutdown()  # idle workers exit as processes do, and release locks
+    except BrokenProcessPool as error:
+        reason = "a worker process was killed, perhaps because memory ran out: try fewer workers"
+        raise WorkerError(f"{reason}; {RESUME}") from error
+    finally:
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.kill()
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """In a worker: exit when the parent has ended, however it did."""
+
+    def watch(parent: Any) -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(multiprocessing.parent_process(),), daemon=True).start()
+
+
+@contextmanager
+def _cluster(function: Callable[[Any], Any], address: str | None) -> Iterator[tuple[Submit, Callable[[], int]]]:
+    """How to submit a job to a Ray cluster, which runs that of a lost node again, and how many at a time."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports to its makers otherwise
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        import ray
+
+        ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR", include_dashboard=False)
+    except ImportError as error:
+        raise UserError(f"launcher=ray needs Ray ({error}): pip install -c constraints.txt '.[ray]'") from error
+    except Exception as error:  # Ray has no class of its own for what can be wrong with a machine or an address
+        where = f"no Ray cluster at address={address}" if address else "Ray did not start"
+        raise UserError(f"{where} ({' '.join(str(error).split())[:200]})") from error
+    finally:
+        if threading.current_thread() is threading.main_thread():  # Ray takes SIGTERM, which ends us in one line
+            signal.signal(signal.SIGTERM, handler)
+    try:
+        task = ray.remote(num_cpus=1)(function)
+        yield lambda job: task.remote(job).future(), lambda: max(1, 2 * int(ray.cluster_resources().get("CPU", 0)))
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error  # as the function raised it, with Ray's traceback
+    except ray.exceptions.RayError as error:
+        raise WorkerError(f"a job was lost on the cluster ({' '.join(str(error).split())[:200]}); {RESUME}") from error
+    finally:
+        ray.shutdown()
 
 
 def chosen_launcher(config: DictConfig) -> Launcher:

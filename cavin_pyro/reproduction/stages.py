@@ -15,7 +15,6 @@ from pathlib import Path
 
 from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError, WorkerError
-from cavin_pyro.launching.workers import killed_by
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.scales import Scale
 from cavin_pyro.storage.files import output_folder
@@ -72,7 +71,7 @@ class Stage:
             started(process)
             status = process.wait()
         if status < 0:
-            raise WorkerError(f"{self.line} {killed_by(-status)}; rerun the same command to resume")
+            raise WorkerError(f"{self.line} was killed by signal {-status}; rerun the same command to resume")
         if status:
             last = (self.folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
             raise UserError(f"{self.line} failed: {' '.join(last).removeprefix('error: ')} ({self.folder}/log.txt)")

@@ -22,7 +22,7 @@ from cavin_pyro.config.errors import UserError, WorkerError
 from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
 from cavin_pyro.data.declaration import ARRAYS, BESIDE, padded
 from cavin_pyro.data.sources import seed_of, slots_of, source_of_shards, sources_of
-from cavin_pyro.launching.workers import in_workers
+from cavin_pyro.launching.launcher import Launcher
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
 from envs.workspace import POINTS_PER_OBJECT
@@ -67,7 +67,7 @@ def export(folder: Path, target: Path) -> int:
         shutil.rmtree(partial, ignore_errors=True)  # of a killed run
         try:
             # A process of its own, because HDF5 crashes when it ends if it could not write something before.
-            with closing(in_workers(_write, [(folder, partial)], 1)) as finished:
+            with closing(Launcher(workers=1).run(_write, [(folder, partial)])) as finished:
                 ((_, count),) = finished
             partial.rename(written)
         except WorkerError:

@@ -255,7 +255,7 @@ def test_a_killed_worker_and_sigterm_end_a_collection_in_one_line_and_keep_its_f
     overrides = ["transitions=1000000", "steps=2", "episodes_per_shard=1", "seed=5", "output=out"]
     folder, seen = tmp_path / "out", 0
     for workers, status, said in (
-        (2, 1, "error: worker process [0-9]+ was killed by signal 9 .*: rerun the same command to resume"),
+        (2, 1, "error: a worker process was killed, perhaps .*: rerun the same command to resume"),
         (1, 128 + signal.SIGTERM, "error: interrupted by SIGTERM; rerun the same command to resume"),
     ):
         process = shell.start_command("collect", *overrides, f"workers={workers}", folder=tmp_path)

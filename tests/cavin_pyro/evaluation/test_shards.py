@@ -11,7 +11,6 @@ import pytest
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import evaluate, merge, seeds_of
-from cavin_pyro.launching.launcher import of_shard
 from cavin_pyro.storage.run_directory import write_config
 
 SHORT = ("maximum_steps=2", "workers=1", "episodes=5", "objects=2", "planner=random", "seed=7")
@@ -53,9 +52,3 @@ def test_merged_shards_are_the_whole_evaluation(tmp_path: Path) -> None:
 def test_a_shard_without_an_episode_is_refused() -> None:
     with pytest.raises(UserError, match="shard=6/6 has none of 5 episodes: choose a smaller n"):
         seeds_of(compose("evaluate", *SHORT, "shard=6/6"))
-
-
-@pytest.mark.parametrize("shard", ["0/3", "4/3", "3", "a/b", "1/0", "-1/3", "1/3/5"])
-def test_a_shard_is_i_of_n(shard: str) -> None:
-    with pytest.raises(UserError, match="shard must be i/n with 1 <= i <= n, such as 2/3, not"):
-        of_shard(range(9), shard)
