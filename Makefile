@@ -1,7 +1,6 @@
 # make demo   sets up .venv once, then plans and executes an episode of each task with the shipped checkpoint
 # make test   sets up what the tests need once, then runs the checks and the tests
-# make soak   runs the tests that make test leaves out, since two slow cores have 15 minutes for it; then 100,000
-#             plans, which go on after their log in runs/soak
+# make soak   runs what takes longer, for a nightly run: slow tests, and property tests with new examples
 # make docs   builds the documentation as a site, site/index.html, and checks every link in it
 # make clean  removes .venv and what tools leave behind
 #
@@ -34,7 +33,6 @@ test: $(installed_for_tests)
 soak: $(installed_for_tests)
 	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist worksteal -m soak
 	HYPOTHESIS_PROFILE=soak OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist worksteal $$(grep -rl --include='test_*.py' hypothesis tests)
-	OMP_NUM_THREADS=1 $(bin)/python benchmarks/long_runs.py --turns 100000 --log runs/soak/long_runs.jsonl
 
 lint: $(installed_for_tests)
 	$(bin)/ruff check .

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,16 +20,6 @@ from tests.real_assets import REAL_ASSETS
 settings.register_profile("cavin_pyro", deadline=None, derandomize=True)
 settings.register_profile("soak", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "cavin_pyro"))
-
-
-UNTIL = float(os.environ.get("CAVIN_PYRO_TESTS_UNTIL", "inf"))  # seconds since 1970: see .ci/run
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Begin no test after the time that continuous integration has."""
-    if time.time() > UNTIL:
-        pytest.skip("no time was left for it")
 
 
 @pytest.fixture(autouse=True)

@@ -43,12 +43,6 @@ CODE_RUNNING_CALLS = {
 MACHINE_PATH = re.compile(rb"/(?:work|tmp|root|farm|home|Users)/[A-Za-z0-9_.]")
 
 
-def test_every_test_is_run() -> None:
-    listed = {ROOT / path for path in PROJECT["tool"]["pytest"]["ini_options"]["testpaths"]}
-    for file in (ROOT / "tests").rglob("test_*.py"):
-        assert listed & {file, *file.parents}, file
-
-
 def repository_files() -> list[Path]:
     """Every file that is tracked, or would be with the next `git add --all`."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
