@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavin_pyro.data.collection import CollectionConfig
-from cavin_pyro.data.dataset import content_records, read_metadata, with_current_names
-from cavin_pyro.storage.run_directory import with_current_keys
+from cavin_pyro.data.dataset import content_records, read_metadata
 
 
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,7 +41,7 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[Any]) -> tuple[bool | None, str]:
-    entries = [with_current_keys(entry) for entry in entries if isinstance(entry, dict)]
+    entries = [entry for entry in entries if isinstance(entry, dict)]
     if not entries:
         return None, "the checkpoint does not say what it was trained on"
     wanted = metadata["configuration"]
@@ -67,7 +66,7 @@ def _verdict(metadata: Mapping[str, Any], fingerprint: str, entries: Sequence[An
 
 def _completed(configuration: Mapping[str, Any]) -> dict[str, Any]:
     """A collection's configuration, with the defaults of options that an older version did not know."""
-    known, found = asdict(CollectionConfig()), with_current_names(configuration)
+    known, found = asdict(CollectionConfig()), configuration
     ranges = {**known["ranges"], **(found.get("ranges") or {})}
     merged = {name: found.get(name, value) for name, value in known.items() if name != "assets"}
     extra = {name: value for name, value in found.items() if name not in known}

@@ -26,12 +26,10 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.declaration import check_file, check_values
 from cavin_pyro.data.sources import check_sources, has_possible_objects, source_of_shards, sources_of
 from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write_json
-from cavin_pyro.storage.run_directory import with_current_keys
 from envs.workspace import MAXIMUM_OBJECTS
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
-RENAMED = {"hold": "intent_length", "perturbed": "perturbation_rate"}  # options of a collection, by their former names
 
 COLLECT_AGAIN = "collect it again, with the same options and repair=true"
 MOST_LOST = 1000  # files; each that is missing is named when the rest is used
@@ -151,7 +149,6 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             f"dataset {folder} has format version {metadata.get('version')}, this program reads {FORMAT_VERSION}: "
             "collect it again"
         )
-    metadata = with_current_keys(metadata)
     counts = [metadata.get(name) for name in ("shards", "episodes", "transitions")]
     if not all(type(count) is int for count in counts) or not isinstance(metadata.get("configuration"), dict):
         raise UserError(f"{path} is damaged: configuration or counts are missing; collect the dataset again")
@@ -159,7 +156,6 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         raise EmptyDatasetError(
             f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
         )
-    metadata["configuration"] = with_current_names(metadata["configuration"])
     _check_forms(path, metadata)
     _check_counts(path, metadata)
     check_sources(path, metadata)
@@ -193,11 +189,6 @@ def _check_counts(path: Path, metadata: Mapping[str, Any]) -> None:
     there = sum(1 for _ in path.parent.glob("episodes-*.h5"))
     if shards > there + MOST_LOST:
         raise UserError(f"{path} counts {shards} files of episodes, but {there} are there: collect the dataset again")
-
-
-def with_current_names(configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of a collection, as an older version wrote it, with the current names."""
-    return {RENAMED.get(name, name): value for name, value in configuration.items()}
 
 
 def content_records(folder: Path) -> list[dict[str, Any]]:

@@ -23,19 +23,11 @@ from cavin_pyro.config.commands.episodes import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.digests import check_manifest, tensors_digest
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.storage.renamed import renamed
 from cavin_pyro.storage.trust import check_numbers, check_targets
 
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
-BUILT_SECTIONS = (
-    "model",
-    "geometry",
-    "dynamics",
-    "prior",
-    "scales",
-    "guide",
-)  # of the configuration, from which parts are built
+BUILT_SECTIONS = ("model", "geometry", "dynamics", "prior", "scales", "guide")  # from which parts are built
 
 
 @dataclass(frozen=True)
@@ -101,8 +93,7 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         trust: a list of further modules whose classes the checkpoint may name.
 
     Raises:
-        UserError: missing, truncated, damaged or foreign file, another version, old names, or a class of an untrusted
-            module.
+        UserError: missing, truncated, damaged or foreign file, another version, or a class of an untrusted module.
     """
     if isinstance(trust, str):  # a sequence too, of letters
         raise UserError(f'trust must be a list of modules, ["{trust}"] in Python, not "{trust}"')
@@ -116,11 +107,6 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
         raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
     if not isinstance(provenance, dict):
         raise UserError(f"checkpoint {path} has a damaged header (its provenance has no entries)")
-    if old := renamed(config):
-        raise UserError(
-            f"checkpoint {path} has old names: {', '.join(old)}: "
-            f"rewrite it with python -m cavin_pyro.storage.renamed {path}"
-        )
     built = {section: config[section] for section in BUILT_SECTIONS if section in config}
     check_targets(built, path, trust)
     check_numbers(built, path, max((size for value in tensors.values() for size in value.shape), default=0))

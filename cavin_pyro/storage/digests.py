@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.files import atomic_write, file_digest
+from cavin_pyro.storage.files import file_digest
 
-MANIFEST = "sha256sums.txt"  # in the folder of the shipped checkpoints, as `sha256sum --check` reads it
+MANIFEST = "sha256sums.txt"  # of the shipped checkpoints: `sha256sum *.safetensors */*.safetensors` in their folder
 
 
 def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
@@ -27,18 +27,8 @@ def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
 def read_manifest(folder: Path) -> dict[str, str]:
     """The digests in a folder's manifest, by the files' paths in it; none without a manifest."""
     path = folder / MANIFEST
-    if not path.is_file():
-        return {}
-    lines = [line.split(maxsplit=1) for line in path.read_text(encoding="utf-8").splitlines()]
-    return {line[1].strip(): line[0] for line in lines if len(line) == 2}
-
-
-def update_manifest(folder: Path) -> None:
-    """Write the manifest of all checkpoints in a folder and in the folders below it."""
-    files = sorted(folder.rglob("*.safetensors"))
-    lines = [f"{file_digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files]
-    with atomic_write(folder / MANIFEST) as temporary:
-        temporary.write_text("".join(lines), encoding="utf-8")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return {name.strip(): digest for digest, _, name in (line.partition(" ") for line in lines)}
 
 
 def check_manifest(path: Path, folder: Path) -> None:
@@ -49,8 +39,7 @@ def check_manifest(path: Path, folder: Path) -> None:
     """
     if not path.resolve().is_relative_to(folder.resolve()):
         return
-    name = path.resolve().relative_to(folder.resolve()).as_posix()
-    wanted = read_manifest(folder).get(name)
+    wanted = read_manifest(folder).get(path.resolve().relative_to(folder.resolve()).as_posix())
     if wanted is not None and wanted != (found := file_digest(path)):
         raise UserError(
             f"checkpoint {path} is not the one that was shipped: its SHA-256 begins with {found[:12]}, that of "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,6 @@ from omegaconf.errors import OmegaConfBaseException
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import flat_options
 from cavin_pyro.storage.files import CONFIG_NAME, atomic_write, holds_no_result, read_json, write_json
-from envs.tasks import TASKS, GeneratedLayouts
-
-# It only decides `checkpoint`, which is compared; older versions did not know it.
-NEVER_COMPARED = ("planner.default_checkpoint",)
-RENAMED_KEYS = {"mark": "fingerprint", "settings": "configuration"}  # of the record of a dataset
 
 
 def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
@@ -48,7 +42,7 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
     now = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
-        if name not in (*ignore, *NEVER_COMPARED) and now.get(name) != earlier.get(name):
+        if name not in ignore and now.get(name) != earlier.get(name):
             raise UserError(
                 f"{folder} holds a run with {name}={earlier.get(name)}, not {now.get(name)}: "
                 "resume with the same options, or choose another output=DIR"
@@ -56,30 +50,8 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
 
 
 def stored_options(path: Path) -> dict[str, Any]:
-    """The options in a `config.yaml` by their dotted names, with what older versions left out."""
-    options = flat_options(OmegaConf.to_container(OmegaConf.load(path)))
-    if isinstance(name := options.get("task"), str) and name in TASKS:
-        task = TASKS[options.pop("task")]
-        options["task._target_"] = f"{task.__module__}.{task.__qualname__}"
-    if "reward" in options:
-        options.setdefault("criterion", "strict")  # older versions knew no other
-        options.setdefault("device", "cpu")
-        options.setdefault("push_decimals", None)  # older versions did not round
-        for name, default in asdict(GeneratedLayouts()).items():
-            options.setdefault(f"generated.{name}", default)
-    if "planner.horizon" in options:
-        options.setdefault("planner.guidance", "none")
-    if "planner.motion_horizon" in options:
-        options.setdefault("planner.tracking_at", "end")
-        if not options.get("planner.running_cost_share"):
-            options.pop("planner.running_cost_share", None)
-    if "scale" in options:
-        options.setdefault("device", "cpu")
-    if "trainer.schedule" in options:
-        options.setdefault("trainer.reflect", False)
-        options.setdefault("trainer.optimizer", "adam")
-        options.setdefault("trained", [])
-    return options
+    """The options in a `config.yaml` by their dotted names."""
+    return flat_options(OmegaConf.to_container(OmegaConf.load(path)))
 
 
 def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
@@ -95,23 +67,11 @@ def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
     now = [{name: dataset[name] for name in ("transitions", "fingerprint")} for dataset in data]
     if not path.exists():
         write_json(path, now)
-    elif (earlier := _with_current_keys(read_json(path))) != now:
+    elif (earlier := read_json(path)) != now:
         raise UserError(
             f"{folder} holds a run with other data, {_of_transitions(earlier)} instead of {_of_transitions(now)}: "
             "resume with the same data=DIR, or choose another output=DIR"
         )
-
-
-def with_current_keys(dataset: Mapping[str, Any]) -> dict[str, Any]:
-    """The record of a dataset, as older datasets, runs and checkpoints have it, with the current keys."""
-    return {RENAMED_KEYS.get(name, name): value for name, value in dataset.items()}
-
-
-def _with_current_keys(data: Any) -> Any:
-    """`data.json` with the current keys; anything else is returned as it is."""
-    if not isinstance(data, list) or not all(isinstance(dataset, dict) for dataset in data):
-        return data
-    return [with_current_keys(dataset) for dataset in data]
 
 
 def _of_transitions(data: Any) -> str:

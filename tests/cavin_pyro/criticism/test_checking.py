@@ -116,8 +116,6 @@ def test_a_report_says_whether_the_model_was_trained_on_the_data(own_pushes: Pat
         True,
         "the model was trained on these, of which it saw 9",
     )
-    older = {"transitions": entry["transitions"], "settings": entry["configuration"], "mark": fingerprint}
-    assert verdict(older)[0] is True  # as older checkpoints name them
     assert verdict(other)[0] is False
     assert verdict({**entry, "fingerprint": "0" * 12})[0] is False
     assert verdict(entry)[0] is None

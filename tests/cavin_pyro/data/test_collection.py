@@ -113,11 +113,8 @@ def test_a_dataset_of_an_older_version_resumes(small: SimpleNamespace, own_pushe
     before = data_of(own_pushes)
     metadata = json.loads((own_pushes / "metadata.json").read_text())
     del metadata["configuration"]["object_set"]
-    for former, name in (("hold", "intent_length"), ("perturbed", "perturbation_rate")):
-        metadata["configuration"][former] = metadata["configuration"].pop(name)
     for name in ("kilograms", "target", "drop_height"):
         del metadata["configuration"]["ranges"][name]
-    metadata["settings"] = metadata.pop("configuration")
     (own_pushes / "metadata.json").write_text(json.dumps(metadata))
     held = metadata["transitions"]
     assert collect(small.pushes, own_pushes, transitions=held, workers=1)["transitions"] == held

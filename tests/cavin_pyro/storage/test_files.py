@@ -2,38 +2,29 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.files import atomic_write, output_folder, read_json, write_json
 
 
-@given(
-    old=st.none() | st.binary(max_size=50),
-    new=st.binary(max_size=50),
-    fails_after=st.none() | st.integers(0, 49),
-)
+@pytest.mark.parametrize("old", [None, b"old"])
+@pytest.mark.parametrize("fails", [False, True])
 def test_a_file_is_the_new_one_or_the_old_one_and_nothing_else_remains(
-    tmp_path_factory: pytest.TempPathFactory, old: bytes | None, new: bytes, fails_after: int | None
+    old: bytes | None, fails: bool, tmp_path: Path
 ) -> None:
-    path = tmp_path_factory.mktemp("files") / "results.csv"
+    path = tmp_path / "results.csv"
     if old is not None:
         path.write_bytes(old)
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(new[:fails_after])
-            assert temporary.suffix == path.suffix  # writers choose formats by it
-            if fails_after is not None:
-                raise ZeroDivisionError
-    except ZeroDivisionError:
-        expected = old
-    else:
-        expected = new
-    assert (path.read_bytes() if path.exists() else None) == expected
+    with suppress(ZeroDivisionError), atomic_write(path) as temporary:
+        assert temporary.suffix == path.suffix  # writers choose formats by it
+        temporary.write_bytes(b"new")
+        if fails:
+            raise ZeroDivisionError
+    assert (path.read_bytes() if path.exists() else None) == (old if fails else b"new")
     assert set(path.parent.iterdir()) <= {path}
 
 
@@ -48,19 +39,14 @@ def test_a_full_disk_says_which_file_it_refused(tmp_path: Path, monkeypatch: pyt
     assert not list(tmp_path.iterdir())
 
 
-def test_json_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_json_is_read_as_it_was_written_or_named(tmp_path: Path) -> None:
     content = {"text": "größer", "numbers": [1, 2.5, None], "nested": {"true": True}}
     write_json(tmp_path / "a.json", content)
     assert read_json(tmp_path / "a.json") == content
-
-
-@pytest.mark.parametrize("content", [None, b"{", b"\xff\xfe\x00", b""])
-def test_json_that_cannot_be_read_is_named(content: bytes | None, tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(UserError, match=r"a\.json"):
-        read_json(path)
+    (tmp_path / "damaged.json").write_bytes(b"\xff\xfe\x00")
+    for name in ("damaged.json", "absent.json"):
+        with pytest.raises(UserError, match=name):
+            read_json(tmp_path / name)
 
 
 def test_an_output_folder_is_made_and_cleared_of_what_a_kill_left(tmp_path: Path) -> None:
@@ -77,13 +63,7 @@ def test_an_output_folder_is_made_and_cleared_of_what_a_kill_left(tmp_path: Path
 
 
 def test_partial_files_of_others_stay(tmp_path: Path) -> None:
-    names = (
-        ".video.mp4.partial",
-        ".film.0123abcd.partial.mkv",
-        ".notes.cavin-old.partial",
-        "a.partial",
-        ".b.partial.c",
-    )
+    names = (".film.0123abcd.partial.mkv", ".notes.cavin-old.partial", "a.partial")
     for name in names:
         (tmp_path / name).write_text("a user's")
     (tmp_path / ".sawyer.cavin-0123abcd.partial").mkdir()

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import socket
@@ -8,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import filelock
 import pytest
 
 from cavin_pyro.config.errors import UserError
@@ -49,18 +47,3 @@ def test_the_lock_can_be_taken_again_within_and_leaves_no_file(tmp_path: Path) -
             pass
         assert (tmp_path / LOCK_NAME).exists()
     assert not (tmp_path / LOCK_NAME).exists()
-
-
-def test_a_file_system_without_locks_is_told_and_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*arguments: object) -> None:
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr(filelock.FileLock, "acquire", refuse)
-    with folder_lock(tmp_path):
-        pass
-    assert (
-        capsys.readouterr().err
-        == f"note: the file system of {tmp_path} has no locks: let no other command write there\n"
-    )
