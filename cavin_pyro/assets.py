@@ -14,8 +14,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    from cavin_pyro.fetching.download import site
-    from cavin_pyro.fetching.folder import install
+    from cavin_pyro.fetching.install import install
     from cavin_pyro.fetching.sawyer import SawyerRobot
     from cavin_pyro.fetching.ycb import YcbObjects
 
@@ -27,8 +26,7 @@ def _run() -> None:
     )
     parser.add_argument("--source", metavar="URL", help="a mirror of the publisher's site, with the same paths")
     arguments = parser.parse_args()
-    kind = kinds[arguments.kind]
-    print(install(kind, arguments.to, site(arguments.source or kind.site)))
+    print(install(kinds[arguments.kind], arguments.to, arguments.source))
 
 
 if __name__ == "__main__":

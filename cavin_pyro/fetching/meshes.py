@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
+import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from trimesh.exchange.obj import export_obj
 
 from cavin_pyro.config.errors import UserError
 
@@ -20,63 +19,40 @@ CONCAVITY = 0.05  # CoACD's threshold: how far, relative to the object, a part m
 LEAK = 0.01  # share of its surface by which a mesh may fail to close and still have a volume
 
 
-class MissingExtraError(UserError):
-    """A package that only this command needs is not installed."""
-
-    def __init__(self, what: str) -> None:
-        super().__init__(f"{what} needs packages of its own: pip install 'cavin-pyro[assets]', then run again")
-
-
-@dataclass(frozen=True)
-class Solid:
-    """Volume (cubic metres), centre [3] (metres) and inertia [3, 3] (square metres: per kilogram) of a body."""
-
-    volume: float
-    center: NDArray[np.float64]
-    inertia: NDArray[np.float64]
-
-
 def decimated(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """The mesh with at most so many faces."""
-    if len(mesh.faces) <= faces:
-        return mesh
-    if importlib.util.find_spec("fast_simplification") is None:
-        raise MissingExtraError("decimating a mesh")
-    return mesh.simplify_quadric_decimation(face_count=faces)
+    return mesh if len(mesh.faces) <= faces else mesh.simplify_quadric_decimation(face_count=faces)
 
 
 def convex_parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Convex parts that together have the shape of the mesh: its hull, or what CoACD finds (Wei et al. 2022)."""
-    if measured(mesh).volume >= CONVEX * mesh.convex_hull.volume:
+    if closed(mesh).volume >= CONVEX * mesh.convex_hull.volume:
         return [_simple_hull(mesh.convex_hull)]
-    if importlib.util.find_spec("coacd") is None:
-        raise MissingExtraError("taking a hollow object apart")
     import coacd
 
     coacd.set_log_level("error")
-    parts = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces), threshold=CONCAVITY, max_convex_hull=LARGEST_PARTS, seed=0
-    )
+    whole = coacd.Mesh(mesh.vertices, mesh.faces)
+    parts = coacd.run_coacd(whole, threshold=CONCAVITY, max_convex_hull=LARGEST_PARTS, seed=0)
     return [_simple_hull(trimesh.Trimesh(vertices, faces).convex_hull) for vertices, faces in parts]
 
 
-def measured(mesh: trimesh.Trimesh) -> Solid:
-    """Volume, centre of mass and inertia about it, of uniform density; scans have small holes, which count as closed.
+def closed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A copy without the small holes of a scan, which has a volume, a centre of mass and an inertia.
 
     Raises:
         UserError: the surface is so open that it bounds no volume.
     """
-    closed = mesh.copy()
-    closed.merge_vertices()
-    closed.fill_holes()
-    trimesh.repair.fix_normals(closed)
+    whole = mesh.copy()
+    whole.merge_vertices()
+    whole.fill_holes()
+    trimesh.repair.fix_normals(whole)
     # Area vectors of a closed surface sum to zero.
-    leak = np.linalg.norm((closed.face_normals * closed.area_faces[:, None]).sum(axis=0)) / closed.area
-    if not leak < LEAK or not closed.volume > 0:
+    leak = np.linalg.norm((whole.face_normals * whole.area_faces[:, None]).sum(axis=0)) / whole.area
+    if not leak < LEAK or not whole.volume > 0:
         raise UserError(
             f"a mesh of {len(mesh.faces)} faces is not closed: {100 * leak:.1f} % of its surface is missing"
         )
-    return Solid(float(closed.volume), closed.center_mass, closed.moment_inertia / closed.volume)
+    return whole
 
 
 def long_side_along_x(mesh: trimesh.Trimesh) -> None:
@@ -88,39 +64,39 @@ def long_side_along_x(mesh: trimesh.Trimesh) -> None:
 
 def write_parts(path: Path, parts: Sequence[trimesh.Trimesh]) -> None:
     """One Wavefront file, a group per part."""
-    lines, offset = [], 1
-    for number, part in enumerate(parts):
-        lines.append(f"o part_{number}")
-        lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in part.vertices]
-        lines += [f"f {a} {b} {c}" for a, b, c in part.faces + offset]
-        offset += len(part.vertices)
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    plain = {"include_normals": False, "include_color": False, "include_texture": False, "header": None}
+    path.write_text(export_obj(trimesh.Scene(parts), digits=6, **plain), encoding="utf-8")
 
 
 def read_parts(path: Path) -> list[trimesh.Trimesh]:
-    """The parts of a file as `write_parts` writes it.
+    """The parts of a Wavefront file, a group each.
 
     Raises:
         UserError: the file is missing or damaged.
     """
     try:
-        groups: list[tuple[list[list[float]], list[list[int]]]] = []
-        for word, *rest in (line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()):
-            if word == "o":
-                groups.append(([], []))
-            elif word == "v":
-                groups[-1][0].append([float(value) for value in rest[:3]])
-            elif word == "f":
-                groups[-1][1].append([int(corner.partition("/")[0]) for corner in rest])
-        parts, offset = [], 1
-        for vertices, faces in groups:
-            parts.append(trimesh.Trimesh(vertices, np.array(faces) - offset))
-            offset += len(vertices)
-    except (OSError, ValueError, IndexError) as error:
+        scene = trimesh.load_scene(path, split_objects=True, group_material=False, skip_materials=True)
+        parts = [part for part in scene.geometry.values() if len(part.faces)]
+    except Exception as error:  # whatever a reader makes of bytes that are no mesh
         raise UserError(f"{path} is missing or damaged") from error
-    if not parts or not all(len(part.faces) for part in parts):
+    if not parts:
         raise UserError(f"{path} is damaged: it holds no mesh")
     return parts
+
+
+def read_mesh(content: bytes, kind: str, name: str) -> trimesh.Trimesh:
+    """A mesh from a file of another kind, without colours and normals: corners at one place become one vertex.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        mesh = trimesh.load_scene(io.BytesIO(content), file_type=kind).to_mesh()
+        return trimesh.Trimesh(mesh.vertices, mesh.faces)
+    except ImportError:
+        raise
+    except Exception as error:  # whatever a reader makes of bytes that are no mesh
+        raise UserError(f"{name} holds no mesh that can be read ({type(error).__name__})") from error
 
 
 def _simple_hull(hull: trimesh.Trimesh) -> trimesh.Trimesh:

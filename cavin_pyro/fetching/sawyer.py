@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-import trimesh
-
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.fetching.archive import Archive
-from cavin_pyro.fetching.meshes import MissingExtraError, decimated
+from cavin_pyro.fetching.install import Files, take
+from cavin_pyro.fetching.meshes import decimated, read_mesh
 from envs.robots import STICK_LENGTH, STICK_RADIUS
 
 COMMIT = "bd387981a6fbc0c63dbeabd17a3765d5527bfe94"  # release 5.3.0, the last one
@@ -42,22 +39,22 @@ STICK = f"""<stick>
 
 
 class SawyerRobot:
-    """A `cavin_pyro.fetching.folder.Kind`: one piece, the arm with and without the stick."""
+    """A `cavin_pyro.fetching.install.Kind`: one piece, the arm with and without the stick."""
 
     name = "sawyer"
     site = "https://github.com"
     pieces = {"arm": f"RethinkRobotics/sawyer_robot/archive/{COMMIT}.tar.gz"}
     wanted: tuple[str, ...] = (URDF, ".DAE", ".dae", ".STL", ".stl", "LICENSE")
 
-    def make(self, piece: str, archive: Archive, folder: Path) -> None:
+    def make(self, piece: str, files: Files, folder: Path) -> None:
         """See `Kind`."""
         try:
-            robot = ElementTree.fromstring(archive.read(URDF))
+            robot = ElementTree.fromstring(take(files, URDF))
         except ElementTree.ParseError as error:
-            raise UserError(f"{archive.path.name}: {URDF} cannot be read ({error})") from error
+            raise UserError(f"{URDF} cannot be read ({error})") from error
         (folder / "meshes").mkdir(exist_ok=True)
         for mesh in robot.iter("mesh"):
-            mesh.set("filename", _write_mesh(mesh.get("filename", ""), archive, folder))
+            mesh.set("filename", _write_mesh(mesh.get("filename", ""), files, folder))
         for box in robot.iter("box"):
             if set(box.get("size", "").split()) == {"0"}:
                 box.set("size", " ".join([SMALLEST] * 3))
@@ -71,8 +68,7 @@ class SawyerRobot:
         _write(robot, folder / "sawyer.urdf")
         robot.extend(ElementTree.fromstring(STICK))
         _write(robot, folder / "sawyer_stick.urdf")
-        if "LICENSE" in archive.names:
-            (folder / "LICENSE").write_bytes(archive.read("LICENSE"))
+        (folder / "LICENSE").write_bytes(take(files, "LICENSE"))
 
     def verify(self, folder: Path) -> str:
         """See `Kind`."""
@@ -87,34 +83,18 @@ class SawyerRobot:
             raise UserError(
                 f"{path} is not the arm that was meant: a joint right_j0 to right_j6 or the stick is missing"
             )
-        files = {mesh.get("filename", "") for mesh in robot.iter("mesh")}
-        for file in sorted(files):
-            try:
-                extents = trimesh.load_mesh(folder / file, file_type="stl").extents
-            except (OSError, ValueError) as error:
-                raise UserError(f"{folder / file} is missing or damaged") from error
-            if not 0.01 < max(extents) < 2.0:
-                raise UserError(f"{folder / file} is {max(extents):g} m long: no link of the arm is")
-        return f"an arm of 7 joints with a stick, {len(files)} meshes"
+        meshes = {mesh.get("filename", "") for mesh in robot.iter("mesh")}
+        if missing := sorted(mesh for mesh in meshes if not (folder / mesh).is_file()):
+            raise UserError(f"{folder / missing[0]} is missing")
+        return f"an arm of 7 joints with a stick, {len(meshes)} meshes"
 
 
-def _write_mesh(address: str, archive: Archive, folder: Path) -> str:
+def _write_mesh(address: str, files: Files, folder: Path) -> str:
     """Decimate one of the archive's meshes into the folder; returns its path there."""
     source = address.removeprefix(PACKAGE)
     if not re.fullmatch(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*\.(DAE|dae|STL|stl)", source):
         raise UserError(f"{URDF} names a mesh where none can be: {address!r}")
-    kind = source[-3:].lower()
-    try:
-        loaded = trimesh.load_scene(io.BytesIO(archive.read(source)), file_type=kind)
-        whole = loaded.to_mesh()
-        # Without colours and normals, so that corners at one place become one vertex, which decimation needs.
-        mesh = decimated(trimesh.Trimesh(whole.vertices, whole.faces), FACES)
-    except UserError:
-        raise
-    except ImportError as error:
-        raise MissingExtraError("reading COLLADA") from error
-    except Exception as error:  # whatever a reader makes of bytes that are no mesh
-        raise UserError(f"{archive.path.name}: {source} cannot be read ({type(error).__name__})") from error
+    mesh = decimated(read_mesh(take(files, source), source[-3:].lower(), source), FACES)
     path = Path("meshes") / ("_".join(Path(source).with_suffix("").parts[-2:]) + ".stl")
     mesh.export(folder / path)
     return str(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,17 +9,17 @@ import numpy as np
 import trimesh
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.fetching.archive import Archive
+from cavin_pyro.fetching.install import Files, take
 from cavin_pyro.fetching.meshes import (
+    closed,
     convex_parts,
     decimated,
     long_side_along_x,
-    measured,
+    read_mesh,
     read_parts,
     write_parts,
 )
 from cavin_pyro.storage.files import read_json, write_json
-from envs.objects.scans import SCANS
 
 VISUAL_FACES = 2000
 # Scans are larger than what was measured by hand: an open flap, a bulging bag, a mug's handle.
@@ -50,12 +49,6 @@ PUBLISHED = {
     "rubiks_cube": Published("077_rubiks_cube", 0.094, (0.057, 0.057, 0.057)),
 }
 
-URDF = """<robot name="{name}"><link name="base">
-<inertial><origin xyz="0 0 0"/><mass value="{mass}"/>
-<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>
-<visual><geometry><mesh filename="{name}.obj"/></geometry></visual>
-<collision><geometry><mesh filename="{name}_vhacd.obj"/></geometry></collision></link></robot>
-"""
 NOTICE = """YCB Object and Model Set: B. Calli, A. Walsman, A. Singh, S. Srinivasa, P. Abbeel, A. M. Dollar, 2015.
 https://www.ycbbenchmarks.com, licence CC BY 4.0, https://creativecommons.org/licenses/by/4.0/
 Changed: ten objects of it, with fewer faces, moved to the centre of mass, turned, and taken apart into convex parts.
@@ -63,44 +56,29 @@ Changed: ten objects of it, with fewer faces, moved to the centre of mass, turne
 
 
 class YcbObjects:
-    """A `cavin_pyro.fetching.folder.Kind`: one archive and one object a piece."""
+    """A `cavin_pyro.fetching.install.Kind`: one archive and one object a piece."""
 
-    name = SCANS
+    name = "ycb"
     site = "https://ycb-benchmarks.s3.amazonaws.com"
     pieces = {name: f"data/google/{one.number}_google_16k.tgz" for name, one in PUBLISHED.items()}
     wanted: tuple[str, ...] = ("google_16k/nontextured.ply",)
 
-    def make(self, piece: str, archive: Archive, folder: Path) -> None:
+    def make(self, piece: str, files: Files, folder: Path) -> None:
         """See `Kind`."""
-        content = archive.read(self.wanted[0])
-        try:
-            loaded = trimesh.load_mesh(io.BytesIO(content), file_type="ply")
-            scan = trimesh.Trimesh(loaded.vertices, loaded.faces)
-        except Exception as error:  # whatever a reader makes of bytes that are no mesh
-            raise UserError(f"{archive.path.name} holds no mesh that can be read ({type(error).__name__})") from error
-        mass = PUBLISHED[piece].mass
+        scan = read_mesh(take(files, self.wanted[0]), "ply", piece)
         long_side_along_x(scan)
         _check_size(piece, scan)
-        scan.apply_translation(-measured(scan).center)
+        body, mass = closed(scan), PUBLISHED[piece].mass
+        body.density = mass / body.volume
+        scan.apply_translation(-body.center_mass)
         mesh = decimated(scan, VISUAL_FACES)
         parts = convex_parts(mesh)
-        inertia = np.diag(measured(scan).inertia) * mass
+        _check_parts(piece, mesh, parts)
         write_parts(folder / f"{piece}.obj", [mesh])
         write_parts(folder / f"{piece}_vhacd.obj", parts)
-        write_parts(folder / f"{piece}_hull.obj", [mesh.convex_hull])
-        x, y, z = (float(f"{value:.5g}") for value in inertia)
-        (folder / f"{piece}.urdf").write_text(URDF.format(name=piece, mass=mass, x=x, y=y, z=z), encoding="utf-8")
+        x, y, z = (float(f"{value:.5g}") for value in np.diag(body.moment_inertia))
         manifest = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
-        manifest[piece] = {
-            "mass": mass,
-            "inertia_diag": [x, y, z],
-            "dims_mm": [round(1e3 * float(side), 1) for side in mesh.extents],
-            "faces": len(mesh.faces),
-            "nparts": len(parts),
-            "vol_ml": round(1e6 * measured(scan).volume, 1),
-            "parts_vol_ml": round(1e6 * sum(part.volume for part in parts), 1),
-        }
-        _check_parts(piece, mesh, parts)
+        manifest[piece] = {"mass": mass, "inertia_diag": [x, y, z]}
         write_json(folder / "meta.json", manifest)
         (folder / "LICENSE.txt").write_text(NOTICE, encoding="utf-8")
 
@@ -108,32 +86,21 @@ class YcbObjects:
         """See `Kind`; looks at the files that the simulator will read."""
         manifest = read_json(folder / "meta.json")
         for name, one in PUBLISHED.items():
-            values = manifest.get(name) if isinstance(manifest, dict) else None
-            if not isinstance(values, dict):
+            if not isinstance(manifest, dict) or name not in manifest:
                 raise UserError(f"{folder} lacks {name}")
-            mesh, parts = read_parts(folder / f"{name}.obj")[0], read_parts(folder / f"{name}_vhacd.obj")
+            (mesh,), parts = read_parts(folder / f"{name}.obj"), read_parts(folder / f"{name}_vhacd.obj")
             _check_size(name, mesh)
             _check_parts(name, mesh, parts)
-            if values.get("mass") != one.mass:
-                raise UserError(f"{name} weighs {values.get('mass')} kg, not {one.mass} as published")
-            inertia = values.get("inertia_diag")
-            if not isinstance(inertia, list) or not _of_a_body(inertia):
-                raise UserError(f"{name}: no body has the inertia {inertia}")
+            if manifest[name].get("mass") != one.mass:
+                raise UserError(f"{name} weighs {manifest[name].get('mass')} kg, not {one.mass} as published")
         return f"{len(PUBLISHED)} objects, as published in size and mass"
-
-
-def _of_a_body(inertia: list[float]) -> bool:
-    """No principal moment exceeds the sum of the other two."""
-    return len(inertia) == 3 and min(inertia) > 0 and 2 * max(inertia) <= sum(inertia) * (1 + 1e-6)
 
 
 def _check_size(name: str, mesh: trimesh.Trimesh) -> None:
     sides, published = mesh.extents, PUBLISHED[name].size
     missing = [side for side in published if not np.abs(sides - side).min() <= TOLERANCE]
     if missing or sides.max() > max(published) + OVERHANG:
-        found, wanted = (
-            " x ".join(f"{1e3 * side:.0f}" for side in size) for size in (sorted(sides), sorted(published))
-        )
+        found, wanted = (" x ".join(f"{1e3 * side:.0f}" for side in sorted(size)) for size in (sides, published))
         raise UserError(
             f"{name} measures {found} mm, not about {wanted} mm as published: not the object that was meant"
         )
@@ -143,7 +110,5 @@ def _check_parts(name: str, mesh: trimesh.Trimesh, parts: list[trimesh.Trimesh])
     if not all(part.is_watertight and part.volume > 0 for part in parts):
         raise UserError(f"{name}: a convex part is not closed")
     apart = np.abs(trimesh.util.concatenate(parts).bounds - mesh.bounds).max()
-    if apart > 0.005:
-        raise UserError(f"{name}: its convex parts end {1e3 * apart:.1f} mm from where its surface ends")
-    if sum(part.volume for part in parts) < 0.9 * measured(mesh).volume:
-        raise UserError(f"{name}: its convex parts leave out a part of its volume")
+    if apart > 0.005 or sum(part.volume for part in parts) < 0.9 * closed(mesh).volume:
+        raise UserError(f"{name}: its convex parts have not the shape of its surface")
