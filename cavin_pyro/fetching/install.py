@@ -100,7 +100,6 @@ def install(kind: Kind, to: Path, source: str | None = None) -> str:
 def _download(url: str, folder: Path, digest: str | None, lock: Path) -> Path:
     """The path of a file in the folder, downloaded unless it is there; `digest`: its SHA-256 as in `lock`, if known."""
     import pooch
-    import requests
 
     name = url.rpartition("/")[2]
     pooch.get_logger().setLevel("WARNING")
@@ -113,8 +112,10 @@ def _download(url: str, folder: Path, digest: str | None, lock: Path) -> Path:
             f"{name} has the wrong checksum, not the one in {lock}: run again, or delete that file if the publisher "
             "has changed it"
         ) from error
-    except requests.RequestException as error:
-        answer = getattr(error.response, "status_code", None)
+    except OSError as error:
+        if error.errno is not None:  # of the disk, not of the network
+            raise
+        answer = getattr(getattr(error, "response", None), "status_code", None)
         what = f"answers {answer}" if answer else f"cannot be reached ({type(error).__name__})"
         raise UserError(f"{url} {what}: run again, or name a mirror with --source URL") from error
 
