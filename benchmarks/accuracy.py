@@ -49,7 +49,7 @@ from cavin_pyro.data.features import cloud_features
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.progress import progress_bar
-from envs.objects.asset import plain_name
+from envs.objects.object_sets import plain_name
 from envs.observation import Observation
 from envs.physics import Poses
 from envs.randomness import collection_streams

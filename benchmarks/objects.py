@@ -45,7 +45,7 @@ class Watch:
 
 def creep(scene: Scene) -> np.ndarray:
     """How far each object drifts within a second if it is not put to sleep, in metres."""
-    bullet, before = scene.world._bullet, scene.ground_truth().positions
+    bullet, before = scene.world.client, scene.ground_truth().positions
     for body in scene.bodies:
         bullet.changeDynamics(body, -1, activationState=1)
     for _ in range(AWAKE):
@@ -66,7 +66,7 @@ def main() -> None:
         observation = scene.sample([WHOLE_TABLE] * (count or 1 + episode % 5), config.ranges, drawing)
         found["reset, ms"].append(1e3 * (time.process_time() - began))
         for body in scene.bodies:
-            depths = [-contact[8] for contact in scene.world._bullet.getContactPoints(body, 0)]
+            depths = [-contact[8] for contact in scene.world.client.getContactPoints(body, 0)]
             found["depth in the table at rest, mm"].append(1e3 * max(depths, default=0.0))
         if episode % 20 == 0:
             found["creep in a second, mm"].extend(1e3 * creep(scene))
