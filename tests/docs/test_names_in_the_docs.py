@@ -96,24 +96,3 @@ def test_links_of_the_page_lead_somewhere(page: Path) -> None:
     generated = {ROOT / "docs" / "reference" / name for name in ("api/index.md", "commands.md")}
     found = {target: (page.parent / target).resolve() for target in targets}
     assert not [target for target, path in sorted(found.items()) if not path.exists() and path not in generated]
-
-
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
-
-
-def flat(config: DictConfig, prefix: str = "") -> dict[str, object]:
-    """The values of all options, by their dotted names."""
-    found: dict[str, object] = {}
-    for key, value in config.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, DictConfig) else {f"{prefix}{key}": value}
-    return found
-
-
-def test_the_table_of_presets_lists_every_option_in_which_they_differ() -> None:
-    ours, paper = flat(compose("plan")), flat(compose("plan", "planner=paper"))
-    differ = {name for name in ours | paper if ours.get(name) != paper.get(name)}
-    differ = {"planner.robustness" if name.startswith("planner.robustness") else name for name in differ}
-    differ -= {"output", "planner.default_checkpoint"}
-    page = (ROOT / "docs" / "how-to" / "plan-faster-or-farther.md").read_text(encoding="utf-8")
-    assert differ == set(re.findall(r"^\| `([a-z_.]+)=` \| .* \| .* \|$", page, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""Our own pairs pass; what does not is in tests/how_to/test_your_own_guide.py, beside the page that tells of it."""
+"""Our own pairs of model and guide pass."""
 
 from __future__ import annotations
 

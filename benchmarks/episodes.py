@@ -1,0 +1,191 @@
+"""Run the episodes behind the tables: `python benchmarks/episodes.py TABLE --seed FIRST --episodes N`.
+
+A table is a named list of rows, a row a task with options of `evaluate`. Every row meets the scenes FIRST to
+FIRST + N - 1. Episodes are added to docs/results/TABLE.parquet as they end; a stopped run resumes, and episodes that
+are there are not run again. `--rows NAME ...` restricts the rows. An episode by the published rules gives a second
+record, of how it ends by the strict ones. `python benchmarks/tables.py` then writes the tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import subprocess
+from collections.abc import Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow
+import torch
+from pyarrow import parquet
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.evaluation.evaluation import episode_row
+from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
+from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.progress import progress_bar
+
+RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+SCHEMA = pyarrow.schema(
+    [
+        *((name, pyarrow.string()) for name in ("row", "task")),
+        ("objects", pyarrow.int8()),
+        ("layout", pyarrow.string()),
+        ("tiles", pyarrow.int8()),  # of a generated layout
+        *((name, pyarrow.string()) for name in ("planner", "checkpoint", "segmentation", "rules")),
+        ("seed", pyarrow.int64()),
+        ("outcome", pyarrow.string()),
+        ("steps", pyarrow.int16()),
+        ("unsafe", pyarrow.int16()),
+        ("ineffective", pyarrow.int16()),
+        ("planning_ms", pyarrow.list_(pyarrow.float32())),
+        ("commit", pyarrow.string()),
+    ]
+)
+WRITE_EVERY = 20  # episodes
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table: a task with its number of objects and further options of `evaluate`."""
+
+    name: str
+    task: str
+    objects: int = 3
+    options: tuple[str, ...] = ()
+
+
+PAPER = ("planner=paper", "planner.motion_horizon=full_horizon", "checkpoint=cavin")
+PAPERS_WORLD = ("env.robot=sawyer", "env.objects=ycb", "env.camera=kinect2", "env.segmentation=clusters")
+TASKS = ("clearing", "insertion", "crossing")
+
+
+def of_each_task(name: str, *options: str, objects: int = 3) -> list[Row]:
+    return [Row(name, task, objects, options) for task in TASKS]
+
+
+SUCCESS = [
+    *of_each_task("ours, 3 objects"),
+    *of_each_task("ours, 5 objects", objects=5),
+    Row("ours, 10 objects", "crossing", 10, ("planner.horizon=60",)),
+    *of_each_task("ours, the paper's networks", "checkpoint=cavin"),
+    *of_each_task("ours, in the paper's world", *PAPERS_WORLD),
+    *of_each_task("Algorithm 1, 3 objects", *PAPER, "env.segmentation=clusters", "criterion=published"),
+    *of_each_task("Algorithm 1, 5 objects", *PAPER, objects=5),
+    *of_each_task("random pushes", "planner=random"),
+]
+
+
+def generated(task: str, tiles: int) -> Row:
+    options = ("layout=generated", f"generated.tiles={tiles}", "planner.guidance=layout", "maximum_steps=120")
+    return Row(f"generated, {tiles} tiles", task, 3, options)
+
+
+FARTHER = [
+    Row("8 objects", "crossing", 8, ("planner.horizon=60",)),
+    *(generated("crossing", tiles) for tiles in (6, 9, 12)),
+    *(generated("insertion", tiles) for tiles in (5, 7)),
+    *(generated("clearing", tiles) for tiles in (6, 9, 14)),
+    Row("3 objects", "rearrange", 3, ("planner.horizon=3", "reward=dense")),
+    Row("3 objects", "gathering"),
+]
+LEFT_OUT = {  # an addition, and the options without it
+    "all": (),
+    "one push per plan": ("pushes_per_plan=null",),
+    "warm start": ("planner.warm_start=false",),
+    "idle pushes last": ("planner.idle_distance=0",),
+    "perturbed rollouts": ("planner.robustness=null",),
+    "failure avoidance": ("planner.avoid_failures=false",),
+    "margin": ("margin=0",),
+    "touchdown": ("planner.touchdown_distance=0",),
+    "plans about the target": ("planner.nearest_objects=null",),
+    "first push": ("planner.tracking_at=end",),
+    "another effect": ("planner.effect_retries=0",),
+}
+ADDITIONS = [
+    Row(name, task, objects, options)
+    for name, options in LEFT_OUT.items()
+    for task, objects in (("clearing", 5), ("insertion", 3), ("crossing", 5))
+]
+TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS}
+_runner: tuple[Row, EpisodeRunner] | None = None  # one per process
+
+
+def play(row: Row, seed: int) -> list[Record]:
+    """One episode of a row: a record, or with the published rules two."""
+    global _runner
+    torch.set_num_threads(1)
+    config = compose("evaluate", f"task={row.task}", f"objects={row.objects}", "reward=sparse", *row.options)
+    if _runner is None or _runner[0] != row:
+        if _runner is not None:
+            _runner[1].env.close()
+        _runner = row, make_runner(config)
+    found = episode_row(_runner[1].rollout(seed))
+    generated_layout = config.layout == "generated"
+    shared = {
+        **{"row": row.name, "task": row.task, "objects": row.objects, "seed": seed},
+        **{"layout": str(config.layout), "tiles": config.generated.tiles if generated_layout else None},
+        "planner": _option(row, "planner", "cavin"),
+        "checkpoint": config.checkpoint or config.planner.default_checkpoint,
+        "segmentation": _option(row, "env.segmentation", "mask"),
+        **{name: found[name] for name in ("unsafe", "ineffective", "planning_ms")},
+    }
+    records = [{**shared, "rules": config.criterion, "outcome": found["outcome"], "steps": found["steps"]}]
+    if config.criterion != "strict":
+        records.append({**shared, "rules": "strict", **{key: found[f"strict_{key}"] for key in ("outcome", "steps")}})
+    return records
+
+
+def _option(row: Row, name: str, default: str) -> str:
+    return dict(option.split("=", 1) for option in row.options).get(name, default)
+
+
+def missing(rows: Sequence[Row], seeds: Sequence[int], known: Sequence[Record]) -> list[tuple[Row, int]]:
+    """Episodes of these rows and seeds that no record has."""
+    done = {(record["row"], record["task"], record["seed"]) for record in known}
+    return [(row, seed) for row in rows for seed in seeds if (row.name, row.task, seed) not in done]
+
+
+def played(jobs: Sequence[tuple[Row, int]], workers: int) -> Generator[list[Record], None, None]:
+    """The records of each episode, as they end; one worker plays here, several in processes of their own."""
+    if workers == 1:
+        yield from (play(*job) for job in jobs)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(play, *job) for job in jobs]):
+            yield future.result()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--seed", type=int, required=True, help="of the first scene")
+    parser.add_argument("--episodes", type=int, default=200, help="of each row (%(default)s)")
+    parser.add_argument("--rows", nargs="+", help="names of rows; all by default")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="another folder than docs/results")
+    arguments = parser.parse_args()
+    rows = [row for row in TABLES[arguments.table] if arguments.rows is None or row.name in arguments.rows]
+    path = arguments.results / f"{arguments.table}.parquet"
+    records: list[Record] = parquet.read_table(path).to_pylist() if path.exists() else []
+    jobs = missing(rows, range(arguments.seed, arguments.seed + arguments.episodes), records)
+    revision = ["git", "-C", str(RESULTS), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(revision, capture_output=True, text=True, check=True).stdout.strip()
+    with (
+        closing(played(jobs, arguments.workers)) as ended,
+        progress_bar("playing", total=len(jobs), unit="episode") as bar,
+    ):
+        for number, found in enumerate(ended, start=1):
+            records += [{**record, "commit": commit} for record in found]
+            bar.update()
+            if number % WRITE_EVERY == 0 or number == len(jobs):
+                with atomic_write(path) as temporary:
+                    parquet.write_table(pyarrow.Table.from_pylist(records, schema=SCHEMA), temporary)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,284 @@
+"""Write the tables of docs/results.md and README.md from docs/results: `python benchmarks/tables.py`.
+
+A table stands between `<!-- table: NAME -->` and `<!-- end -->`. Each follows from one file of docs/results with a row
+per episode (or per measured time, or predicted object), and says how many episodes it has, their seeds, and the commit
+that ran them. Rates have Wilson's intervals at 95 %; two planners in the same scenes are compared by the exact McNemar
+test. `--check` writes nothing and fails if a page would change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pyarrow import parquet
+
+from cavin_pyro.evaluation.statistics import mcnemar, wilson
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+MARKERS = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+TASKS = ("clearing", "insertion", "crossing")
+RULES = ("published", "strict")
+METHODS = {"cavin": "CAVIN", "contact": "CAVIN, contact", "sectar": "SeCTAR", "cvae_mpc": "CVAE-MPC", "mpc": "MPC"}
+NOTHING = "Not measured yet.\n"
+Row = dict[str, Any]
+
+
+def read(name: str) -> list[Row]:
+    """The rows of docs/results/NAME.parquet."""
+    rows: list[Row] = parquet.read_table(RESULTS / f"{name}.parquet").to_pylist()
+    return rows
+
+
+def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by the values of these columns, in the order of their first appearance."""
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return found
+
+
+def markdown(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    body = [head, ["---"] * len(head), *lines]
+    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in body)
+
+
+def rate(rows: Sequence[Row], outcome: str = "outcome") -> str:
+    """Success with its interval, in per cent."""
+    if not rows:
+        return ""
+    found = wilson(sum(row[outcome] == "success" for row in rows), len(rows))
+    return f"{100 * found['rate']:.1f} % ({100 * found['low']:.1f} to {100 * found['high']:.1f})"
+
+
+def pushes(rows: Sequence[Row], outcome: str = "outcome", steps: str = "steps") -> str:
+    """Median and mean number of pushes of the successes."""
+    counts = [row[steps] for row in rows if row[outcome] == "success"]
+    return f"{statistics.median(counts):g} ({statistics.mean(counts):.1f})" if counts else ""
+
+
+def seeds(rows: Sequence[Row]) -> str:
+    """The blocks of seeds, those that follow one another as one."""
+    blocks: list[list[int]] = []
+    for number in sorted({row["seed"] for row in rows}):
+        if blocks and number == blocks[-1][1] + 1:
+            blocks[-1][1] = number
+        else:
+            blocks.append([number, number])
+    return ", ".join(f"{first} to {last}" for first, last in blocks)
+
+
+def paired(one: Sequence[Row], other: Sequence[Row]) -> tuple[int, int, float]:
+    """Scenes that only the one solves, that only the other solves, and the p of the exact McNemar test."""
+    theirs = {row["seed"]: row["outcome"] == "success" for row in other}
+    pairs = [(row["outcome"] == "success", theirs[row["seed"]]) for row in one if row["seed"] in theirs]
+    alone, others = pairs.count((True, False)), pairs.count((False, True))
+    return alone, others, mcnemar(alone, others)
+
+
+def readme() -> str:
+    """Rates by row and task."""
+    lines = []
+    for (row, planner, checkpoint, segmentation, rules), found in groups(
+        read("success"), "row", "planner", "checkpoint", "segmentation", "rules"
+    ).items():
+        if "one segment" in row:
+            continue
+        by_task = groups(found, "task")
+        counts = {len(by_task[task,]) for task in TASKS if (task,) in by_task}
+        options = f"`planner={planner} checkpoint={checkpoint}`"
+        rates = [rate(by_task.get((task,), [])) for task in TASKS]
+        lines.append([row, options, f"`{segmentation}`", rules, ", ".join(f"{one:,}" for one in counts), *rates])
+    return markdown(["", "options", "segmentation", "rules", "episodes", *TASKS], lines)
+
+
+def success(name: str = "success") -> str:
+    """One line per row and task: how episodes end, with their seeds and commit."""
+    lines = []
+    for (row, task, objects, rules), found in groups(read(name), "row", "task", "objects", "rules").items():
+        ends = Counter(one["outcome"] for one in found)
+        failures = [ends[end] for end in ("violation", "fall", "timeout")]
+        commits = ", ".join(sorted({one["commit"] for one in found}))
+        lines.append(
+            [row, task, objects, rules, len(found), rate(found), *failures, pushes(found), seeds(found), commits]
+        )
+    head = ["row", "task", "objects", "rules", "episodes", "success", "violations", "falls", "out of time"]
+    return markdown([*head, "pushes, median (mean)", "seeds", "commit"], lines)
+
+
+def additions() -> str:
+    """Each addition left out, beside all of them in the same scenes."""
+    rows = read("additions")
+    everything = groups([row for row in rows if row["row"] == "all"], "task", "objects")
+    lines = []
+    for (name, task, objects), found in groups(rows, "row", "task", "objects").items():
+        ms = [value for row in found for value in row["planning_ms"]]
+        line = [name, f"{task}, {objects}", len(found), rate(found)]
+        violations = sum(row["outcome"] in ("violation", "fall") for row in found)
+        line += [violations, pushes(found), f"{statistics.median(ms):.0f}"]
+        if name == "all":
+            lines.append([*line, ""])
+        else:
+            without, complete, p = paired(found, everything[task, objects])
+            lines.append([*line, f"{without}, {complete} (p = {p:.2g})"])
+    head = ["left out", "task, objects", "episodes", "success", "violations and falls", "pushes, median (mean)"]
+    return markdown([*head, "ms per plan", "succeeds alone: without it, with all"], lines)
+
+
+def reproduction() -> str:
+    """The bars of the paper's figure by both rules, planners as in the paper, 3 objects."""
+    rows = [row for row in read("reproduction") if row["planner"] == "paper" and row["objects"] == 3]
+    lines = []
+    for rules in RULES:
+        for method in METHODS:
+            cells = groups([row for row in rows if row["method"] == method], "task", "reward")
+            rates = [
+                rate(cells.get((task, reward), []), f"{rules}_outcome")
+                for task in TASKS
+                for reward in ("dense", "sparse")
+            ]
+            if any(rates):
+                lines.append([METHODS[method], rules, *rates])
+    return markdown(
+        ["method", "rules", *(f"{task}, {reward}" for task in TASKS for reward in ("dense", "sparse"))], lines
+    )
+
+
+def more_objects() -> str:
+    """Clearing with sparse rewards against the number of objects, planners as in the paper."""
+    rows = [row for row in read("reproduction") if row["planner"] == "paper" and row["reward"] == "sparse"]
+    rows = [row for row in rows if row["task"] == "clearing"]
+    lines = []
+    for method, name in METHODS.items():
+        by_count = groups([row for row in rows if row["method"] == method], "objects")
+        lines.append([name, *(rate(by_count.get((count,), []), "published_outcome") for count in range(1, 6))])
+    return markdown(["method", *(f"{count} objects" if count > 1 else "1 object" for count in range(1, 6))], lines)
+
+
+def variants() -> str:
+    """Parts of CAVIN left out, planners otherwise as in the paper."""
+    rows = [row for row in read("reproduction") if row["reward"] == "sparse" and row["objects"] == 3]
+    lines = []
+    for (method, planner), found in groups(rows, "method", "planner").items():
+        if (method in ("cavin", "sectar") and planner != "ours") or (method, planner) == ("cavin", "ours"):
+            tasks = groups(found, "task")
+            rates = [rate(tasks.get((task,), []), f"{rules}_outcome") for rules in RULES for task in TASKS]
+            lines.append([METHODS[method], f"`{planner}`", len(found), *rates])
+    return markdown(
+        ["method", "planner", "episodes", *(f"{task}, {rules}" for rules in RULES for task in TASKS)], lines
+    )
+
+
+def factors() -> str:
+    """Networks, data and planner in crossing: success by the strict rules, and pushes."""
+    lines = []
+    for (planner, method, data), found in sorted(groups(read("factors"), "planner", "method", "data").items()):
+        by_count = groups(found, "objects")
+        cells = [
+            text
+            for count in (3, 5)
+            for text in (
+                rate(by_count[count,], "strict_outcome"),
+                pushes(by_count[count,], "strict_outcome", "strict_steps"),
+            )
+        ]
+        lines.append([f"`{planner}`", f"`{method}`", data, len(found), *cells])
+    head = ["planner", "networks", "pushes in training", "episodes"]
+    return markdown([*head, *(f"{what}, {count} objects" for count in (3, 5) for what in ("success", "pushes"))], lines)
+
+
+def simulator() -> str:
+    """The simulator in the place of f at line 10."""
+    lines = []
+    for (task, objects), found in groups(read("simulator"), "task", "objects").items():
+        by = groups(found, "line_10")
+        by_f, by_simulator = by["f",], by["simulator",]
+        alone, others, p = paired(by_f, by_simulator)
+        test = f"{alone}, {others} (p = {p:.2g})"
+        lines.append(
+            [f"{task}, {objects}", len(by_f), rate(by_f), rate(by_simulator), test, pushes(by_f), pushes(by_simulator)]
+        )
+    head = ["task, objects", "scenes", "f", "the simulator", "succeeds alone: f, the simulator"]
+    return markdown([*head, "pushes, f", "pushes, the simulator"], lines)
+
+
+def accuracy() -> str:
+    """Errors of predicted centres, in centimetres, of objects that moved and that did not."""
+    rows = read("accuracy")
+    kinds: list[tuple[str, Callable[[Row], bool]]] = [
+        ("all", lambda row: True),
+        ("alone on the table", lambda row: row["objects"] == 1),
+        ("five objects", lambda row: row["objects"] == 5),
+    ]
+    who = list(dict.fromkeys(row["predictor"] for row in rows))
+    lines = []
+    for ahead in sorted({row["pushes"] for row in rows}):
+        for name, chosen in kinds:
+            cells = {one: [row for row in rows if row["pushes"] == ahead and row["predictor"] == one] for one in who}
+            moved = {one: [100 * row["error"] for row in cells[one] if row["moved"] and chosen(row)] for one in who}
+            texts = [_errors(moved[one]) for one in who]
+            lines.append([f"{ahead} push{'es' * (ahead > 1)}, {name}", len(moved[who[0]]), *texts])
+        still = {one: [row["phantom"] for row in cells[one] if not row["moved"]] for one in who}
+        shares = [f"{100 * statistics.mean(still[one]):.2f} %" if any(still[one]) else "" for one in who]
+        lines.append([f"{ahead} push{'es' * (ahead > 1)}, still but said to move", len(still[who[0]]), *shares])
+    return markdown(["mean / median error, cm", "objects", *who], lines)
+
+
+def _errors(values: Sequence[float]) -> str:
+    return f"{statistics.mean(values):.2f} / {statistics.median(values):.2f}" if values else ""
+
+
+def as_stored(name: str) -> str:
+    """A file of measured times or verdicts as it is, a line per row."""
+    rows = read(name)
+    return markdown(list(rows[0]), [["" if value is None else value for value in row.values()] for row in rows])
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "readme": readme,
+    "success": success,
+    "farther": lambda: success("farther"),
+    "additions": additions,
+    "reproduction": reproduction,
+    "more_objects": more_objects,
+    "variants": variants,
+    "factors": factors,
+    "simulator": simulator,
+    "accuracy": accuracy,
+    "speed": lambda: as_stored("speed"),
+    "criticism": lambda: as_stored("criticism"),
+}
+
+
+def written(text: str) -> str:
+    """A page with its tables as the files of docs/results have them."""
+
+    def table(found: re.Match[str]) -> str:
+        name = {"readme": "success", "more_objects": "reproduction", "variants": "reproduction"}.get(found[2], found[2])
+        exists = (RESULTS / f"{name}.parquet").exists()
+        return f"{found[1]}\n{TABLES[found[2]]() if exists else NOTHING}\n{found[3]}"
+
+    return MARKERS.sub(table, text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a page would change")
+    arguments = parser.parse_args()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        now = written(text)
+        if now != text and arguments.check:
+            raise SystemExit(f"{page.relative_to(ROOT)} differs from docs/results: run python benchmarks/tables.py")
+        page.write_text(now, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

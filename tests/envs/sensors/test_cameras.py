@@ -1,0 +1,135 @@
+"""Cameras with any pose, and the Kinect v2's errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.scene import Scene
+from envs.sensors import CAMERAS, IdealSensor, Kinect2, sensor_of
+from envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
+from envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation, axial_noise
+
+coordinate = st.floats(-1.0, 1.0)
+cameras = st.builds(
+    Camera,
+    st.integers(64, 512),
+    st.integers(64, 424),
+    st.tuples(coordinate, coordinate, st.floats(0.4, 2.0)),
+    st.tuples(coordinate, coordinate, coordinate),
+    st.tuples(*[st.floats(-20.0, 20.0)] * 4),
+)
+
+
+@settings(deadline=None)
+@given(cameras, st.data())
+def test_a_point_behind_a_pixel_is_projected_back_into_it_whatever_the_pose(
+    camera: Camera, data: st.DataObject
+) -> None:
+    row = data.draw(st.integers(0, camera.height - 1))
+    column = data.draw(st.integers(0, camera.width - 1))
+    depth = np.full((camera.height, camera.width), data.draw(st.floats(0.3, 3.0)))
+    point = camera.points(depth, np.array([row]), np.array([column]))
+    np.testing.assert_allclose(camera.project(point), [[column + RAY_COLUMN, row + RAY_ROW]], atol=1e-6)
+    along_axis = (point - np.array(camera.position)) @ camera.axes[2]
+    np.testing.assert_allclose(along_axis, depth[row, column], atol=1e-9)
+
+
+@settings(deadline=None)
+@given(cameras)
+def test_the_axes_of_an_image_are_orthonormal_and_right_handed(camera: Camera) -> None:
+    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.cross(camera.axes[0], camera.axes[1]), camera.axes[2], atol=1e-12)
+
+
+def test_the_renderer_draws_what_the_geometry_says_of_a_turned_and_shifted_camera(scene: Scene, put: Callable) -> None:
+    scene.reset([put("rubiks_cube", 0.6, 0.1)], np.random.default_rng(0))
+    camera = Camera(512, 424, (0.63, -0.04, 1.03), (0.02, -0.025, 0.02), (12.0, -9.0, -14.0, 15.0))
+    rendering = scene.world.render(camera)
+    points = camera.points(rendering.depth, *np.nonzero(rendering.bodies == scene.bodies[0]))
+    truth = scene.ground_truth().positions[0]
+    top = points[points[:, 2] > 2 * truth[2] - 0.001]
+    assert len(top) > 0.7 * len(points)  # the rest is a side of the cube
+    np.testing.assert_allclose(top.mean(axis=0), (truth[0], truth[1], 2 * truth[2]), atol=0.002)
+
+
+def test_the_table_that_the_kinect_computes_is_the_one_that_the_renderer_draws(scene: Scene, put: Callable) -> None:
+    scene.reset([put("mug", 0.6, 0.1), put("banana", 0.5, -0.3)], np.random.default_rng(0))
+    sensor = Kinect2()
+    sensor.reset(np.random.default_rng(3))
+    with_table, objects = scene.world.render(sensor.actual), scene.world.render(sensor.actual, table=False)
+    computed = np.minimum(objects.depth, sensor._table)
+    np.testing.assert_allclose(computed[with_table.bodies >= 0], with_table.depth[with_table.bodies >= 0], atol=1e-4)
+
+
+def test_noise_grows_with_distance_and_with_the_angle_of_the_surface() -> None:
+    """Source: Fankhauser et al. 2015; 1.3 mm at one metre from straight above."""
+    head_on = axial_noise(np.array([1.0, 2.0, 4.0]), np.zeros(3))
+    np.testing.assert_allclose(head_on, [0.0013, 0.0017, 0.0043], rtol=1e-5)
+    slanted = axial_noise(np.ones(4), np.radians([0.0, 30.0, 60.0, 75.0]))
+    assert (np.diff(slanted) > 0).all()
+
+
+def test_the_kinect_measures_a_bare_table_as_its_noise_model_says(scene: Scene, put: Callable) -> None:
+    scene.reset([put("rubiks_cube", 0.3, 0.5)], np.random.default_rng(0))
+    sensor = Kinect2(viewpoint=Perturbation(0, 0, 0), calibration=Perturbation(0, 0, 0))
+    sensor.reset(np.random.default_rng(0))
+    image, _ = sensor.capture(scene.world.render)
+    assert image.depth.shape == (424, 512)
+    middle = image.depth[180:240, 220:290]
+    assert 0 < (middle == 0).mean() < 0.01
+    assert np.median(middle) == pytest.approx(1.0, abs=5e-4)
+    assert middle[middle > 0].std() == pytest.approx(0.0013, rel=0.1)
+    np.testing.assert_allclose(image.depth / RESOLUTION, np.rint(image.depth / RESOLUTION), atol=1e-3)
+    assert not image.depth[:10].any()  # there is nothing beside the table
+
+
+def test_measurements_are_missing_and_mixed_at_the_edges_of_objects(scene: Scene, put: Callable) -> None:
+    scene.reset([put("tomato_soup_can", 0.6, 0.0)], np.random.default_rng(0))
+    sensor = Kinect2()
+    sensor.reset(np.random.default_rng(0))
+    image, bodies = sensor.capture(scene.world.render)
+    can = bodies == scene.bodies[0]
+    outline = can & ~(np.roll(can, 1, 0) & np.roll(can, -1, 0) & np.roll(can, 1, 1) & np.roll(can, -1, 1))
+    assert (image.depth[outline] == 0).mean() > 0.2
+    assert (image.depth[can & ~outline] == 0).mean() < 0.2
+
+
+def test_nothing_is_mixed_with_what_is_not_there(scene: Scene, put: Callable) -> None:
+    """Beyond the table's edge there is no floor in the simulator, and an object's points end where it ends."""
+    scene.reset([put("sugar_box", 0.25, 0.0), put("mug", 0.94, 0.3)], np.random.default_rng(0))
+    sensor = Kinect2()
+    for seed in range(10):
+        sensor.reset(np.random.default_rng(seed))
+        image, bodies = sensor.capture(scene.world.render)
+        rows, columns = np.nonzero(np.isin(bodies, scene.bodies) & (image.depth > 0.0))
+        assert image.camera.points(image.depth, rows, columns)[:, 2].min() > -0.02  # metres
+
+
+def test_the_kinect_stands_elsewhere_in_every_episode_and_is_believed_to_stand_near_there() -> None:
+    sensor, actual = Kinect2(), []
+    for seed in range(50):
+        sensor.reset(np.random.default_rng(seed))
+        actual.append(sensor.actual.position)
+        for camera, other, bounds in (
+            (sensor.actual, NOMINAL, VIEWPOINT),
+            (sensor.believed, sensor.actual, CALIBRATION),
+        ):
+            assert np.abs(np.subtract(camera.position, other.position)).max() <= bounds.translation
+            assert np.abs(np.subtract(camera.intrinsics, other.intrinsics)).max() <= bounds.intrinsics
+            assert np.abs(np.subtract(camera.rotation, other.rotation)).max() <= 1.1 * bounds.rotation
+    np.testing.assert_allclose(np.ptp(actual, axis=0), 2 * VIEWPOINT.translation, rtol=0.2)
+
+
+def test_cameras_go_by_names_poses_or_themselves() -> None:
+    assert set(CAMERAS) == {"ideal", "kinect2"}
+    camera, sensor = Camera(position=(0.5, 0.0, 1.2)), Kinect2()
+    assert sensor_of(camera).nominal == camera
+    assert sensor_of(sensor) is sensor
+    assert isinstance(sensor_of("ideal"), IdealSensor)
+    with pytest.raises(ValueError, match=r"^unknown camera 'webcam': choose from ideal, kinect2$"):
+        sensor_of("webcam")
