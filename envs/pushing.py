@@ -13,18 +13,17 @@ import torch
 from numpy.typing import NDArray
 
 from envs.layouts import GENERATED, generate_task, possible_tasks
-from envs.objects.asset import plain_name
-from envs.objects.object_sets import ObjectSet, load_object_set
+from envs.objects.object_sets import ObjectSet, load_object_set, plain_name
 from envs.objects.sampling import Area, ObjectRanges
 from envs.observation import Observation
-from envs.randomness import goal_stream, layout_stream, next_scene_stream
+from envs.randomness import GOAL, LAYOUT, named_stream
 from envs.robots import RobotFactory
 from envs.scene import Scene
 from envs.segmentation import SegmenterFactory
 from envs.sensors import DepthSensor
 from envs.sensors.camera import Camera
 from envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
-from envs.tasks.contract import check_functions
+from envs.tasks.task import check_functions
 from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, object_slots, tile_center
 
 EPISODE_STEPS = 60
@@ -145,18 +144,18 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             ValueError: the layout has no room for the objects, or there is no layout of that number.
         """
         super().reset(seed=seed)
-        scene_generator = next_scene_stream(self.np_random)
-        sampled = int(layout_stream(scene_generator).integers(len(self.tasks)))
+        (scene_generator,) = self.np_random.spawn(1)
+        sampled = int(named_stream(scene_generator, LAYOUT).integers(len(self.tasks)))
         number = (options or {}).get("layout", sampled)
         if number not in range(len(self.tasks)):
             raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
         if self._generate is not None:
-            self.tasks = (self._generate(layout_stream(scene_generator)),)
+            self.tasks = (self._generate(named_stream(scene_generator, LAYOUT)),)
         self._begin(self.tasks[number])
         target = _areas(self.task.target_start, TARGET_JITTER)
         obstacle = _areas(self.task.obstacle_start, OBSTACLE_JITTER)
         areas = [target, *[obstacle] * (self.objects - 1)]
-        can_start = partial(self._can_start, self.task, goal_stream(scene_generator))
+        can_start = partial(self._can_start, self.task, named_stream(scene_generator, GOAL))
         self._observation = self.scene.sample(areas, self.ranges, scene_generator, acceptable=can_start)
         self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
         self.scene.places = self.task.object_places() if self.show_tiles else ()

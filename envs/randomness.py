@@ -36,37 +36,6 @@ def named_stream(parent: np.random.Generator, name: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, name)))
 
 
-def next_scene_stream(environment: np.random.Generator) -> np.random.Generator:
-    """The scene's stream of an environment's next reset.
-
-    Args:
-        environment: Gymnasium's `np_random`, which `reset(seed=...)` creates from the seed.
-    """
-    (scene,) = environment.spawn(1)
-    return scene
-
-
-def layout_stream(scene: np.random.Generator) -> np.random.Generator:
-    """The stream for a scene's random layout."""
-    return named_stream(scene, LAYOUT)
-
-
-def goal_stream(scene: np.random.Generator) -> np.random.Generator:
-    """The stream for a scene's random goal."""
-    return named_stream(scene, GOAL)
-
-
-def next_sample_streams(scene: np.random.Generator) -> tuple[np.random.Generator, np.random.Generator]:
-    """Streams of the objects and of the points for the next sample of a scene."""
-    objects, points = scene.spawn(2)
-    return objects, points
-
-
-def sensor_stream(points: np.random.Generator) -> np.random.Generator:
-    """The camera's perturbed pose and its noise, in the scene whose points come from `points`."""
-    return named_stream(points, SENSOR)
-
-
 def collection_streams(seed: int, episode: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Streams of the scene and of the policy for one collected episode."""
     scene, policy = np.random.default_rng([seed, episode]).spawn(2)

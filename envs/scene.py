@@ -9,21 +9,20 @@ import colorsys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import cycle
+from itertools import count, cycle
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.filming import FrameHook, film
 from envs.markings import Place, TileGroup, paint_of
-from envs.objects.object_sets import BuiltinObjects, ObjectSet
+from envs.objects.object_sets import BUILTIN, ObjectSet
 from envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
 from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from envs.physics import PhysicsWorld, Poses
-from envs.randomness import next_sample_streams, sensor_stream
-from envs.robots import RobotFactory, Stopped, push, robot_factory, settle
+from envs.randomness import SENSOR, named_stream
+from envs.robots import TIP_HEIGHT, RobotFactory, Stopped, push, robot_factory, settle
 from envs.segmentation import Pixels, SegmenterFactory, segmenter_of
 from envs.sensors import DepthImage, DepthSensor, sensor_of
 from envs.sensors.camera import Camera
@@ -33,6 +32,8 @@ MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians
 FALLEN = -0.02  # metres; an object whose centre is lower has left the table
 SCENE_SAMPLES = 50  # scenes sampled, at most, to find an acceptable one
+FRAME_STEPS = 10  # physics steps between two frames of a video
+TRAVEL_FRAME_STEPS = 40  # the same while the tool is in the air; an arm travels four fifths of the time
 
 # The target is orange; obstacles are cool colours.
 HUES = (0.58, 0.45, 0.72, 0.33)  # of the first obstacles; the others are brighter ones of nearly the same hues
@@ -67,7 +68,7 @@ class Scene:
     Args:
         camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
         segmentation: a name in `envs.segmentation.SEGMENTERS`, or a factory of segmenters.
-        object_set: the set of the objects' names, by default the builtin shapes.
+        object_set: the set of the objects' names.
         on_frame: called a few times during every push, to film it.
         robot: one of `envs.robots.ROBOTS`, or a factory of robots. assets: folder of the files that some robots need.
         slots: M, the objects that observations have room for.
@@ -81,8 +82,8 @@ class Scene:
         *,
         camera: str | Camera | DepthSensor = "ideal",
         segmentation: str | SegmenterFactory = "mask",
-        object_set: ObjectSet | None = None,
-        on_frame: FrameHook | None = None,
+        object_set: ObjectSet = BUILTIN,
+        on_frame: Callable[[], None] | None = None,
         robot: str | RobotFactory = "stick",
         assets: str | Path | None = None,
         slots: int = OBJECT_SLOTS,
@@ -90,7 +91,7 @@ class Scene:
         self.sensor = sensor_of(camera)
         self.segmenter = segmenter_of(segmentation, self.true_masks, slots)
         self.slots = slots
-        self.object_set = object_set or BuiltinObjects()
+        self.object_set = object_set
         self._make_robot = robot_factory(robot, assets)
         self.on_frame = on_frame
         self.world = PhysicsWorld()
@@ -128,7 +129,7 @@ class Scene:
             NoRoomError: no such scene was found.
         """
         for _ in range(SCENE_SAMPLES):
-            scene_generator, point_generator = next_sample_streams(generator)
+            scene_generator, point_generator = generator.spawn(2)
             observation = self.reset(sample_objects(areas, ranges, scene_generator, self.object_set), point_generator)
             if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
@@ -150,7 +151,7 @@ class Scene:
         self.bodies = [self._add(one, color) for one, color in zip(objects, cycle(COLORS), strict=False)]
         self.robot = self._make_robot(self.world)
         settle(self.world, self.robot, self.bodies, limit=720)
-        self.sensor.reset(sensor_stream(point_generator))
+        self.sensor.reset(named_stream(point_generator, SENSOR))
         self._latest_clouds = LatestClouds(point_generator, self.slots)
         self.seconds["physics"] += time.process_time() - began
         return self._observe(first=True)
@@ -167,7 +168,8 @@ class Scene:
         began = time.process_time()
         before = self.ground_truth()
         start, end = push_endpoints(action)
-        self.world.on_step = None if self.on_frame is None else film(self.robot, self.on_frame)
+        steps = count()
+        self.world.on_step = None if self.on_frame is None else lambda: self._film(next(steps))
         try:
             ended = push(self.robot, start, end)
         finally:
@@ -185,6 +187,13 @@ class Scene:
             fallen=self._any_fallen(),
             stopped="" if ended == "unsafe" else ended,
         )
+
+    def _film(self, step: int) -> None:
+        """Make a frame of the first physics step of a push, and of every `FRAME_STEPS`th."""
+        if step % FRAME_STEPS == 0 and self.on_frame is not None:
+            low = self.robot.tip()[2] < 2 * TIP_HEIGHT
+            if low or step % TRAVEL_FRAME_STEPS == 0:
+                self.on_frame()
 
     def observe(self) -> Observation:
         """Take a depth image and turn it into one cloud per object.

@@ -11,8 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.own_parts import object_set_of, robot_of
 from envs.layouts import task_class
-from envs.objects.asset import plain_name
-from envs.objects.object_sets import chosen
+from envs.objects.object_sets import chosen, plain_name
 from envs.objects.sampling import ObjectRanges
 from envs.tasks import Task
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW

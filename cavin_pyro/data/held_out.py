@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, read_metadata
-from envs.objects.asset import listed, plain_name
+from envs.objects.object_sets import listed, plain_name
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.recording_plan import log_plan, log_reached, object_name, vivid
 from cavin_pyro.visualization.video import FRAMES_PER_SECOND, PAUSE
-from envs.appearance import parts_of
 from envs.markings import PLACE_RADIUS
 from envs.pushing import ObservationDict, PushingEnv
 from envs.scene import COLORS
@@ -84,7 +83,7 @@ class EpisodeRecording(EpisodeCallback):
     def _log_scene(self) -> None:
         """Log what does not change: shapes in their own frames, and the task's tiles."""
         self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for number, part in enumerate(parts_of(self._scene.world)):
+        for number, part in enumerate(self._scene.world.parts()):
             path = self._links.setdefault((part.body, part.link), self._link_path(part.body, part.link))
             corners = part.vertices[part.triangles]  # [F, 3, 3], each triangle with corners of its own: flat shading
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

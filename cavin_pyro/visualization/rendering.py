@@ -16,7 +16,7 @@ from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
 from cavin_pyro.visualization.progress import EpisodeProgress
 from cavin_pyro.visualization.video import EpisodeVideo
-from envs.goals import SUFFIXES, goal_bytes
+from envs.goals import SUFFIXES, save_goal
 from envs.scene import Scene
 
 EVIDENCE_COLUMNS = ("log_z", "temperature", "effective_samples")
@@ -51,7 +51,7 @@ def check_goal(path: str | None) -> None:
     if path is None:
         return
     if Path(path).suffix.lower() not in SUFFIXES:
-        raise UserError(f"save_goal={path} must end in {', '.join(SUFFIXES)}")
+        raise UserError(f"save_goal={path} must end in {' or '.join(SUFFIXES)}")
     if not Path(path).parent.is_dir():
         raise UserError(f"save_goal={path}: there is no folder {Path(path).parent}")
 
@@ -64,7 +64,7 @@ def write_goal(path: str, scene: Scene) -> None:
     """
     try:
         with atomic_write(Path(path)) as temporary:
-            temporary.write_bytes(goal_bytes(Path(path).suffix, scene))
+            save_goal(temporary, scene)
     except OSError as error:
         raise UserError(f"save_goal={path} cannot be written: {error.strerror}") from error
 

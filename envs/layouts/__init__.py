@@ -13,8 +13,9 @@ Source of the layouts of the paper's three tasks: appendix "Task Details"; the p
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -22,11 +23,9 @@ import numpy as np
 import yaml
 
 from envs.tasks import TASKS, GeneratedLayouts, Task
-from envs.tasks.contract import check_fields
 from envs.tasks.tiles import TileSet
 
 RANDOM, GENERATED = "random", "generated"
-LARGEST = 100_000  # characters of a layout; ours have 200
 _FOLDER = Path(__file__).parent
 
 
@@ -44,7 +43,10 @@ def task_class(task: str | type[Task]) -> type[Task]:
         raise ValueError(f"{task!r} is no task: derive it from envs.tasks.Task")
     if task.__abstractmethods__:
         raise ValueError(f"task {task.__name__} lacks {' and '.join(sorted(task.__abstractmethods__))}")
-    check_fields(task)
+    known = {field.name for field in fields(task)}
+    annotated = inspect.get_annotations(task)
+    if any(name not in known and "ClassVar" not in str(hint) for name, hint in annotated.items()):
+        raise ValueError(f"decorate {task.__name__} with @dataclass(frozen=True, kw_only=True)")
     return task
 
 
@@ -164,10 +166,9 @@ def _path(kind: type[Task], layout: int | str | Path) -> Path:
 
 def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
     try:
-        content = _PlainLoader(_text(path)).get_single_data()
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        reason = error.strerror
-        raise ValueError(f"layout {path} cannot be read ({reason}): give {_choices(kind)}") from error
+        raise ValueError(f"layout {path} cannot be read ({error.strerror}): give {_choices(kind)}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"layout {path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
@@ -175,32 +176,7 @@ def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
     return content
 
 
-def _text(path: Path) -> str:
-    """The text of a file that is a file, and no larger than a layout can be."""
-    if path.exists() and not path.is_file() and not path.is_dir():  # of a folder `open` says it better
-        raise ValueError("it is no file")
-    with open(path, encoding="utf-8") as file:
-        text = file.read(LARGEST + 1)
-    if len(text) > LARGEST:
-        raise ValueError(f"it has over {LARGEST} characters")
-    return text
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """Reads plain data; `*name`, which can make a short file endless, is refused."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise ValueError("it refers to another part of itself with *")
-        return super().compose_node(parent, index)
-
-
 def _choices(kind: type[Task]) -> str:
-    """`0, 1, 2, random, generated or the path of a YAML file`, as far as the task has them."""
-    numbers = [str(number) for number in layout_numbers(kind)]
-    names = [*numbers, *([RANDOM] if numbers else []), *([GENERATED] if _generates(kind) else [])]
-    return f"{', '.join(names)} or the path of a YAML file" if names else "the path of a YAML file"
-
-
-def _generates(kind: type[Task]) -> bool:
-    return getattr(kind.generate, "__func__", None) is not getattr(Task.generate, "__func__", None)
+    """`0, 1, 2, random or the path of a YAML file`, as far as the task has them."""
+    names = [*(str(number) for number in layout_numbers(kind)), RANDOM, GENERATED]
+    return f"{', '.join(names)} or the path of a YAML file" if len(names) > 2 else "the path of a YAML file"

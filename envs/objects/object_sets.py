@@ -1,17 +1,52 @@
-"""Sets of objects: ten builtin shapes, real scans from a folder, both together, or random shapes."""
+"""Sets of objects: ten builtin shapes, scans of real objects from a folder, both together, or random shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from envs.objects.asset import ObjectAsset, listed, plain_name
-from envs.objects.random_shapes import RANDOM_NAMES, random_shape
-from envs.objects.scans import ScannedObjects
-from envs.objects.shapes import BUILTIN_NAMES, Shape, builtin_shape, write_mesh
-from envs.process_folder import process_folder
+import numpy as np
+
+from envs.files import assets_folder, process_folder
+from envs.objects.shapes import BUILTIN_NAMES, RANDOM_NAMES, Shape, builtin_shape, plain_name, random_shape, write_mesh
+
+SCANS = "ycb"  # the folder's name within the assets, and the prefix of its objects' names
+FARTHEST = 100.0  # metres; larger numbers are not metres
+_GET = f"get them with: python -m cavin_pyro.assets {SCANS} --to DIR"
+
+
+@dataclass(frozen=True)
+class ObjectAsset:
+    """An object of a set.
+
+    Attributes:
+        name: in its set. mass: kilograms, as published.
+        radius: metres from the origin to the farthest vertex.
+        collision: Wavefront file, a group per convex part. visual: Wavefront file for the camera. Both in
+            metres, the origin at the centre of mass.
+        inertia: (x, y, z) kilograms times square metres at that mass and size, about the file's axes; None: the
+            simulator computes that of the bounding box.
+    """
+
+    name: str
+    mass: float
+    radius: float
+    collision: Path
+    visual: Path
+    inertia: tuple[float, float, float] | None = None
+
+    def inertia_of(self, mass: float, scale: float) -> tuple[float, float, float] | None:
+        """The inertia at another mass (kilograms) and size (factor); it is proportional to mass times area."""
+        if self.inertia is None:
+            return None
+        factor = mass / self.mass * scale**2
+        x, y, z = (value * factor for value in self.inertia)
+        return x, y, z
 
 
 class ObjectSet(Protocol):
@@ -29,24 +64,49 @@ class ObjectSet(Protocol):
         """
 
 
-class BuiltinObjects:
-    """The ten shapes of `envs.objects.shapes`, written to a temporary folder at their first use."""
+class ShapeObjects:
+    """Shapes of `envs.objects.shapes`, each written to a temporary folder at its first use.
 
-    names = BUILTIN_NAMES
+    Args:
+        names: of the objects. build: makes the shape of a name.
+    """
 
-    def asset(self, name: str) -> ObjectAsset:
-        """See `ObjectSet`."""
-        return _asset(builtin_shape(name))
-
-
-class RandomObjects:
-    """The hundred shapes of `envs.objects.random_shapes`, written in the same way."""
-
-    names = RANDOM_NAMES
+    def __init__(self, names: tuple[str, ...], build: Callable[[str], Shape]) -> None:
+        self.names, self._build = names, build
 
     def asset(self, name: str) -> ObjectAsset:
-        """See `ObjectSet`."""
-        return _asset(random_shape(name))
+        _check_name(name, self.names)
+        shape = self._build(name)
+        mesh = write_mesh(shape, _mesh_folder())
+        return ObjectAsset(shape.name, shape.mass, shape.radius, collision=mesh, visual=mesh)
+
+
+class ScannedObjects:
+    """The objects of the folder `assets/ycb`, called `ycb/NAME`. The constructor checks every file.
+
+    The folder has for each object `NAME.obj` (visual mesh) and `NAME_vhacd.obj` (collision mesh: one convex part per
+    group), in metres, z up, with the origin at the centre of mass, and one `meta.json` with names, masses (kilograms)
+    and inertias (kilograms times square metres):
+
+        {"mug": {"mass": 0.118, "inertia_diag": [1.07e-4, 1.11e-4, 1.47e-4]}, ...}
+
+    `python -m cavin_pyro.assets ycb --to DIR` makes such a folder of the YCB objects.
+
+    Raises:
+        ValueError: no folder was named, or the folder or a file in it is missing or damaged: the message
+            says what is missing, where, and which command makes it.
+    """
+
+    def __init__(self, assets: str | Path | None) -> None:
+        if assets is None:
+            raise ValueError(f"these objects are scans, in no folder that was named: give env.assets=DIR; {_GET}")
+        folder = assets_folder(assets) / SCANS
+        self._assets = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in _manifest(folder).items()}
+        self.names = tuple(self._assets)
+
+    def asset(self, name: str) -> ObjectAsset:
+        _check_name(name, self.names)
+        return self._assets[name]
 
 
 class MixedObjects:
@@ -61,17 +121,16 @@ class MixedObjects:
         self.names = tuple(self._sets)
 
     def asset(self, name: str) -> ObjectAsset:
-        """See `ObjectSet`."""
-        if name not in self._sets:
-            raise ValueError(f"unknown object {name!r}: choose from {listed(self.names)}")
+        _check_name(name, self.names)
         return self._sets[name].asset(name)
 
 
+BUILTIN = ShapeObjects(BUILTIN_NAMES, builtin_shape)
 OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
-    "builtin": lambda assets: BuiltinObjects(),
+    "builtin": lambda assets: BUILTIN,
     "ycb": ScannedObjects,
-    "mixed": lambda assets: MixedObjects(BuiltinObjects(), ScannedObjects(assets)),
-    "random": lambda assets: RandomObjects(),
+    "mixed": lambda assets: MixedObjects(BUILTIN, ScannedObjects(assets)),
+    "random": lambda assets: ShapeObjects(RANDOM_NAMES, random_shape),
 }
 """Factories of object sets by name; their argument is the folder of assets, or None."""
 
@@ -105,11 +164,70 @@ def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _asset(shape: Shape) -> ObjectAsset:
-    mesh = write_mesh(shape, _mesh_folder())
-    return ObjectAsset(shape.name, shape.mass, shape.radius, collision=mesh, visual=mesh)
+def listed(names: Iterable[str]) -> str:
+    """Names for a one-line message: all of them, or both ends of a long list."""
+    every = list(names)
+    return ", ".join(every if len(every) <= 40 else [*every[:2], "...", every[-1]])
+
+
+def _check_name(name: str, names: Sequence[str]) -> None:
+    if name not in names:
+        raise ValueError(f"unknown object {name!r}: choose from {listed(names)}")
 
 
 @cache
 def _mesh_folder() -> Path:
     return process_folder("meshes")
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    get = _GET.replace("DIR", str(folder.parent))
+    try:
+        manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"no objects in {folder}: meta.json cannot be read ({error.strerror}); {get}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{folder / 'meta.json'} is damaged: it is not JSON; {get}") from error
+    if not isinstance(manifest, dict) or not manifest:
+        raise ValueError(f"{folder / 'meta.json'} is damaged: it names no object; {get}")
+    files = [(name, file) for name in manifest for file in (f"{name}.obj", f"{name}_vhacd.obj")]
+    missing = [file for name, file in files if plain_name(name) != name or not os.path.isfile(folder / file)]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise ValueError(f"the objects in {folder} are incomplete: {missing[0]}{more} missing; {get}")
+    return manifest
+
+
+def _scan(folder: Path, name: str, values: Any) -> ObjectAsset:
+    try:
+        x, y, z = map(float, values["inertia_diag"])
+        mass = float(values["mass"])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        mass = x = y = z = np.nan
+    if not all(0.0 < number < np.inf for number in (mass, x, y, z)):
+        raise ValueError(f"{folder / 'meta.json'} is damaged: {name} needs a mass and an inertia_diag of three numbers")
+    collision = folder / f"{name}_vhacd.obj"
+    return ObjectAsset(
+        name=f"{SCANS}/{name}",
+        mass=mass,
+        radius=_radius(collision),
+        collision=collision.absolute(),
+        visual=(folder / f"{name}.obj").absolute(),
+        inertia=(x, y, z),
+    )
+
+
+def _radius(mesh: Path) -> float:
+    """Metres from the origin to the farthest vertex.
+
+    Raises:
+        ValueError: there is no vertex, or one is no point within `FARTHEST`.
+    """
+    try:
+        lines = mesh.read_text(encoding="utf-8").splitlines()
+        vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float64)
+        if not (np.abs(vertices) < FARTHEST).all():  # also if one is no number
+            raise ValueError("no metres")
+        return float(np.linalg.norm(vertices.reshape(-1, 3), axis=1).max())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{mesh} is damaged: its vertices cannot be read as points in metres") from error

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.objects.object_sets import BuiltinObjects, ObjectSet, chosen
+from envs.objects.object_sets import BUILTIN, ObjectSet, chosen
 from envs.objects.shapes import BUILTIN_NAMES
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
@@ -69,11 +69,6 @@ Area = Sequence[tuple[tuple[float, float], tuple[float, float]]]
 WHOLE_TABLE: Area = (((TABLE_LOW[0] + 0.1, TABLE_LOW[1] + 0.1), (TABLE_HIGH[0] - 0.1, TABLE_HIGH[1] - 0.1)),)
 
 
-def _point_in(area: Area, generator: np.random.Generator) -> NDArray[np.float64]:
-    low, high = area[int(generator.integers(len(area)))]
-    return generator.uniform(low, high)
-
-
 def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Generator) -> NDArray[np.float64]:
     """Planar positions [M, 2] in metres, one in each area, no two closer than `clearance`.
 
@@ -83,11 +78,8 @@ def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Genera
     for _ in range(ATTEMPTS):
         chosen: list[NDArray[np.float64]] = []
         for area in areas:
-            free = [
-                point
-                for point in (_point_in(area, generator) for _ in range(20))
-                if all(np.linalg.norm(point - other) >= clearance for other in chosen)
-            ]
+            points = [generator.uniform(*area[int(generator.integers(len(area)))]) for _ in range(20)]
+            free = [one for one in points if all(np.linalg.norm(one - other) >= clearance for other in chosen)]
             if not free:
                 break
             chosen.append(free[0])
@@ -103,18 +95,16 @@ def sample_objects(
     areas: Sequence[Area],
     ranges: ObjectRanges,
     generator: np.random.Generator,
-    objects: ObjectSet | None = None,
+    objects: ObjectSet = BUILTIN,
 ) -> list[ObjectParameters]:
     """Sample one object per area, in random orientation, above the table and clear of its neighbours.
 
     Args:
-        areas: start area of each object; the first is the target. objects: the set of the names, by default the builtin
-            one.
+        areas: start area of each object; the first is the target. objects: the set of the names.
 
     Raises:
         NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
     """
-    objects = objects or BuiltinObjects()
     names = chosen(ranges.names, objects)
     targets = chosen(ranges.target, objects) or names
     positions = arrange(areas, ranges.clearance, generator)

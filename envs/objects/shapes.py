@@ -1,8 +1,10 @@
-"""The ten builtin objects: the paper's YCB subset rebuilt from convex parts at published sizes and masses.
+"""The ten builtin objects, the paper's YCB subset rebuilt at published sizes and masses, and a hundred random ones.
 
 A shape is a tuple of convex parts; the same parts serve for collision and for the camera. Round
 objects are prisms whose corners lie on the published circle.
-Sizes and masses: YCB Object and Model Set (Calli et al. 2015).
+Sizes and masses: YCB Object and Model Set (Calli et al. 2015). Random objects for training: a model trained on a few
+objects only learns those, while random unions of shapes generalise to real ones (Tobin et al. 2018, "Domain
+Randomization and Generative Models for Robotic Grasping", whose recipe this follows).
 """
 
 from __future__ import annotations
@@ -12,12 +14,12 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-
-from envs.objects.asset import plain_name
+from scipy.spatial.transform import Rotation
 
 SIDES = 16  # flat faces around a can; the largest gap to the circle is 2 % of its radius
 STAVES = 10  # flat faces around a hollow vessel, each of them a convex part, which costs time in every step
@@ -125,13 +127,7 @@ BUILTIN_NAMES = tuple(_RECIPES)
 
 @cache
 def builtin_shape(name: str) -> Shape:
-    """Build one of the ten shapes.
-
-    Raises:
-        ValueError: the name is not one of `BUILTIN_NAMES`.
-    """
-    if name not in _RECIPES:
-        raise ValueError(f"unknown object {name!r}: choose from {', '.join(BUILTIN_NAMES)}")
+    """Build the shape of a name in `BUILTIN_NAMES`."""
     build, mass = _RECIPES[name]
     return shape_of(name, build(), mass)
 
@@ -143,6 +139,11 @@ def shape_of(name: str, parts: Sequence[trimesh.Trimesh], mass: float) -> Shape:
     for part in parts:
         part.apply_translation(-centroid)
     return Shape(name, tuple(parts), mass)
+
+
+def plain_name(name: str) -> str:
+    """An object's name without its set's: `mug` for `ycb/mug`."""
+    return name.rpartition("/")[2]
 
 
 def write_mesh(shape: Shape, folder: Path) -> Path:
@@ -157,3 +158,52 @@ def write_mesh(shape: Shape, folder: Path) -> Path:
             part.unmerge_vertices()
         trimesh.Scene(parts).export(path, include_normals=True)
     return path
+
+
+RANDOM_NAMES = tuple(f"random/shape_{number:02d}" for number in range(100))
+MAXIMUM_PARTS = 3
+SIDE = (0.02, 0.16)  # metres, of a part
+RADIUS = (0.035, 0.10)  # metres from the origin to the farthest vertex; the YCB objects used have 0.04 to 0.1
+DENSITY = (150.0, 900.0)  # kilograms per cubic metre; a mug's and a box of sugar's, as solid bodies
+CORNERS = 12  # points of a convex hull
+
+
+@cache
+def random_shape(name: str) -> Shape:
+    """Build one of the hundred: one to three convex parts, each but the first with its middle on the one before.
+
+    A name in `RANDOM_NAMES` gives the same object on every machine.
+    """
+    generator = np.random.default_rng(RANDOM_NAMES.index(name))
+    while True:
+        parts = [_part(generator)]
+        for _ in range(int(generator.integers(MAXIMUM_PARTS))):
+            part, faces = _part(generator), parts[-1].triangles_center
+            part.apply_translation(faces[generator.integers(len(faces))])
+            parts.append(part)
+        volume = sum(part.volume for part in parts)
+        shape = shape_of(name, parts, mass=float(volume * _between(DENSITY, generator)))
+        if RADIUS[0] <= shape.radius <= RADIUS[1]:
+            return shape
+
+
+def _part(generator: np.random.Generator) -> trimesh.Trimesh:
+    """A convex mesh around the origin, in a random orientation."""
+    sides = _between(SIDE, generator, size=3)
+    kind = int(generator.integers(3))
+    if kind == 0:
+        part = trimesh.creation.box(sides)
+    elif kind == 1:
+        part = trimesh.creation.cylinder(radius=sides[0] / 2, height=sides[1], sections=SIDES)
+    else:
+        directions = generator.normal(size=(CORNERS, 3))
+        part = trimesh.convex.convex_hull(directions / np.linalg.norm(directions, axis=1, keepdims=True) * sides / 2)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.random(random_state=generator).as_matrix()
+    part.apply_transform(turn)
+    return part
+
+
+def _between(bounds: tuple[float, float], generator: np.random.Generator, size: int | None = None) -> Any:
+    """Numbers whose logarithm is uniform."""
+    return np.exp(generator.uniform(np.log(bounds[0]), np.log(bounds[1]), size))

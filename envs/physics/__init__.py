@@ -1,18 +1,7 @@
 """The only package that calls PyBullet: bodies, steps, contacts, images and arms of a simulated world."""
 
-from envs.physics.arm import Arm, ArmDescription
+from envs.physics.arm import Arm, ArmDescription, Kinematics
 from envs.physics.bullet import PYBULLET_DATA
-from envs.physics.kinematics import Kinematics
-from envs.physics.visuals import Poses, Visual
-from envs.physics.world import TIME_STEP, PhysicsWorld
+from envs.physics.world import TIME_STEP, PhysicsWorld, Poses
 
-__all__ = [
-    "PYBULLET_DATA",
-    "TIME_STEP",
-    "Arm",
-    "ArmDescription",
-    "Kinematics",
-    "PhysicsWorld",
-    "Poses",
-    "Visual",
-]
+__all__ = ["PYBULLET_DATA", "TIME_STEP", "Arm", "ArmDescription", "Kinematics", "PhysicsWorld", "Poses"]

@@ -1,82 +1,68 @@
-"""Visual shapes and poses of bodies, for other renderers."""
+"""The appearance of bodies as triangles, for 3D viewers."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from envs.physics.bullet import BulletClient, pybullet
 
-KINDS = {
-    pybullet.GEOM_MESH: "mesh",
-    pybullet.GEOM_BOX: "box",
-    pybullet.GEOM_CYLINDER: "cylinder",
-    pybullet.GEOM_SPHERE: "sphere",
-    pybullet.GEOM_CAPSULE: "capsule",
-}
-
 
 @dataclass(frozen=True)
-class Poses:
-    """True poses of bodies.
+class Part:
+    """One rigid shape.
 
     Attributes:
-        positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
-    """
-
-    positions: NDArray[np.float64]
-    orientations: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Visual:
-    """One visual shape of a body.
-
-    Attributes:
-        body, link: numbers; link -1 is the body's base. kind: mesh, box, cylinder, sphere or capsule.
-        sizes: a mesh's factors on (x, y, z); a box's sides; a cylinder's or capsule's length and radius; a sphere's
-            radius; metres. mesh: the file, of a mesh only.
-        position: [3] metres and orientation: [4] unit quaternion (x, y, z, w), in the link's frame.
+        body, link: its numbers in the simulator; link -1 is the body's base.
+        vertices: [V, 3] metres in the link's frame. triangles: [F, 3] numbers of vertices.
         color: red, green, blue, opacity in [0, 1].
     """
 
     body: int
     link: int
-    kind: str
-    sizes: tuple[float, ...]
-    mesh: Path | None
-    position: tuple[float, ...]
-    orientation: tuple[float, ...]
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
     color: tuple[float, ...]
 
 
-def visuals(bullet: BulletClient) -> list[Visual]:
-    """The visual shapes of every body in the world."""
-    shapes = [
-        shape
-        for index in range(bullet.getNumBodies())
-        for shape in bullet.getVisualShapeData(bullet.getBodyUniqueId(index))
-    ]
-    return [
-        Visual(body, link, KINDS[kind], sizes, Path(os.fsdecode(mesh)) if mesh else None, position, orientation, color)
-        for body, link, kind, sizes, mesh, position, orientation, color in (shape[:8] for shape in shapes)
-        if kind in KINDS
-    ]
+def parts_of(bullet: BulletClient) -> list[Part]:
+    """Every shape in a simulation.
+
+    Raises:
+        ValueError: a mesh file that the simulator has read cannot be read as triangles.
+    """
+    parts = []
+    for index in range(bullet.getNumBodies()):
+        for shape in bullet.getVisualShapeData(bullet.getBodyUniqueId(index)):
+            body, link, kind, sizes, file, position, orientation, color = shape[:8]
+            mesh = _mesh(kind, sizes, file)
+            vertices = Rotation.from_quat(orientation).apply(mesh.vertices) + np.array(position)
+            parts.append(Part(body, link, vertices, np.asarray(mesh.faces, dtype=np.int64), color))
+    return parts
 
 
-def link_poses(bullet: BulletClient, links: Sequence[tuple[int, int]]) -> Poses:
-    """True poses of the visuals' frames, for (body, link) pairs; link -1 is a body's base."""
-    found = []
-    for body, link in links:
-        if link >= 0:
-            found.append(bullet.getLinkState(body, link, computeForwardKinematics=1)[4:6])
-            continue
-        # Bullet returns the pose of the base's centre of mass.
-        inertial = bullet.invertTransform(*bullet.getDynamicsInfo(body, -1)[3:5])
-        found.append(bullet.multiplyTransforms(*bullet.getBasePositionAndOrientation(body), *inertial))
-    return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
+def _mesh(kind: int, sizes: tuple[float, ...], file: bytes) -> trimesh.Trimesh:
+    """Triangles around the shape's own origin.
+
+    Args:
+        sizes: metres; a box's sides; a cylinder's or capsule's length and radius; a sphere's radius; of a mesh, the
+            factors on (x, y, z) of its file.
+    """
+    if kind == pybullet.GEOM_BOX:
+        return trimesh.creation.box(sizes)
+    if kind == pybullet.GEOM_CYLINDER:
+        return trimesh.creation.cylinder(radius=sizes[1], height=sizes[0])
+    if kind == pybullet.GEOM_CAPSULE:  # both Bullet's and this one are centred on their middle
+        return trimesh.creation.capsule(radius=sizes[1], height=sizes[0])
+    if kind == pybullet.GEOM_SPHERE:
+        return trimesh.creation.icosphere(subdivisions=2, radius=sizes[0])
+    mesh = trimesh.load(os.fsdecode(file), force="mesh")
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise ValueError(f"{os.fsdecode(file)} holds no triangles")
+    mesh.apply_scale(sizes)
+    return mesh

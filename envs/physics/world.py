@@ -7,6 +7,7 @@ velocity are set before every step, so that contacts are solved as with an arm t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.bullet import BulletClient, connect, pybullet
-from envs.physics.rendering import render
-from envs.physics.visuals import Poses, Visual, link_poses, visuals
-from envs.sensors.camera import Camera
+from envs.physics.visuals import Part, parts_of
+from envs.sensors.camera import FAR, NEAR, Camera
 from envs.sensors.sensor import Rendering
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
@@ -35,6 +35,18 @@ SPINNING_FRICTION = 0.003  # metres
 ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
 
 
+@dataclass(frozen=True)
+class Poses:
+    """True poses of bodies.
+
+    Attributes:
+        positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
+    """
+
+    positions: NDArray[np.float64]
+    orientations: NDArray[np.float64]
+
+
 class PhysicsWorld:
     """One PyBullet world in DIRECT mode with a table in it.
 
@@ -47,23 +59,18 @@ class PhysicsWorld:
         raise TypeError("a simulation cannot be copied: make a second environment and reset it with the same seed")
 
     def __init__(self) -> None:
-        self._bullet = connect()
+        self.client = connect()  # for the files of this package alone
         self.on_step: Callable[[], None] | None = None  # called after every step, to film or to measure
         self.reset()
 
-    @property
-    def client(self) -> BulletClient:
-        """The simulation itself, for the other files of this package."""
-        return self._bullet
-
     def close(self) -> None:
         """Disconnect; the world cannot be used afterwards. Closing twice is harmless."""
-        if self._bullet.isConnected():
-            self._bullet.disconnect()
+        if self.client.isConnected():
+            self.client.disconnect()
 
     def reset(self) -> None:
         """Empty the world and put the table into it."""
-        bullet = self._bullet
+        bullet = self.client
         bullet.resetSimulation()
         self.objects: list[int] = []  # bodies that `add_object` made
         self._cylinders: dict[tuple[float, float], int] = {}  # shapes for the test in `occupied`
@@ -105,7 +112,7 @@ class PhysicsWorld:
             position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
             color: red, green, blue in [0, 1].
         """
-        bullet, size = self._bullet, [scale] * 3
+        bullet, size = self.client, [scale] * 3
         body = bullet.createMultiBody(
             baseMass=mass,
             baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size),
@@ -131,7 +138,7 @@ class PhysicsWorld:
 
     def add_tool(self, *, radius: float, length: float, position: Sequence[float]) -> int:
         """Add an upright cylinder (metres) that moves only where `place` puts it."""
-        bullet = self._bullet
+        bullet = self.client
         body = bullet.createMultiBody(
             baseMass=TOOL_MASS,
             baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=radius, height=length),
@@ -145,61 +152,69 @@ class PhysicsWorld:
 
     def place(self, body: int, position: Sequence[float], velocity: Sequence[float]) -> None:
         """Set an upright body's position (metres) and velocity (metres per second)."""
-        self._bullet.resetBasePositionAndOrientation(body, position, (0.0, 0.0, 0.0, 1.0))
-        self._bullet.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
+        self.client.resetBasePositionAndOrientation(body, position, (0.0, 0.0, 0.0, 1.0))
+        self.client.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
 
     def step(self) -> None:
         """Advance by one `TIME_STEP`."""
-        self._bullet.stepSimulation()
+        self.client.stepSimulation()
         if self.on_step is not None:
             self.on_step()
 
     def overlaps(self, body: int, other: int) -> bool:
         """Whether two bodies currently interpenetrate."""
-        return len(self._bullet.getClosestPoints(body, other, 0.0)) > 0
+        return len(self.client.getClosestPoints(body, other, 0.0)) > 0
 
     def occupied(self, foot: Sequence[float] | NDArray[np.float64], *, radius: float, length: float) -> bool:
         """Whether an upright cylinder (metres), its lower end's centre at `foot`, would overlap an object."""
         size = radius, length
         if size not in self._cylinders:
-            self._cylinders[size] = self._bullet.createCollisionShape(
+            self._cylinders[size] = self.client.createCollisionShape(
                 pybullet.GEOM_CYLINDER, radius=radius, height=length
             )
         middle = [foot[0], foot[1], foot[2] + length / 2]
         shape = {"collisionShapeA": self._cylinders[size], "collisionShapePositionA": middle}
-        return any(self._bullet.getClosestPoints(-1, body, 0.0, **shape) for body in self.objects)
+        return any(self.client.getClosestPoints(-1, body, 0.0, **shape) for body in self.objects)
 
     def rest(self, bodies: Sequence[int]) -> None:
         """Put bodies to sleep: they cost no time and do not drift until something touches them."""
         for body in bodies:
             for state in (pybullet.ACTIVATION_STATE_ENABLE_SLEEPING, pybullet.ACTIVATION_STATE_SLEEP):
-                self._bullet.changeDynamics(body, -1, activationState=state)
+                self.client.changeDynamics(body, -1, activationState=state)
 
     def poses(self, bodies: Sequence[int]) -> Poses:
         """True poses of the bodies; for physics and tests, never for a planner."""
-        found = [self._bullet.getBasePositionAndOrientation(body) for body in bodies]
+        found = [self.client.getBasePositionAndOrientation(body) for body in bodies]
         return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
 
     def restore(self, bodies: Sequence[int], poses: Poses) -> None:
         """Put bodies at rest at poses, for example where they were before; to try several pushes from one state."""
         for body, position, orientation in zip(bodies, poses.positions, poses.orientations, strict=True):
-            self._bullet.resetBasePositionAndOrientation(body, position, orientation)
-            self._bullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self.client.resetBasePositionAndOrientation(body, position, orientation)
+            self.client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self.rest(bodies)
 
-    def visuals(self) -> list[Visual]:
-        """The visual shapes of every body in the world."""
-        return visuals(self._bullet)
+    def parts(self) -> list[Part]:
+        """The appearance of every body, for other renderers; `link_poses` has the current poses of its frames."""
+        return parts_of(self.client)
 
     def link_poses(self, links: Sequence[tuple[int, int]]) -> Poses:
-        """True poses of the visuals' frames, for (body, link) pairs; link -1 is a body's base."""
-        return link_poses(self._bullet, links)
+        """True poses of the parts' frames, for (body, link) pairs; link -1 is a body's base."""
+        found, bullet = [], self.client
+        for body, link in links:
+            if link >= 0:
+                found.append(bullet.getLinkState(body, link, computeForwardKinematics=1)[4:6])
+                continue
+            # Bullet returns the pose of the base's centre of mass.
+            inertial = bullet.invertTransform(*bullet.getDynamicsInfo(body, -1)[3:5])
+            found.append(bullet.multiplyTransforms(*bullet.getBasePositionAndOrientation(body), *inertial))
+        return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
 
     def fastest(self, bodies: Sequence[int]) -> float:
         """Largest speed among the bodies, in metres per second; a turn of 1 rad/s counts as 0.05 m/s."""
         speeds = [0.0]
         for body in bodies:
-            linear, angular = self._bullet.getBaseVelocity(body)
+            linear, angular = self.client.getBaseVelocity(body)
             speeds += [float(np.linalg.norm(linear)), 0.05 * float(np.linalg.norm(angular))]
         return max(speeds)
 
@@ -209,13 +224,36 @@ class PhysicsWorld:
         Args:
             table: whether to render it. It fills most of an image and takes four fifths of the rendering time.
         """
-        if not table:
-            self._show_table(0.0)
-        rendering = render(self._bullet, camera)
-        if not table:
-            self._show_table(1.0)
+        if table:
+            return _render(self.client, camera)
+        # The renderer omits fully transparent bodies.
+        self.client.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, 0.0))
+        rendering = _render(self.client, camera)
+        self.client.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, 1.0))
         return rendering
 
-    def _show_table(self, opacity: float) -> None:
-        """Show or hide the table: the renderer omits fully transparent bodies."""
-        self._bullet.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, opacity))
+
+def _render(bullet: BulletClient, camera: Camera) -> Rendering:
+    position, axes = np.array(camera.position), camera.axes
+    # An intrinsic matrix written as the frustum that OpenGL's conventions want, column by column.
+    along_row, along_column, column, row = camera.intrinsics
+    width, height = camera.width, camera.height
+    frustum = np.zeros((4, 4))
+    frustum[0, 0], frustum[1, 1] = 2 * along_row / width, 2 * along_column / height
+    frustum[0, 2], frustum[1, 2] = 1 - 2 * column / width, 2 * row / height - 1
+    frustum[2, 2], frustum[2, 3] = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
+    frustum[3, 2] = -1.0
+    image = bullet.getCameraImage(
+        width,
+        height,
+        viewMatrix=pybullet.computeViewMatrix(position, position + position[2] * axes[2], -axes[1]),
+        projectionMatrix=frustum.T.ravel().tolist(),
+        renderer=pybullet.ER_TINY_RENDERER,
+        shadow=0,
+        lightDirection=(0.4, 0.3, 1.0),
+    )
+    buffer = np.asarray(image[3], dtype=np.float64).reshape(height, width)
+    depth = FAR * NEAR / (FAR - (FAR - NEAR) * buffer)
+    bodies = np.asarray(image[4], dtype=np.int64).reshape(height, width)
+    color = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[..., :3]
+    return Rendering(depth, bodies, color)

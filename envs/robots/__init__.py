@@ -9,8 +9,7 @@ from pathlib import Path
 from envs.physics import PhysicsWorld
 from envs.robots.arm import ArmRobot
 from envs.robots.panda import panda
-from envs.robots.phases import SETTLED_SPEED, push, settle
-from envs.robots.robot import STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, Robot, Stopped
+from envs.robots.robot import SETTLED_SPEED, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, Robot, Stopped, push, settle
 from envs.robots.sawyer import sawyer
 from envs.robots.stick import RETRACTED, StickRobot
 

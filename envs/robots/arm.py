@@ -1,4 +1,10 @@
-"""A simulated arm of seven joints: inverse kinematics at waypoints, motors that follow the path between them."""
+"""A simulated arm of seven joints: inverse kinematics at waypoints, motors that follow the path between them.
+
+The stick is round and upright, so its rotation about its own axis is free: there are five conditions, and an arm of
+seven joints has two redundant degrees of freedom, which keep it near a posture. The first joint turns the whole arm
+about the vertical, so a table over distance and height gives an initial guess for every position, which damped least
+squares refines. The solution depends on the position only, not on the arm's state: equal pushes are executed equally.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +13,77 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
-from envs.physics import TIME_STEP, Arm, ArmDescription, PhysicsWorld
-from envs.robots.reach import InverseKinematics
-from envs.robots.robot import ABOVE_HEIGHT, PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
+from envs.physics import TIME_STEP, Arm, ArmDescription, Kinematics, PhysicsWorld
+from envs.robots.robot import ABOVE_HEIGHT, PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, Point, Stopped
 from envs.sensors.camera import Camera
 from envs.workspace import TABLE_HIGH, TABLE_LOW
+
+DISTANCES = np.arange(0.20, 1.001, 0.05)  # metres from the first joint's axis
+HEIGHTS = np.linspace(TIP_HEIGHT, ABOVE_HEIGHT, 4)  # metres
+CLOSE = 1e-4  # tolerance: metres from the position, and radians from upright
+ITERATIONS = 60
+DAMPING = 1e-5
+TO_POSTURE = 0.1  # fraction of the way back to the posture per iteration, in the null space of the tip
+LARGEST_STEP = 0.3  # radians per iteration
+
+
+class InverseKinematics:
+    """Joint angles for positions of the tip.
+
+    Raises:
+        ValueError: the arm's file cannot be used.
+    """
+
+    def __init__(self, description: ArmDescription) -> None:
+        self.forward = Kinematics(description)
+        self._base, self._posture = np.array(description.base), np.array(description.posture)
+        self.solve = lru_cache(maxsize=4096)(self._solve)
+        # Outwards and inwards from the middle, each from its neighbour, so that the elbow does not flip.
+        middle = len(DISTANCES) // 2
+        table = np.zeros((len(DISTANCES), len(HEIGHTS), len(self._posture)))
+        for column, height in enumerate(HEIGHTS):
+            for rows in (range(middle, len(DISTANCES)), range(middle - 1, -1, -1)):
+                for row in rows:
+                    near = row - rows.step
+                    guess = table[near, column] if row != middle else self._posture
+                    place = self._base + np.array([DISTANCES[row], 0.0, height - self._base[2]])
+                    table[row, column] = self._descend(place, guess, TO_POSTURE)[0]
+        self._guess = RegularGridInterpolator((DISTANCES, HEIGHTS), table, bounds_error=False, fill_value=None)
+
+    def angles(self, place: Point) -> NDArray[np.float64] | None:
+        """Joint angles [J] radians that put the tip at `place` [3] metres, upright; None if there is no solution."""
+        return self.solve(*(float(value) for value in place))
+
+    def _solve(self, x: float, y: float, z: float) -> NDArray[np.float64] | None:
+        place = np.array([x, y, z])
+        if not np.isfinite(place).all():
+            return None
+        across = place[:2] - self._base[:2]
+        guess = self._guess((np.clip(np.linalg.norm(across), DISTANCES[0], DISTANCES[-1]), z))
+        guess = np.clip(guess.reshape(-1), self.forward.low, self.forward.high)
+        guess[0] += np.arctan2(across[1], across[0])
+        angles, there = self._descend(place, guess, 0.0)
+        return angles if there else None
+
+    def _descend(self, place: Point, angles: NDArray[np.float64], drift: float) -> tuple[NDArray[np.float64], bool]:
+        """Damped least squares from a guess, within the joints' limits: angles [J], and whether they converged."""
+        for _ in range(ITERATIONS):
+            position, axis, jacobian = self.forward(angles)
+            # The rotation that makes the axis point down; its component about the vertical is free.
+            error = np.concatenate([place - position, np.cross(axis, (0.0, 0.0, -1.0))[:2]])
+            if np.abs(error).max() < CLOSE and axis[2] < 0.0:
+                return angles, True
+            jacobian = jacobian[:5]
+            inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING * np.eye(5))
+            step = inverse @ error
+            if drift:
+                step += (np.eye(len(angles)) - inverse @ jacobian) @ (drift * (self._posture - angles))
+            step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
+            angles = np.clip(angles + step, self.forward.low, self.forward.high)
+        return angles, False
+
 
 WAYPOINTS = 11  # along a push, at most 14 mm apart
 WAYPOINTS_UP = 5  # between the table and `ABOVE_HEIGHT`
@@ -42,17 +112,14 @@ class ArmRobot:
         self._place = self.arm.tip()  # commanded position of the tip
 
     def fits(self, place: Point) -> bool:
-        """See `Robot`."""
         return not self._world.occupied(place, radius=STICK_RADIUS, length=STICK_LENGTH)
 
     def reaches(self, start: Point, end: Point) -> bool:
-        """See `Robot`."""
         columns = [_line(np.append(place[:2], ABOVE_HEIGHT), place, WAYPOINTS_UP) for place in (start, end)]
         paths = [self._angles(places) for places in (*columns, _line(start, end, WAYPOINTS))]
         return all(path is not None for path in paths)
 
     def move(self, place: Point) -> Stopped:
-        """See `Robot`."""
         if np.allclose(place[:2], self._place[:2]):
             path = self._angles(_line(self._place, place, WAYPOINTS_UP))
         else:
@@ -61,11 +128,9 @@ class ArmRobot:
         return self._follow(path, place, MOVE_STEPS)
 
     def slide(self, end: Point) -> Stopped:
-        """See `Robot`."""
         return self._follow(self._angles(_line(self._place, end, WAYPOINTS)), end, PUSH_STEPS)
 
     def leave(self) -> Stopped:
-        """See `Robot`."""
         if self._at is self._home:
             return ""
         stopped = self._follow(np.stack([self._at, self._home]), self.arm.tip(), MOVE_STEPS, guarded=False)
@@ -75,7 +140,6 @@ class ArmRobot:
         return stopped
 
     def clear_of_view(self, camera: Camera) -> bool:
-        """See `Robot`."""
         x, y, z = camera.position
         corners = self.arm.corners()
         # Project the arm from the camera onto the table; parts above the camera do not count.
@@ -86,16 +150,13 @@ class ArmRobot:
         return bool(apart.any(axis=1).all())
 
     def stop(self) -> None:
-        """See `Robot`."""
         self._at, self._place = self.arm.angles(), self.arm.tip()
         self.arm.command(self._at, np.zeros_like(self._at))
 
     def wait(self) -> None:
-        """See `Robot`."""
         self._world.step()
 
     def tip(self) -> Point:
-        """See `Robot`."""
         return self.arm.tip()
 
     def _angles(self, places: NDArray[np.float64]) -> NDArray[np.float64] | None:

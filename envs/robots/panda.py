@@ -6,9 +6,9 @@ from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
+from envs.files import process_folder
 from envs.physics import PYBULLET_DATA, ArmDescription
 from envs.physics.arm import STICK, TIP
-from envs.process_folder import process_folder
 from envs.robots.robot import STICK_LENGTH, STICK_RADIUS
 
 POSTURE = (0.0, 0.3, 0.0, -1.8, 0.0, 2.2, 0.78)  # radians

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from xml.etree import ElementTree
 
-from envs.assets import assets_folder
+from envs.files import assets_folder
 from envs.physics import ArmDescription
 
 URDF = Path("sawyer", "sawyer_stick.urdf")  # inside the folder of assets

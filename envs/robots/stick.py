@@ -27,21 +27,17 @@ class StickRobot:
         self._tip = np.array(RETRACTED) - (0.0, 0.0, _MIDDLE)
 
     def fits(self, place: Point) -> bool:
-        """See `Robot`."""
         self._put(place, np.zeros(3))
         return not any(self._world.overlaps(self._tool, body) for body in self._world.objects)
 
     def reaches(self, start: Point, end: Point) -> bool:
-        """See `Robot`."""
         return True
 
     def move(self, place: Point) -> Stopped:
-        """See `Robot`."""
         self._tip = place  # without passing time or touching anything
         return ""
 
     def slide(self, end: Point) -> Stopped:
-        """See `Robot`."""
         start = self._tip
         phase = np.linspace(0.0, np.pi, PUSH_STEPS + 1)
         travelled = (1.0 - np.cos(phase)) / 2.0
@@ -51,25 +47,20 @@ class StickRobot:
         return self.move(end)
 
     def leave(self) -> Stopped:
-        """See `Robot`."""
         self._put(np.array(RETRACTED) - (0.0, 0.0, _MIDDLE), np.zeros(3))
         return ""
 
     def clear_of_view(self, camera: Camera) -> bool:
-        """See `Robot`."""
         return bool(self._tip[2] > camera.position[2])
 
     def stop(self) -> None:
-        """See `Robot`."""
         self._put(self._tip, np.zeros(3))
 
     def wait(self) -> None:
-        """See `Robot`."""
         self.stop()
         self._world.step()
 
     def tip(self) -> Point:
-        """See `Robot`."""
         return self._tip.copy()
 
     def _put(self, tip: Point, velocity: Point) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from envs.segmentation.clusters import ClusterSegmenter
-from envs.segmentation.mask import MaskSegmenter, TrueMasks
-from envs.segmentation.segmenter import Pixels, Segmenter
+from envs.segmentation.segmenter import MaskSegmenter, Pixels, Segmenter, TrueMasks
 from envs.workspace import OBJECT_SLOTS
 
 SegmenterFactory = Callable[[int], Segmenter]

@@ -10,8 +10,16 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from envs.segmentation.height_map import HeightMap, Mask, cells_of, map_heights
-from envs.segmentation.regions import AROUND, box_around, find_regions, split_at_necks
+from envs.segmentation.height_map import (
+    AROUND,
+    HeightMap,
+    Mask,
+    box_around,
+    cells_of,
+    find_regions,
+    map_heights,
+    split_at_necks,
+)
 from envs.segmentation.segmenter import Pixels
 from envs.segmentation.tracking import Track, begin_track, follow_tracks
 from envs.sensors.sensor import DepthImage

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.tasks.generated import GeneratedLayouts, blocks, paths
-from envs.tasks.step import Step
-from envs.tasks.task import Marking, Task, check_inside
+from envs.tasks.task import Marking, Step, Task, check_inside
 from envs.tasks.tiles import TileSet, table_distance
 
 

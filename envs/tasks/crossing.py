@@ -8,8 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from envs.tasks.generated import GeneratedLayouts, paths, reachable_tiles, starting_tiles
-from envs.tasks.step import Step
-from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart, check_inside
+from envs.tasks.task import GOAL_MARKING, Marking, Step, Task, check_apart, check_inside
 from envs.tasks.tiles import TileSet
 from envs.workspace import TILE_SIDE
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from envs.tasks.step import Step
-from envs.tasks.task import Marking, Task, check_apart
+from envs.tasks.task import Marking, Step, Task, check_apart
 from envs.tasks.tiles import TileSet
 
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.tasks.generated import ANY_SHAPE, GeneratedLayouts, neighbours, reachable_tiles, starting_tiles
-from envs.tasks.step import Step
-from envs.tasks.task import GOAL_MARKING, Marking, Task, check_apart
+from envs.tasks.task import GOAL_MARKING, Marking, Step, Task, check_apart
 from envs.tasks.tiles import TileSet
 from envs.workspace import TILE_COUNT, Tile
 

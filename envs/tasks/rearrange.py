@@ -15,8 +15,7 @@ from torch import Tensor
 from envs.goals import Goal, assign, read_goal, sample_places
 from envs.markings import Place, TileGroup
 from envs.observation import Observation
-from envs.tasks.step import Step
-from envs.tasks.task import Marking, Task
+from envs.tasks.task import Marking, Step, Task
 from envs.tasks.tiles import TileSet
 from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW
 

@@ -14,9 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.tasks.distance_field import DistanceField, grid
-from envs.tasks.step import Step, off_table
-from envs.tasks.task import Task
+from envs.tasks.task import Step, Task, off_table
+from envs.tasks.tiles import DistanceField, grid
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 REWARD_NAMES = ("dense", "sparse")

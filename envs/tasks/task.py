@@ -1,7 +1,7 @@
-"""Base class of tasks: their tiles, success, violations, and the terms of their reward.
+"""Base class of tasks: their tiles, success, violations, and the terms of their reward; and the steps they judge.
 
 A task is one class in one file of this folder; `envs/layouts/` has its layouts. The same functions evaluate the steps
-of the environment and the predicted steps of planners.
+of the environment and the predicted steps of planners. Tensors may have any leading dimensions `[...]`.
 
 Source: paper, section 4.1 and appendix "Task Details".
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, fields
 from typing import ClassVar, Literal, NamedTuple, TypeVar, get_type_hints
 
@@ -21,9 +21,90 @@ from torch import Tensor
 from envs.markings import Place, TileGroup
 from envs.observation import Observation
 from envs.tasks.generated import GeneratedLayouts
-from envs.tasks.step import Step
-from envs.tasks.tiles import TileSet, parse_tiles
-from envs.workspace import Tile
+from envs.tasks.tiles import TileSet, box_distance, parse_tiles, table_distance
+from envs.workspace import REACH_HIGH, REACH_LOW, Tile
+
+STILL = 0.005  # metres; what moves by less is taken to stay where it is
+
+Depth = Callable[[Tensor], Tensor]
+"""Metres from points [..., 2] to the border of a forbidden place, positive within it: [...]."""
+
+
+class Step(NamedTuple):
+    """Planar centres of objects in T + 1 successive states, with a push from each to the next; object 0 is the target.
+
+    A task evaluates all T steps at once: [..., T]. The environment evaluates T = 1 step at a time, planners whole
+    segments, so that no state is evaluated twice.
+
+    Attributes:
+        states: [..., T + 1, M, 2] metres. mask: [..., 1, M] bool, True for real objects.
+        margin: safety margin in metres, for planners; else 0.
+    """
+
+    states: Tensor
+    mask: Tensor
+    margin: float
+
+    @property
+    def before(self) -> Tensor:
+        """Positions before the push: [..., T, M, 2] metres."""
+        return self.states[..., :-1, :, :]
+
+    @property
+    def after(self) -> Tensor:
+        """Positions after the push: [..., T, M, 2] metres."""
+        return self.states[..., 1:, :, :]
+
+    @property
+    def target(self) -> Tensor:
+        """Position of the target after the push: [..., T, 2] metres."""
+        return self.after[..., 0, :]
+
+    def target_enters(self, depth: Depth) -> Tensor:
+        """Whether the target is in a forbidden place: [..., T] bool.
+
+        Within the margin around that place, an object may stay where it is or move away, but come no closer.
+        """
+        return self._enters(depth, self.states[..., :1, :]).squeeze(-1)
+
+    def any_enters(self, depth: Depth) -> Tensor:
+        """Whether any real object is in a forbidden place, with the margin as in `target_enters`: [..., T] bool."""
+        return (self._enters(depth, self.states) & self.mask).any(dim=-1)
+
+    def any_leaves_reach(self, arrived: Callable[[Tensor], Tensor]) -> Tensor:
+        """Whether a push moves any real object out of the tool's reach, the margin included, or farther: [..., T] bool.
+
+        By more than `STILL`: predictions of an object that nothing touches differ by less. What lies there may stay.
+
+        Args:
+            arrived: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
+        """
+        depths = torch.where(arrived(self.states), -torch.inf, _out_of_reach(self.states))
+        before, after = depths[..., :-1, :], depths[..., 1:, :]
+        return ((after > -self.margin) & (after > before + STILL) & self.mask).any(dim=-1)
+
+    def all_within(self, depth: Depth) -> Tensor:
+        """Whether every real object is more than the margin within a place, by its `depth`: [..., T] bool."""
+        return ~(~(depth(self.after) > self.margin) & self.mask).any(dim=-1)
+
+    def _enters(self, depth: Depth, states: Tensor) -> Tensor:
+        """Of each object in `states: [..., T + 1, M, 2]`: [..., T, M] bool."""
+        if self.margin == 0.0:
+            return depth(states[..., 1:, :, :]) > 0.0
+        depths = depth(states)  # once per state, although a state is after one push and before the next
+        before, after = depths[..., :-1, :], depths[..., 1:, :]
+        return (after > 0.0) | ((after > -self.margin) & (after > before))
+
+
+def off_table(points: Tensor) -> Tensor:
+    """Metres by which points [..., 2] lie off the table, negative on it: [...]."""
+    return -table_distance(points)
+
+
+def _out_of_reach(points: Tensor) -> Tensor:
+    """Metres by which points [..., 2] lie outside the box that the tool's tip reaches, negative within: [...]."""
+    return -box_distance(points, REACH_LOW, REACH_HIGH)
+
 
 GOAL_REWARD = 100.0
 VIOLATION_REWARD = -100.0
@@ -211,3 +292,24 @@ def check_inside(inner: Iterable[Tile], outer: Iterable[Tile], problem: str) -> 
     """Raise ValueError if a tile of `inner` is not in `outer`; it replaces `{tile}` in `problem`."""
     if outside := set(inner) - set(outer):
         raise ValueError(problem.format(tile=list(min(outside))))
+
+
+def check_functions(task: Task, objects: int) -> None:
+    """Call the functions of a task once, on a few plans with that number of objects.
+
+    Raises:
+        ValueError: one returns another type or shape than `Task` documents.
+    """
+    plans, steps = 8, 6  # other than one another and than any number of objects: no wrong shape fits by chance
+    states, mask = torch.zeros(plans, steps + 1, objects, 2), torch.ones(plans, 1, objects, dtype=torch.bool)
+    step = Step(states, mask, 0.0)
+    flags = ("success", "violation", "published_violation", "dead_end")
+    values = {name: (getattr(task, name)(step), "bool", [plans, steps]) for name in flags}
+    values["potential"] = task.potential(states, mask), "metres", [plans, steps + 1]
+    for name, (value, kind, shape) in values.items():
+        fits = isinstance(value, Tensor) and (value.dtype == torch.bool) == (kind == "bool")
+        sizes = [*zip(value.shape[::-1], shape[::-1], strict=False)] if fits else []
+        fits = fits and value.ndim <= len(shape) and all(size in (1, wanted) for size, wanted in sizes)
+        if not fits or (kind == "metres" and (1, steps + 1) in sizes[:1]):
+            given = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"task {type(task).__name__}: {name} must return {kind} [...], here {shape}, not {given}")

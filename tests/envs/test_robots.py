@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,24 +13,18 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.physics import PhysicsWorld
-from envs.pushing import PushingEnv
-from envs.robots import ROBOTS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, ArmRobot, push, robot_factory
+from envs.robots import STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, push
 from envs.robots.arm import inverse_kinematics
-from envs.robots.panda import panda
 from envs.robots.robot import ABOVE_HEIGHT
 from envs.robots.sawyer import sawyer
 from envs.scene import Scene
-from envs.sensors.camera import Camera
 from envs.workspace import REACH_HIGH, REACH_LOW
 from tests.real_assets import REAL_ASSETS
 
-ROOT = Path(__file__).parents[2]
 NO_SAWYER = "the Sawyer's URDF lies neither in ../shared/assets nor where CAVIN_ASSETS says"
 with_sawyer = pytest.mark.skipif(not (REAL_ASSETS / "sawyer" / "sawyer_stick.urdf").is_file(), reason=NO_SAWYER)
 ARMS = [pytest.param("sawyer", marks=with_sawyer), "panda"]
 EVERY_ROBOT = [*ARMS, "stick"]
-CAMERAS = [Camera(position=(x, y, z)) for x in (0.55, 0.65) for y in (-0.05, 0.05) for z in (0.95, 1.05)]
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +33,6 @@ def scene_of() -> Callable[[str], Scene]:
     yield lambda name: made.setdefault(name, Scene(robot=name, assets=REAL_ASSETS))
     for scene in made.values():
         scene.close()
-
-
-def bodies_in_view(scene: Scene) -> set[int]:
-    """Bodies that the observing camera sees."""
-    return set(np.unique(scene.world.render(scene.camera).bodies).tolist()) - {-1}
-
-
-# A push.
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -105,32 +89,6 @@ def test_an_arm_touches_nothing_on_its_way_between_retracted_and_above(
     np.testing.assert_allclose(after.orientations, before.orientations, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ARMS)
-def test_the_arm_is_in_the_photograph_of_a_push_and_never_in_the_image_that_is_observed(
-    put: Callable, push: Callable, name: str
-) -> None:
-    during: list[set[int]] = []
-    photographs: list[np.ndarray] = []
-
-    def film() -> None:
-        during.append(bodies_in_view(scene))
-        photographs.append(scene.photograph(scene.camera))
-
-    scene = Scene(robot=name, assets=REAL_ASSETS)
-    scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
-    arm, without = scene.robot.arm.body, scene.photograph(scene.camera)
-    assert arm not in bodies_in_view(scene)
-    for action in (push(0.45, 0.0, 0.0, 0.1), push(0.55, 0.0, 0.0, 0.1), push(0.45, 0.2, 0.08, 0.0)):
-        scene.on_frame = film if not during else None
-        scene.push(action)
-        assert arm not in bodies_in_view(scene)
-        assert all(scene.robot.clear_of_view(camera) for camera in CAMERAS)
-    assert arm in set().union(*during)
-    shown = max(np.abs(image.astype(int) - without).max(axis=-1).mean() for image in photographs)
-    assert shown > 2  # of 255, over the whole image
-    scene.close()
-
-
 def test_observing_with_the_arm_in_view_raises(scene_of: Callable, put: Callable) -> None:
     scene = scene_of("panda")
     scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
@@ -140,9 +98,6 @@ def test_observing_with_the_arm_in_view_raises(scene_of: Callable, put: Callable
         scene.observe()
     scene.robot.leave()
     assert scene.observe().visible[0]
-
-
-# What ends a push early.
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)
@@ -178,18 +133,6 @@ def test_a_push_out_of_reach_is_not_begun(scene_of: Callable, put: Callable, pus
     assert report.stopped == "unreachable" and report.ineffective and not report.unsafe
     np.testing.assert_array_equal(scene.ground_truth().positions, before.positions)
     assert scene.push(push(0.5, 0.0, 0.05, 0.0)).stopped == ""  # and the next one is
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_an_arm_that_meets_the_table_stops_and_leaves(scene_of: Callable, put: Callable, name: str) -> None:
-    scene = scene_of(name)
-    scene.reset([put("rubiks_cube", 0.55, 0.2)], np.random.default_rng(0))
-    robot = scene.robot
-    assert not robot.move(np.array([0.5, 0.0, ABOVE_HEIGHT]))
-    assert robot.move(np.array([0.5, 0.0, -0.05])) == "table"
-    assert robot.tip()[2] > -0.01
-    robot.leave()
-    assert robot.clear_of_view(scene.camera)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -230,9 +173,6 @@ def test_whatever_stops_a_push_the_robot_goes_up_and_is_retracted(verb: str) -> 
     assert ("slide" in robot.called) == (verb == "slide")
 
 
-# Inverse kinematics.
-
-
 @with_sawyer
 @settings(max_examples=60)
 @given(st.floats(REACH_LOW[0], REACH_HIGH[0]), st.floats(REACH_LOW[1], REACH_HIGH[1]))
@@ -245,28 +185,6 @@ def test_the_sawyer_reaches_every_place_and_holds_the_stick_upright(x: float, y:
         found = inverse.forward(angles)
         np.testing.assert_allclose(found.position, [x, y, height], atol=2e-4)
         assert found.axis[2] < -0.999
-
-
-def test_the_panda_reaches_nine_tenths_of_the_table_and_says_where_it_does_not() -> None:
-    inverse = inverse_kinematics(panda())
-    grid = [np.array([x, y, TIP_HEIGHT]) for x in np.linspace(0.3, 0.8, 6) for y in np.linspace(-0.55, 0.55, 7)]
-    reached = [inverse.angles(place) is not None for place in grid]
-    assert np.mean(reached) > 0.85
-    assert inverse.angles(np.array([0.8, 0.55, TIP_HEIGHT])) is None
-    assert inverse.angles(np.array([np.nan, 0.0, 0.1])) is None
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_the_answer_does_not_depend_on_what_was_asked_before(name: str) -> None:
-    description = panda() if name == "panda" else sawyer(REAL_ASSETS)
-    places = np.random.default_rng(0).uniform((0.3, -0.4, 0.0), (0.6, 0.4, 0.2), size=(10, 3))
-    one, other = (type(inverse_kinematics(description))(description) for _ in range(2))
-    forwards = [one.angles(place) for place in places]
-    backwards = [other.angles(place) for place in places[::-1]][::-1]
-    np.testing.assert_array_equal(forwards, backwards)
-
-
-# Files.
 
 
 def test_missing_files_are_named_in_one_line(tmp_path: Path) -> None:
@@ -286,70 +204,8 @@ def test_missing_files_are_named_in_one_line(tmp_path: Path) -> None:
         assert "python -m cavin_pyro.assets sawyer --to DIR" in str(caught.value)
 
 
-def test_the_folder_may_be_named_from_the_users_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "mine" / "sawyer").mkdir(parents=True)
-    (tmp_path / "mine" / "sawyer" / "sawyer_stick.urdf").write_text("<robot/>")
-    assert sawyer("~/mine").urdf == tmp_path / "mine" / "sawyer" / "sawyer_stick.urdf"
-    for absent in ("~nobody-of-this-name/mine", "a" * 300):
-        with pytest.raises(ValueError, match=rf"needs sawyer/sawyer_stick.urdf, which is not in {absent}"):
-            sawyer(absent)
-
-
-def test_a_urdf_of_something_else_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "sawyer").mkdir()
-    (tmp_path / "sawyer" / "sawyer_stick.urdf").write_text('<robot name="r"><link name="base"/></robot>')
-    world = PhysicsWorld()
-    with pytest.raises(ValueError, match=r"has no joint or link named 'controller_box'"):
-        robot_factory("sawyer", tmp_path)(world)
-    world.close()
-
-
-# Environments.
-
-
 @pytest.mark.parametrize("name", ARMS)
 def test_gymnasium_finds_nothing_wrong_with_an_arm(name: str) -> None:
     env = gymnasium.make("cavin/Crossing-v0", robot=name, assets=str(REAL_ASSETS), objects=2, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.close()
-
-
-def episode(name: str) -> bytes:
-    """Everything that fixed actions show."""
-    env, content = PushingEnv(robot=name, assets=REAL_ASSETS, objects=3), b""
-    actions = np.random.default_rng(0).uniform(-0.6, 0.6, size=(3, 4)).astype(np.float32)
-    first, _ = env.reset(seed=1)
-    for observed in (first, *(env.step(action)[0] for action in actions)):
-        content += b"".join(array.tobytes() for array in observed.values())
-    env.close()
-    return content
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("name", ARMS)
-def test_equal_seeds_and_actions_give_equal_observations_here_and_in_another_process(name: str) -> None:
-    script = (
-        "import importlib.util, sys\n"
-        "spec = importlib.util.spec_from_file_location('robots', sys.argv[1])\n"
-        "module = importlib.util.module_from_spec(spec)\n"
-        "spec.loader.exec_module(module)\n"
-        "sys.stdout.buffer.write(module.episode(sys.argv[2]))\n"
-    )
-    command = [sys.executable, "-c", script, str(Path(__file__).resolve()), name]
-    elsewhere = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
-    here = episode(name)
-    assert here == episode(name) == elsewhere.stdout
-
-
-def test_every_name_makes_a_robot_that_has_every_verb() -> None:
-    from envs.robots import Robot
-
-    verbs = {name for name in vars(Robot) if not name.startswith("_")}
-    assert verbs == {"fits", "reaches", "move", "slide", "leave", "clear_of_view", "stop", "wait", "tip"}
-    assert set(ROBOTS) == {"stick", "sawyer", "panda"}
-    world = PhysicsWorld()
-    for robot in (robot_factory("stick")(world), robot_factory("panda")(world)):
-        assert all(callable(getattr(robot, verb)) for verb in verbs)
-    assert isinstance(robot, ArmRobot)
-    world.close()

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,19 +11,15 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import envs.segmentation.clusters as clusters_module
 from envs.objects.sampling import ObjectParameters
 from envs.pushing import PushingEnv
 from envs.scene import Scene
-from envs.segmentation import SEGMENTERS, ClusterSegmenter, MaskSegmenter, segmenter_of
-from envs.segmentation.height_map import CELL, ORIGIN, fit_table
-from envs.segmentation.regions import split_at_necks
-from envs.segmentation.registration import explain
-from envs.segmentation.shapes import Pose, shape_of
+from envs.segmentation import SEGMENTERS, ClusterSegmenter, MaskSegmenter
+from envs.segmentation.height_map import fit_table, split_at_necks
+from envs.segmentation.registration import Pose, explain, shape_of
 from envs.sensors import CAMERAS, DepthImage
 from envs.sensors.camera import Camera
 
-ROOT = Path(__file__).parents[2]
 CAMERA = Camera(256, 212, rotation=(0.02, -0.02, 0.01))
 
 
@@ -59,23 +51,6 @@ def pixel(image: DepthImage, x: float, y: float, z: float = 0.05) -> tuple[int, 
     return row, column
 
 
-def test_the_cluster_segmenter_gets_only_the_depth_and_the_camera() -> None:
-    names = set(DepthImage.__dataclass_fields__)
-    assert names == {"depth", "camera"}
-    assert list(inspect.signature(ClusterSegmenter.follow).parameters) == ["self", "image"]
-    assert list(inspect.signature(ClusterSegmenter).parameters) == ["slots"]
-
-    def betray() -> list:
-        raise AssertionError("the simulator was asked")
-
-    assert isinstance(segmenter_of("clusters", betray), ClusterSegmenter)
-    image = table(CAMERA, (0.6, 0.1, 0.04, 0.04))
-    segmenter = SEGMENTERS["clusters"](betray)
-    segmenter.start(image, pixel(image, 0.6, 0.1))
-    assert len(segmenter.follow(image)) == 1
-    assert not {name for name in vars(clusters_module) if "physics" in name.lower()}
-
-
 def test_the_mask_gives_each_object_its_own_measured_pixels_in_order() -> None:
     two, one = np.array([[0, 0, 1], [0, 1, 1]], bool), np.array([[0, 0, 0], [1, 0, 0]], bool)
     depth = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
@@ -99,11 +74,6 @@ def test_the_table_is_found_though_the_cameras_pose_is_not_quite_known(
     believed = DepthImage(image.depth, Camera(256, 212, (position[0], position[1], position[2] + error), rotation))
     plane = fit_table(believed)
     assert 1.0 / np.linalg.norm(plane) == pytest.approx(position[2], abs=1e-3)  # the camera's true height
-
-
-def test_an_image_without_a_table_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^no table in the depth image"):
-        ClusterSegmenter().start(DepthImage(np.zeros((212, 256)), CAMERA), None)
 
 
 def test_the_confirmed_object_comes_first() -> None:
@@ -138,16 +108,6 @@ def test_an_object_is_known_again_where_it_was_pushed_and_when_it_comes_back_to_
     assert [len(rows) > 0 for rows, _ in hidden] == [False, True, True]
     back = segmenter.follow(pushed)
     np.testing.assert_allclose([center(pushed, pixels)[:2] for pixels in back], second, atol=0.002)
-
-
-def test_what_has_left_the_table_is_not_looked_for_in_what_another_has_become() -> None:
-    before = table(CAMERA, (0.6, 0.1, 0.04, 0.03), (0.6, 0.25, 0.03, 0.05))
-    segmenter = ClusterSegmenter()
-    segmenter.start(before, pixel(before, 0.6, 0.1))
-    after = table(CAMERA, (0.6, 0.3, 0.03, 0.05))
-    gone, moved = segmenter.follow(after)
-    assert len(gone[0]) == 0
-    np.testing.assert_allclose(center(after, moved)[:2], (0.6, 0.3), atol=0.004)
 
 
 def test_a_handle_beside_a_body_is_part_of_it_and_a_like_thing_alone_is_an_object() -> None:
@@ -192,34 +152,6 @@ def test_three_in_a_row_that_touch_and_are_pushed_on_keep_their_places_until_the
     np.testing.assert_allclose(ys, first, atol=0.004)
 
 
-def test_a_bent_object_around_another_is_separated_from_it() -> None:
-    def bent(x: float, y: float) -> list[tuple[float, float, float, float]]:
-        return [(x, y, 0.015, 0.07), (x + 0.05, y - 0.055, 0.05, 0.015), (x + 0.05, y + 0.055, 0.05, 0.015)]
-
-    apart = table(CAMERA, *bent(0.4, 0.0), (0.65, 0.0, 0.025, 0.025))
-    within = table(CAMERA, *bent(0.4, 0.0), (0.442, 0.01, 0.025, 0.025))
-    segmenter = ClusterSegmenter()
-    segmenter.start(apart, pixel(apart, 0.65, 0.0))
-    square, _ = segmenter.follow(within)
-    np.testing.assert_allclose(center(within, square)[:2], (0.442, 0.01), atol=0.008)
-
-
-def test_the_shape_from_when_an_object_stood_alone_is_remembered_while_it_touches_another() -> None:
-    apart = table(CAMERA, (0.6, 0.0, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
-    touching = table(CAMERA, (0.6, 0.11, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
-    segmenter = ClusterSegmenter()
-    segmenter.start(apart, pixel(apart, 0.6, 0.0))
-    before = [track.shape for track in segmenter._tracks]
-    segmenter.follow(touching)
-    after = [track.shape for track in segmenter._tracks]
-    for one, other in zip(before, after, strict=True):
-        np.testing.assert_array_equal(one.patch, other.patch)
-    moved = np.subtract((after[0].pose.row, after[0].pose.column), (before[0].pose.row, before[0].pose.column)) * CELL
-    np.testing.assert_allclose(moved, (0.0, 0.11), atol=0.006)
-    segmenter.follow(apart)
-    assert segmenter._tracks[0].shape is not after[0]
-
-
 def boxes_on_map(*boxes: tuple[float, float, float, float, float, float]) -> list[np.ndarray]:
     """Maps of heights, each of one box (row, column, turn, half height, half width in cells, metres high)."""
     rows, columns = np.indices((80, 80))
@@ -258,15 +190,6 @@ def test_a_shape_that_is_not_on_the_map_is_not_laid_there() -> None:
     assert set(explain(maps[0] + maps[1], shapes, ()).poses) == {0, 1}
 
 
-def test_an_object_taken_to_stand_still_may_turn_out_to_have_moved_on() -> None:
-    low, high = (30, 40, 0.0, 6.0, 8.0, 0.04), (43, 40, 0.0, 6.0, 5.0, 0.04)
-    shapes = [shape_of(one > 0, one) for one in boxes_on_map(low, high)]
-    pushed = boxes_on_map((43, 40, *low[2:]), (56, 40, *high[2:]))  # the first stands where the second stood
-    owners = explain(np.maximum(*pushed), shapes, still=[1]).owners()
-    for n in range(2):
-        assert (owners[pushed[n] > 0] == n).mean() > 0.85
-
-
 @settings(deadline=None, max_examples=20)
 @given(st.floats(-3.1, 3.1), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
 def test_a_shape_covers_as_many_cells_wherever_it_is_placed(turn: float, row: float, column: float) -> None:
@@ -276,10 +199,6 @@ def test_a_shape_covers_as_many_cells_wherever_it_is_placed(turn: float, row: fl
     assert len(np.unique(cells, axis=0)) == len(cells) == pytest.approx(shape.area, rel=0.1)
     np.testing.assert_allclose(cells.mean(axis=0), (row, column), atol=1.0)
     assert set(heights) == {np.float32(SIDES[0][2])}
-
-
-def test_the_map_covers_the_table() -> None:
-    assert (ORIGIN < (0.22, -0.61)).all()
 
 
 def test_clusters_agree_with_the_mask_on_what_the_kinect_sees(seen_by_kinect: Scene, put: Callable) -> None:
@@ -301,32 +220,3 @@ def test_gymnasium_finds_nothing_wrong_with_any_camera_and_segmentation(camera: 
     env = PushingEnv(objects=2, camera=camera, segmentation=segmentation)
     check_env(env, skip_render_check=True)
     env.close()
-
-
-PROGRAM = """
-import hashlib, numpy as np
-from envs.pushing import PushingEnv
-env, hashed = PushingEnv(objects=3, camera="kinect2", segmentation="clusters"), hashlib.sha256()
-for run in range({runs}):
-    observed = [env.reset(seed=4)[0]]
-    observed += [env.step(action)[0] for action in np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)]
-    hashed = hashlib.sha256()
-    for one in observed:
-        for name in sorted(one):
-            hashed.update(one[name].tobytes())
-print(hashed.hexdigest())
-"""
-
-
-@pytest.mark.soak
-def test_a_seed_and_actions_give_the_same_observations_again_and_in_another_process() -> None:
-    hashes = []
-    for runs in (1, 2):
-        command = [sys.executable, "-c", PROGRAM.format(runs=runs)]
-        hashes.append(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
-    assert hashes[0] == hashes[1]
-
-
-def test_an_unknown_segmentation_gets_its_one_line() -> None:
-    with pytest.raises(ValueError, match=r"^unknown segmentation 'guess': choose from mask, clusters$"):
-        PushingEnv(segmentation="guess")

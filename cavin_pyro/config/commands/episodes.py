@@ -140,7 +140,7 @@ class PlanConfig(EpisodeConfig):
     video: bool = option(True, "write a video of the episode", group="run")
     save_goal: str | None = option(
         None,
-        "file for the episode's last scene, as a goal for task=rearrange: a depth image (.png, .npy) or point clouds "
+        "file for the episode's last scene, as a goal for task=rearrange: a depth image (.png) or point clouds "
         "(.safetensors)",
         group="run",
     )

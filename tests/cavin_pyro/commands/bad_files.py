@@ -111,10 +111,10 @@ BAD_FILES = [
     ("collect", "env.ranges.clearance=2 minimum_objects=5", "no room for 5 objects at least 2 m apart"),
     # Goals.
     ("plan", "task=rearrange task.goal=@nothing.png", "nothing.png cannot be read: No such file or directory"),
-    ("plan", "task=rearrange task.goal=@noise", "must be a file that ends in .png, .npy, .safetensors"),
-    ("evaluate", "task=rearrange task.goal=@no_yaml.yaml", "must be a file that ends in .png, .npy, .safetensors"),
+    ("plan", "task=rearrange task.goal=@noise", "must be a file that ends in .png or .safetensors"),
+    ("evaluate", "task=rearrange task.goal=@no_yaml.yaml", "must be a file that ends in .png or .safetensors"),
     ("plan", "save_goal=@nothing/goal.png", "there is no folder"),
-    ("plan", "save_goal=goal.pkl", "save_goal=goal.pkl must end in .png, .npy, .safetensors"),
+    ("plan", "save_goal=goal.pkl", "save_goal=goal.pkl must end in .png or .safetensors"),
     # Places that cannot be written to; a folder below a file is refused to every user alike.
     *(
         (

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from envs.layouts import load_task, parse_task
 from envs.tasks import TASKS, TaskReward
-from envs.tasks.distance_field import SPACING, DistanceField, grid
-from envs.tasks.generated import paths
+from envs.tasks.tiles import SPACING, DistanceField, grid
 from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, tile_center
 
 UPPER = [(1, column) for column in range(1, 6)]
@@ -46,32 +42,6 @@ def test_the_distance_follows_a_bridge_round_its_bend() -> None:
         assert left(reward, (1, column)) == pytest.approx(to_corner + side + 3 * side, abs=ERROR)
     # The straight path from the start is two tiles long.
     assert left(reward, (1, 1)) > 1.1 > 3 * side > 2 * side
-
-
-def test_the_distance_falls_from_tile_to_tile_and_nowhere_faster_than_an_object_moves() -> None:
-    reward = crossing(U, (3, 1))
-    path = [*UPPER, (2, 5), *[(3, column) for column in range(5, 0, -1)]]
-    places = [
-        (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]))
-        for a, b in pairwise(path)
-        for share in torch.linspace(0, 1, 31)[:-1].tolist()
-    ]
-    distances = torch.tensor([left(reward, place) for place in places])
-    assert distances.diff().abs().max() <= 1.5 * TILE_SIDE / 30
-    borders = distances[15::30]  # between each tile and the next
-    assert (borders.diff()[:-1] < 0).all() and borders[-1] == pytest.approx(0.0, abs=SPACING)
-
-
-def test_a_diagonal_touch_of_two_tiles_is_no_path() -> None:
-    around = [(1, 1), (1, 2), (1, 3), (2, 3), (3, 3), (3, 2)]  # (3, 2) and (2, 1) touch in a corner
-    reward = crossing([*around, (2, 1)], (2, 1))
-    round_the_gap = math.hypot(TILE_SIDE / 2, TILE_SIDE / 2) + 2 * TILE_SIDE  # along two sides of (2, 2)
-    assert left(reward, (3, 2)) == pytest.approx(round_the_gap, abs=ERROR)
-
-
-def test_an_obstacle_is_not_what_the_goal_is_about() -> None:
-    reward = crossing(U, (3, 1))
-    assert left(reward, (1, 1), (3, 1)) == left(reward, (1, 1), (1, 1))
 
 
 def test_to_clear_is_the_distance_out_of_the_region_of_all_objects_together() -> None:
@@ -115,21 +85,6 @@ def test_the_distance_is_zero_where_the_task_is_solved_and_nowhere_longer_than_i
     assert (distances >= 0).all() and (distances <= reward.distance_to_goal.longest(mask)).all()
 
 
-def test_batches_and_the_order_of_objects_do_not_matter() -> None:
-    torch.manual_seed(0)
-    centers = 0.3 + 0.5 * torch.rand(2, 5, 4, 3)
-    mask = torch.tensor([True, True, True, False])
-    for name, about_all in (("clearing", True), ("crossing", False)):
-        reward = TaskReward(load_task(name, 0))
-        together = reward.distance_to_goal(centers, mask.expand(2, 5, 4))
-        for i in range(2):
-            for j in range(5):
-                assert reward.distance_to_goal(centers[i, j], mask) == together[i, j]
-        order = [2, 0, 1, 3] if about_all else [0, 2, 1, 3]
-        torch.testing.assert_close(reward.distance_to_goal(centers[:, :, order], mask[order].expand(2, 5, 4)), together)
-        assert reward.distance_to_goal.longest(mask.expand(2, 5, 4)).shape == (2, 5)
-
-
 def test_places_off_the_table_and_predictions_that_are_not_finite_have_a_distance() -> None:
     reward = crossing(U, (3, 1))
     far = torch.tensor([[[9.0, -9.0, 0.0]], [[torch.nan, 0.0, 0.0]], [[torch.inf, -torch.inf, 0.0]]])
@@ -141,17 +96,3 @@ def test_without_a_goal_there_is_no_direction() -> None:
     nowhere = torch.zeros(grid().shape[:-1], dtype=torch.bool)
     field = DistanceField(~nowhere, nowhere)
     assert field.longest == 0.0 and not field(torch.rand(5, 2)).any()
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(4, 14), st.randoms(use_true_random=False))
-def test_no_path_on_a_bridge_is_shorter_than_the_straight_one_or_longer_than_through_the_middles(
-    tiles: int, random: object
-) -> None:
-    by_shape = paths(tiles)
-    bridge = random.choice(by_shape[random.choice(list(by_shape))])  # type: ignore[attr-defined]
-    reward = crossing(list(bridge), bridge[-1])
-    for number, tile in enumerate(bridge[:-1]):
-        metres = left(reward, tile)
-        straight = math.dist(tile_center(tile), tile_center(bridge[-1])) - TILE_SIDE * math.sqrt(0.5)
-        assert straight - SPACING <= metres <= (len(bridge) - number - 1.5) * TILE_SIDE + ERROR

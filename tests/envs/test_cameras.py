@@ -1,4 +1,4 @@
-"""Cameras with any pose, and the Kinect v2's errors."""
+"""Cameras: their geometry, alone and through the renderer, and the Kinect v2's errors."""
 
 from __future__ import annotations
 
@@ -11,8 +11,52 @@ from hypothesis import strategies as st
 
 from envs.scene import Scene
 from envs.sensors import CAMERAS, IdealSensor, Kinect2, sensor_of
-from envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
+from envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera, sample_cloud
 from envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation, axial_noise
+
+
+def test_the_images_up_is_x_and_its_left_is_y() -> None:
+    camera = Camera()
+    middle, up, left = camera.project(np.array([[0.6, 0.0, 0.0], [0.7, 0.0, 0.0], [0.6, 0.1, 0.0]]))
+    np.testing.assert_allclose(middle, [camera.width / 2, camera.height / 2])
+    assert up[1] < middle[1] and up[0] == middle[0]
+    assert left[0] < middle[0] and left[1] == middle[1]
+
+
+def test_a_resized_camera_sees_the_same_in_more_pixels() -> None:
+    camera = Camera(position=(0.5, 0.1, 0.9))
+    points = np.random.default_rng(0).uniform([0.3, -0.5, 0.0], [0.9, 0.5, 0.2], size=(20, 3))
+    larger = camera.resized(2 * camera.width, 2 * camera.height)
+    np.testing.assert_allclose(larger.project(points), 2 * camera.project(points))
+
+
+@pytest.mark.parametrize("name", ["gelatin_box", "rubiks_cube", "sugar_box"])
+def test_the_cloud_of_a_box_right_under_the_camera_is_centred_on_it(scene: Scene, put: Callable, name: str) -> None:
+    observed = scene.reset([put(name, 0.6, 0.0)], np.random.default_rng(0))
+    truth = scene.ground_truth().positions[0]
+    np.testing.assert_allclose(observed.centers[0, :2], truth[:2], atol=0.004)  # the noise of 256 points
+    assert abs(np.median(observed.clouds[0, :, 2]) - 2 * truth[2]) < 0.002  # the top of the box
+
+
+def test_points_of_boxes_lie_neither_too_far_to_a_side_nor_too_far_ahead(scene: Scene, put: Callable) -> None:
+    errors = []
+    for number in range(20):
+        x, y = 0.6 + 0.0021 * number, 0.0015 * number
+        observed = scene.reset([put("gelatin_box", x, y)], np.random.default_rng(number))
+        errors.append(observed.centers[0, :2] - scene.ground_truth().positions[0, :2])
+    np.testing.assert_allclose(np.mean(errors, axis=0), 0.0, atol=0.001)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_a_cloud_repeats_points_only_where_there_are_too_few(present: int, count: int, seed: int) -> None:
+    points = np.arange(3.0 * present).reshape(present, 3)
+    cloud = sample_cloud(points, count, np.random.default_rng(seed))
+    assert cloud.shape == (count, 3)
+    assert {tuple(point) for point in cloud} <= {tuple(point) for point in points}
+    if present >= count:
+        assert len({tuple(point) for point in cloud}) == count
+
 
 coordinate = st.floats(-1.0, 1.0)
 cameras = st.builds(
@@ -25,7 +69,7 @@ cameras = st.builds(
 )
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=30)
 @given(cameras, st.data())
 def test_a_point_behind_a_pixel_is_projected_back_into_it_whatever_the_pose(
     camera: Camera, data: st.DataObject
@@ -39,13 +83,6 @@ def test_a_point_behind_a_pixel_is_projected_back_into_it_whatever_the_pose(
     np.testing.assert_allclose(along_axis, depth[row, column], atol=1e-9)
 
 
-@settings(deadline=None)
-@given(cameras)
-def test_the_axes_of_an_image_are_orthonormal_and_right_handed(camera: Camera) -> None:
-    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(np.cross(camera.axes[0], camera.axes[1]), camera.axes[2], atol=1e-12)
-
-
 def test_the_renderer_draws_what_the_geometry_says_of_a_turned_and_shifted_camera(scene: Scene, put: Callable) -> None:
     scene.reset([put("rubiks_cube", 0.6, 0.1)], np.random.default_rng(0))
     camera = Camera(512, 424, (0.63, -0.04, 1.03), (0.02, -0.025, 0.02), (12.0, -9.0, -14.0, 15.0))
@@ -55,15 +92,6 @@ def test_the_renderer_draws_what_the_geometry_says_of_a_turned_and_shifted_camer
     top = points[points[:, 2] > 2 * truth[2] - 0.001]
     assert len(top) > 0.7 * len(points)  # the rest is a side of the cube
     np.testing.assert_allclose(top.mean(axis=0), (truth[0], truth[1], 2 * truth[2]), atol=0.002)
-
-
-def test_the_table_that_the_kinect_computes_is_the_one_that_the_renderer_draws(scene: Scene, put: Callable) -> None:
-    scene.reset([put("mug", 0.6, 0.1), put("banana", 0.5, -0.3)], np.random.default_rng(0))
-    sensor = Kinect2()
-    sensor.reset(np.random.default_rng(3))
-    with_table, objects = scene.world.render(sensor.actual), scene.world.render(sensor.actual, table=False)
-    computed = np.minimum(objects.depth, sensor._table)
-    np.testing.assert_allclose(computed[with_table.bodies >= 0], with_table.depth[with_table.bodies >= 0], atol=1e-4)
 
 
 def test_noise_grows_with_distance_and_with_the_angle_of_the_surface() -> None:
@@ -99,20 +127,9 @@ def test_measurements_are_missing_and_mixed_at_the_edges_of_objects(scene: Scene
     assert (image.depth[can & ~outline] == 0).mean() < 0.2
 
 
-def test_nothing_is_mixed_with_what_is_not_there(scene: Scene, put: Callable) -> None:
-    """Beyond the table's edge there is no floor in the simulator, and an object's points end where it ends."""
-    scene.reset([put("sugar_box", 0.25, 0.0), put("mug", 0.94, 0.3)], np.random.default_rng(0))
-    sensor = Kinect2()
-    for seed in range(10):
-        sensor.reset(np.random.default_rng(seed))
-        image, bodies = sensor.capture(scene.world.render)
-        rows, columns = np.nonzero(np.isin(bodies, scene.bodies) & (image.depth > 0.0))
-        assert image.camera.points(image.depth, rows, columns)[:, 2].min() > -0.02  # metres
-
-
 def test_the_kinect_stands_elsewhere_in_every_episode_and_is_believed_to_stand_near_there() -> None:
     sensor, actual = Kinect2(), []
-    for seed in range(50):
+    for seed in range(12):
         sensor.reset(np.random.default_rng(seed))
         actual.append(sensor.actual.position)
         for camera, other, bounds in (
@@ -122,7 +139,7 @@ def test_the_kinect_stands_elsewhere_in_every_episode_and_is_believed_to_stand_n
             assert np.abs(np.subtract(camera.position, other.position)).max() <= bounds.translation
             assert np.abs(np.subtract(camera.intrinsics, other.intrinsics)).max() <= bounds.intrinsics
             assert np.abs(np.subtract(camera.rotation, other.rotation)).max() <= 1.1 * bounds.rotation
-    np.testing.assert_allclose(np.ptp(actual, axis=0), 2 * VIEWPOINT.translation, rtol=0.2)
+    np.testing.assert_allclose(np.ptp(actual, axis=0), 2 * VIEWPOINT.translation, rtol=0.5)
 
 
 def test_cameras_go_by_names_poses_or_themselves() -> None:

@@ -1,4 +1,4 @@
-"""Rewards as the paper's appendix "Task Details" defines them."""
+"""Rewards as the paper's appendix "Task Details" defines them, and those of gathering."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from itertools import pairwise
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from envs.tasks import Outcome, Task, TaskReward
 from envs.tasks.clearing import Clearing
 from envs.tasks.crossing import Crossing
+from envs.tasks.gathering import Gathering
 from envs.tasks.insertion import Insertion
 from envs.workspace import tile_center
 
@@ -51,13 +50,6 @@ def judge(
 
 def tile(i: float, j: float) -> Point:
     return tile_center((i, j))
-
-
-def test_a_step_that_decides_nothing_costs_one() -> None:
-    for task in (CLEARING, INSERTION, CROSSING):
-        outcome = judge(task, [tile(2, 4), ASIDE], [tile(2, 3.9), ASIDE])
-        assert outcome.reward == -1
-        assert not outcome.success and not outcome.failure
 
 
 def test_clearing_succeeds_when_no_object_remains_in_the_region() -> None:
@@ -99,15 +91,6 @@ def test_crossing_succeeds_when_the_target_reaches_the_goal() -> None:
     assert not judge(CROSSING, [ASIDE, tile(2, 3)], [ASIDE, tile(2, 2)]).success
 
 
-@pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
-@pytest.mark.parametrize("off", [(0.21, 0.0), (0.99, 0.0), (0.6, 0.62), (0.6, -0.62)])
-def test_any_object_off_the_table_ends_every_task(task: Task, off: Point) -> None:
-    for after in ([tile(2, 4), off], [off, tile(2, 4)]):
-        outcome = judge(task, [tile(2, 4), ASIDE], after)
-        assert outcome.fall and outcome.failure and not outcome.violation and not outcome.success
-        assert outcome.reward == -101
-
-
 def test_a_violation_outweighs_success_and_a_fall_outweighs_both() -> None:
     in_slot, forbidden, off = tile(2, 1), tile(1, 1), (1.2, 0.0)
     before = [tile(2, 2), ASIDE, ASIDE]
@@ -135,17 +118,6 @@ def test_the_dense_term_is_the_targets_way_towards_the_goal_in_metres(task: Task
     assert away.reward.item() == pytest.approx(-1 - 0.03)
 
 
-def test_obstacles_earn_nothing_where_there_is_a_target() -> None:
-    for task in (INSERTION, CROSSING):
-        outcome = judge(task, [tile(2, 4), tile(3, 5)], [tile(2, 4), tile(2, 5)], reward="dense")
-        assert outcome.terms["progress"] == 0 and outcome.reward == -1
-
-
-def test_insertion_pulls_the_target_to_the_nearest_tile_of_the_slot() -> None:
-    above_second = judge(INSERTION, [tile(3, 4), ASIDE], [tile(3, 3), ASIDE], reward="dense")
-    assert above_second.terms["progress"].item() == pytest.approx(0.15)
-
-
 @pytest.mark.parametrize(
     ("near", "outwards"),
     [((0.27, 0.0), (-1, 0)), ((0.93, 0.0), (1, 0)), ((0.6, -0.5), (0, -1)), ((0.6, 0.45), (0, 1))],
@@ -161,42 +133,12 @@ def test_clearing_pulls_objects_to_the_nearest_of_all_four_edges(near: Point, ou
         assert away.reward.item() == pytest.approx(-1.02)
 
 
-def test_clearing_counts_only_what_remains_in_the_region() -> None:
-    inside, outside = tile(2, 3), tile(3.2, 3)
-    assert judge(CLEARING, [inside, outside], [inside, ASIDE], reward="dense").terms["progress"] == 0
-    leaving = judge(CLEARING, [inside, inside], [inside, outside], reward="dense")
-    assert leaving.terms["progress"].item() == pytest.approx(inside[0] - 0.22)  # all that was left of its way
-
-
-def test_a_sparse_reward_knows_no_progress() -> None:
-    outcome = judge(CROSSING, [tile(2, 4), ASIDE], [tile(2, 3), ASIDE])
-    assert outcome.reward == -1
-    assert outcome.terms["progress"] == 0
-
-
-COORDINATES = st.tuples(st.floats(0.23, 0.97), st.floats(-0.6, 0.6))
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.lists(st.tuples(COORDINATES, COORDINATES), min_size=2, max_size=6))
-@pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
-def test_going_in_circles_earns_no_progress(task: Task, path: list) -> None:
-    reward, mask = TaskReward(task, reward="dense"), torch.tensor([True, True])
-    visited = [states(*points) for points in [*path, path[0]]]
-    total = sum(reward(a, b, mask).terms["progress"] for a, b in pairwise(visited))
-    assert total.item() == pytest.approx(0.0, abs=1e-12)
-
-
-# Margins: 2 cm stricter than the task.
-
-
 @pytest.mark.parametrize("task", [INSERTION, CROSSING])
 def test_a_margin_leaves_the_goal_as_it_is(task: Task) -> None:
-    just_in, well_in = tile(2, task.goal.tiles[0][1] + 0.45), tile(2, task.goal.tiles[0][1] + 0.3)
+    just_in = tile(2, task.goal.tiles[0][1] + 0.45)
     before = [tile(2, task.goal.tiles[0][1] + 0.8), ASIDE]
     assert judge(task, before, [just_in, ASIDE]).success
     assert judge(task, before, [just_in, ASIDE], margin=0.02).success
-    assert judge(task, before, [well_in, ASIDE], margin=0.02).success
 
 
 def test_a_margin_widens_the_region_to_clear() -> None:
@@ -233,7 +175,7 @@ def test_within_the_margin_an_object_may_stay_or_go_back_but_not_further_out(pla
     assert fails(third, forbidden, 0.0)
 
 
-def test_the_published_criterion_tolerates_a_tile_and_a_half_beside_the_bridge() -> None:
+def test_the_published_criterion_tolerates_a_tile_and_a_half_beside_the_bridge_and_all_of_insertion() -> None:
     reward, mask = TaskReward(CROSSING, criterion="published"), torch.tensor([True])
 
     def violated(x: float) -> bool:
@@ -241,60 +183,9 @@ def test_the_published_criterion_tolerates_a_tile_and_a_half_beside_the_bridge()
 
     assert [violated(0.67 + d) for d in (-0.01, 0.01, 0.22, 0.23)] == [False, False, False, True]
     assert TaskReward(CROSSING)(torch.zeros(1, 3), torch.tensor([[0.68, 0.0, 0.0]]), mask).violation
-
-
-def test_by_the_published_criterion_insertion_forbids_no_place() -> None:
     inside = torch.tensor([[*tile(1, 1), 0.0]])
-    strict, published = (TaskReward(INSERTION, criterion=name) for name in ("strict", "published"))
-    mask = torch.tensor([True])
-    assert strict(inside, inside, mask).violation and not published(inside, inside, mask).violation
-    off = torch.tensor([[0.99, 0.0, 0.0]])
-    assert published(inside, off, mask).fall
-
-
-@pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
-def test_what_the_published_criterion_forbids_is_forbidden_by_the_strict_one(task: Task) -> None:
-    points = torch.cartesian_prod(torch.linspace(0.2, 1.0, 40), torch.linspace(-0.63, 0.63, 40))
-    centers = torch.cat((points, torch.zeros(len(points), 1)), -1).unsqueeze(-2)
-    mask = torch.ones(len(points), 1, dtype=torch.bool)
-    strict, published = (TaskReward(task, criterion=name)(centers, centers, mask) for name in ("strict", "published"))
-    assert not (published.violation & ~strict.violation).any()
-    assert (published.violation == published.failure & ~published.fall).all()
-
-
-@pytest.mark.parametrize("margin", [-0.01, math.nan])
-def test_a_negative_margin_is_refused(margin: float) -> None:
-    with pytest.raises(ValueError, match=r"^margin must be at least 0 metres, not (-0.01|nan)$"):
-        TaskReward(CROSSING, margin=margin)
-
-
-def test_the_error_of_an_unknown_reward_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"^unknown reward 'shaped': choose from dense, sparse$"):
-        TaskReward(CROSSING, reward="shaped")
-
-
-# Tensors.
-
-
-@pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
-def test_leading_dimensions_broadcast_and_every_element_is_judged_alone(task: Task) -> None:
-    generator = torch.Generator().manual_seed(0)
-    low, high = torch.tensor([0.2, -0.63, 0.0]), torch.tensor([1.0, 0.63, 0.1])
-    before = low + (high - low) * torch.rand(4, 1, 3, 3, generator=generator)
-    after = (before + 0.1 * torch.randn(4, 50, 3, 3, generator=generator)).clamp(low, high)
-    mask = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [True] * 3])[:, None]
-    reward = TaskReward(task, reward="dense", margin=0.01)
-    together = reward(before, after, mask)
-    assert all(field.shape == (4, 50) for field in (*together.terms.values(), *together[2:], together.reward))
-    for field in (together.success, together.failure):
-        assert field.dtype == torch.bool
-    assert together.failure.any() and not together.failure.all()
-    for row in range(4):
-        for column in range(0, 50, 7):
-            alone = reward(before[row, 0], after[row, column], mask[row, 0])
-            assert torch.equal(alone.reward, together.reward[row, column])
-            assert torch.equal(alone.failure, together.failure[row, column])
-            assert torch.equal(alone.success, together.success[row, column])
+    assert TaskReward(INSERTION)(inside, inside, mask).violation
+    assert not TaskReward(INSERTION, criterion="published")(inside, inside, mask).violation
 
 
 @pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
@@ -328,40 +219,61 @@ def test_padding_changes_nothing(task: Task, padding: float, margin: float) -> N
         assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize(("task", "goal"), [(CLEARING, tile(3.1, 4)), (INSERTION, tile(2, 1)), (CROSSING, tile(2, 2))])
-def test_padding_within_the_region_to_clear_does_not_hinder_success(task: Task, goal: Point) -> None:
-    before, after = states(tile(2, 2.6), ASIDE, tile(2, 3)), states(goal, ASIDE, tile(2, 3))
-    assert TaskReward(task)(before, after, torch.tensor([True, True, False])).success
+# A region up to the robot's side of the table, x 0.22 to 0.52 and y -0.11 to 0.19. The tool reaches x from 0.30 on.
+AT_THE_ROBOT = Clearing(region=[(0, 3), (0, 4), (1, 3), (1, 4)], target_start=[(1, 3)], obstacle_start=[(1, 4)])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("task", [CLEARING, INSERTION, CROSSING])
-def test_the_reward_has_the_precision_of_the_states(task: Task, dtype: torch.dtype) -> None:
-    before, after = states(tile(2, 4), ASIDE), states(tile(2, 3.9), ASIDE)
-    outcome = TaskReward(task, reward="dense")(before.to(dtype), after.to(dtype), torch.tensor([True, True]))
-    assert outcome.reward.dtype == outcome.terms["progress"].dtype == dtype
-
-
-def test_double_precision_is_not_lost_on_the_way() -> None:
-    step = 1e-12  # metres; far below what single precision tells apart
-    outcome = judge(CROSSING, [tile(2, 3), ASIDE], [(tile(2, 3)[0], tile(2, 3)[1] - step), ASIDE])
-    assert outcome.terms["progress"].item() == pytest.approx(step, rel=1e-3)
-
-
-@given(
-    task=st.sampled_from([CLEARING, INSERTION, CROSSING]),
-    path=st.lists(st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6)), min_size=2, max_size=8),
+@pytest.mark.parametrize(
+    ("before", "after", "dead_end"),
+    [
+        ((0.40, 0.0), (0.33, 0.0), False),
+        ((0.40, 0.0), (0.31, 0.0), True),  # within the margin
+        ((0.40, 0.0), (0.25, 0.0), True),
+        ((0.31, 0.0), (0.25, 0.0), True),  # farther, from within the margin
+        ((0.28, 0.0), (0.26, 0.0), True),
+        ((0.28, 0.0), (0.277, 0.0), False),  # as far as predictions tell
+        ((0.26, 0.0), (0.26, 0.1), False),  # sideways
+        ((0.26, 0.0), (0.33, 0.0), False),  # back
+        ((0.26, 0.25), (0.26, 0.15), True),  # into the region
+        ((0.40, 0.25), (0.25, 0.25), False),  # beside the region, where nothing is left to do
+    ],
 )
-def test_no_episode_returns_more_than_the_maximum_return(task: Task, path: list[Point]) -> None:
-    total = 0.0
-    for before, after in pairwise(path):
-        step = judge(task, [before], [after])
-        total += float(step.reward)
-        if step.success or step.failure:
-            break
-    assert total <= TaskReward(task).maximum_return
+def test_planners_keep_what_is_in_the_region_to_clear_within_the_tools_reach(
+    before: Point, after: Point, dead_end: bool
+) -> None:
+    for others in ([], [tile(1, 3)]):
+        moved = [before, *others], [after, *others]
+        assert judge(AT_THE_ROBOT, *moved, margin=0.02).violation == dead_end
+        assert not judge(AT_THE_ROBOT, *moved).violation  # the environment forbids nothing
 
 
-def test_an_immediate_success_returns_the_maximum() -> None:
-    assert judge(CROSSING, [ASIDE], [tile(2, 2)]).reward == TaskReward(CROSSING).maximum_return
-    assert TaskReward(CROSSING, reward="dense").maximum_return == math.inf  # progress is earned, too
+# Two tiles, x 0.37 to 0.52 and y -0.11 to 0.19.
+GATHERING = Gathering(region=[(1, 3), (1, 4)], target_start=[(1, 1)], obstacle_start=[(1, 6)])
+INSIDE, BESIDE, FAR = tile(1, 3), (0.54, 0.0), (0.72, 0.0)
+
+
+def test_gathering_succeeds_when_every_object_is_in_the_region() -> None:
+    assert judge(GATHERING, [INSIDE, BESIDE], [INSIDE, INSIDE]).success
+    for after in ([INSIDE, BESIDE], [BESIDE, INSIDE]):
+        outcome = judge(GATHERING, [INSIDE, INSIDE], after)
+        assert not outcome.success and not outcome.failure and outcome.reward == -1
+    just_inside, well_inside = (0.51, 0.0), (0.49, 0.0)
+    assert judge(GATHERING, [BESIDE], [just_inside]).success
+    assert not judge(GATHERING, [BESIDE], [just_inside], margin=0.02).success
+    assert judge(GATHERING, [BESIDE], [well_inside], margin=0.02).success
+
+
+def test_planners_keep_what_is_not_yet_gathered_within_the_tools_reach() -> None:
+    out_of_reach = (0.82, 0.0)  # the tool reaches x up to 0.80
+    moves = [(FAR, out_of_reach), (out_of_reach, out_of_reach), (out_of_reach, FAR)]
+    found = [bool(judge(GATHERING, [before], [after], margin=0.02).violation) for before, after in moves]
+    assert found == [True, False, False]
+    assert not judge(GATHERING, [FAR], [out_of_reach]).violation  # the environment forbids nothing
+
+
+def test_gathering_pulls_every_object_to_the_region() -> None:
+    outcome = judge(GATHERING, [FAR, FAR, INSIDE], [BESIDE, INSIDE, INSIDE], reward="dense")
+    assert outcome.terms["progress"].item() == pytest.approx(0.18 + 0.20)
+    assert outcome.reward.item() == pytest.approx(-1 + 0.38)  # not every object is inside
+    with pytest.raises(ValueError, match=r"^target_start tile \[1, 3\] is in the region to gather in$"):
+        Gathering(**{**vars(GATHERING), "target_start": [(1, 3)]})

@@ -1,0 +1,167 @@
+"""Goals: from files or at random, and which place is whose."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable
+from itertools import combinations, permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from safetensors.numpy import save
+
+from envs.goals import LARGEST, SHAPE_WEIGHT, Goal, assign, outlines, read_goal, sample_places, save_goal
+from envs.observation import Observation
+from envs.scene import Scene
+from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
+
+# Half length, half width and height in metres of a book, a can and a cube.
+BOOK, CAN, CUBE = (0.09, 0.06, 0.03), (0.035, 0.035, 0.12), (0.03, 0.03, 0.06)
+SHAPES = (BOOK, CAN, CUBE)
+
+angles = st.floats(-np.pi, np.pi)
+points = st.tuples(st.floats(0.3, 0.9), st.floats(-0.5, 0.5))
+
+
+def cloud(
+    shape: tuple[float, float, float], place: tuple[float, float], angle: float = 0.0, seed: int = 0
+) -> np.ndarray:
+    """Points on the top of a block that is turned by an angle, with a millimetre of noise: [256, 3] metres."""
+    generator = np.random.default_rng(seed)
+    flat = generator.uniform(-1.0, 1.0, (POINTS_PER_OBJECT, 2)) * shape[:2]
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    top = np.full((POINTS_PER_OBJECT, 1), shape[2])
+    noise = 0.001 * generator.standard_normal((POINTS_PER_OBJECT, 3))
+    return (np.concatenate([flat @ turn.T + place, top], axis=-1) + noise).astype(np.float32)
+
+
+def goal(*clouds: np.ndarray) -> Goal:
+    return Goal(np.array([one.mean(axis=0) for one in clouds]), np.array(clouds))
+
+
+def observed(*clouds: np.ndarray) -> Observation:
+    padded = np.zeros((OBJECT_SLOTS, POINTS_PER_OBJECT, 3), np.float32)
+    padded[: len(clouds)] = clouds
+    mask = np.arange(OBJECT_SLOTS) < len(clouds)
+    return Observation(padded, padded.mean(axis=1), mask, mask)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.permutations(range(3)), st.lists(points, min_size=6, max_size=6), st.lists(angles, min_size=6, max_size=6))
+def test_objects_that_differ_go_where_the_goal_shows_them_however_far_and_turned(
+    order: list[int], places: list[tuple[float, float]], turns: list[float]
+) -> None:
+    shown = [cloud(SHAPES[kind], places[number], turns[number], seed=number) for number, kind in enumerate(order)]
+    starts = [cloud(shape, places[3 + kind], turns[3 + kind], seed=9 + kind) for kind, shape in enumerate(SHAPES)]
+    found = assign(observed(*starts), goal(*shown))
+    for kind, place in enumerate(found):
+        np.testing.assert_allclose(place, shown[order.index(kind)].mean(axis=0)[:2], atol=1e-6)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.lists(points, min_size=3, max_size=3), st.lists(points, min_size=3, max_size=3))
+def test_objects_that_look_the_same_take_the_shortest_ways_in_total(
+    starts: list[tuple[float, float]], places: list[tuple[float, float]]
+) -> None:
+    block = cloud(CUBE, (0.0, 0.0))
+    block -= block.mean(axis=0)
+    clouds, shown = ([block + np.float32([*point, 0.0]) for point in some] for some in (starts, places))
+    found = assign(observed(*clouds), goal(*shown))
+    ways = [np.linalg.norm(np.array(order) - np.array(starts), axis=-1).sum() for order in permutations(places)]
+    # The clouds are the same but for rounding, which counts `SHAPE_WEIGHT` times.
+    assert np.linalg.norm(np.array(found) - np.array(starts), axis=-1).sum() <= min(ways) + SHAPE_WEIGHT * 1e-5
+
+
+def test_an_outline_is_of_height_length_and_width() -> None:
+    (found,) = outlines(cloud(BOOK, (0.5, 0.2), 0.7)[None])
+    expected = [BOOK[2], BOOK[0] / np.sqrt(3), BOOK[1] / np.sqrt(3)]  # a uniform block's standard deviations
+    assert found == pytest.approx(expected, abs=5e-3)
+
+
+PLACES = ((0.45, -0.20), (0.60, 0.25), (0.70, -0.05))
+FLAT = np.ones((212, 256))  # metres: an empty table
+CLOUDS = np.full((2, POINTS_PER_OBJECT, 3), 0.5, np.float32)
+
+
+@pytest.fixture
+def shown(scene: Scene, put: Callable) -> Scene:
+    """Three objects at `PLACES`."""
+    names = ("sugar_box", "rubiks_cube", "potted_meat_can")
+    objects = [put(name, x, y) for name, (x, y) in zip(names, PLACES, strict=True)]
+    scene.reset(objects, np.random.default_rng(0))
+    return scene
+
+
+@pytest.mark.parametrize("suffix", [".png", ".safetensors"])
+def test_a_saved_scene_shows_its_objects_where_they_are(suffix: str, shown: Scene, tmp_path: Path) -> None:
+    save_goal(tmp_path / f"goal{suffix}", shown)
+    goal = read_goal(tmp_path / f"goal{suffix}")
+    true = shown.observe().centers[:3]
+    assert goal.clouds.shape == (3, POINTS_PER_OBJECT, 3)
+    nearest = np.linalg.norm(goal.centers[:, None] - true[None], axis=-1)
+    assert sorted(nearest.argmin(axis=1)) == [0, 1, 2]
+    assert nearest.min(axis=1).max() < 0.015  # the segmentations differ on the sides of tall objects
+    np.testing.assert_array_equal(goal.centers, read_goal(str(tmp_path / f"goal{suffix}")).centers)
+
+
+def png(values: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(values).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+REFUSED = [
+    ("goal.pt", pickle.dumps(FLAT), r"must be a file that ends in \.png or \.safetensors$"),
+    ("goal.png", png(np.zeros((212, 256), np.uint16)), r"no table in the depth image"),
+    ("goal.png", png((1000 * FLAT).astype(np.uint16)), r"shows 0 objects on the table, and a scene holds 1 to 10$"),
+    ("goal.png", png(np.zeros((212, 256), np.uint8)), r"16 bits of depth per pixel, in millimetres, not L$"),
+    ("goal.png", png(np.zeros((212, 255), np.uint16)), r"has 255 by 212 pixels, and the camera 256 by 212"),
+    ("goal.png", png(np.zeros((1, 5000), np.uint16)), r"is over 2048 pixels wide or high$"),
+    ("goal.png", png((1000 * FLAT).astype(np.uint16))[:-60], r"is damaged or no PNG"),
+    ("goal.safetensors", b"\xff" * 64, r"is damaged or no safetensors file"),
+    ("goal.safetensors", save({"points": CLOUDS}), r"must hold clouds, float32 \[objects, 256, 3\]$"),
+    ("goal.safetensors", save({"clouds": CLOUDS.repeat(6, axis=0)}), r"shows 12 objects on the table, .* 1 to 10$"),
+    ("goal.safetensors", save({"clouds": np.nan * CLOUDS}), r"shows an object beside the table$"),
+    ("goal.safetensors", bytes(LARGEST + 1), r"has over \d+ bytes$"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "message"), REFUSED)
+def test_what_is_no_goal_is_refused_in_one_line(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_goal(tmp_path / name)
+    assert str(caught.value).startswith(f"goal {tmp_path / name} ")
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_file_is_refused(shown: Scene, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"cannot be read: No such file or directory$"):
+        read_goal(tmp_path / "goal.png")
+    with pytest.raises(ValueError, match=r"^a goal must end in \.png or \.safetensors, not '\.pkl'$"):
+        save_goal(tmp_path / "goal.pkl", shown)
+
+
+REGION = [(1, 2), (1, 3), (2, 3), (3, 5)]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32), st.integers(1, 4))
+def test_places_lie_on_the_tiles_and_apart(seed: int, count: int) -> None:
+    places = sample_places(REGION, count, 0.1, np.random.default_rng(seed))
+    assert len(places) == count
+    for place in places:
+        offsets = [np.abs(np.array(place) - tile_center(tile)).max() for tile in REGION]
+        assert min(offsets) <= TILE_SIDE / 2
+    assert all(np.linalg.norm(np.subtract(*pair)) >= 0.1 for pair in combinations(places, 2))
+    assert places == sample_places(REGION, count, 0.1, np.random.default_rng(seed))
+
+
+def test_places_for_which_there_is_no_room_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^no room for 3 places at least 0\.5 m apart in the region: add tiles"):
+        sample_places([(1, 2)], 3, 0.5, np.random.default_rng(0))

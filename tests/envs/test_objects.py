@@ -1,0 +1,313 @@
+"""Objects: builtin and random shapes, scans from a folder, and how they are sampled."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.objects.object_sets import ObjectSet, chosen, load_object_set
+from envs.objects.sampling import WHOLE_TABLE, Area, ObjectParameters, ObjectRanges, arrange, sample_objects
+from envs.objects.shapes import (
+    BUILTIN_NAMES,
+    DENSITY,
+    RADIUS,
+    RANDOM_NAMES,
+    Shape,
+    builtin_shape,
+    random_shape,
+    write_mesh,
+)
+from envs.pushing import PushingEnv
+from envs.robots import SETTLED_SPEED
+from envs.scene import Scene
+from envs.workspace import TABLE_HIGH, TABLE_LOW
+
+# Millimetres and grams as published with the YCB Object and Model Set (Calli et al. 2015): the sides of the
+# boxes, smallest first; diameter and height of what is round; thickness and length of the banana.
+BOXES = {
+    "sugar_box": ((38, 89, 175), 514),
+    "pudding_box": ((35, 89, 110), 187),
+    "gelatin_box": ((28, 73, 85), 97),
+    "potted_meat_can": ((50, 82, 97), 370),
+    "rubiks_cube": ((57, 57, 57), 94),
+}
+ROUND = {
+    "tomato_soup_can": ((66, 101), 349),
+    "tuna_fish_can": ((85, 33), 171),
+    "mug": ((80, 82), 118),
+    "a_cups": ((55, 60), 13),
+}
+BANANA = ((36, 190), 66)
+TOLERANCE = 2.0  # millimetres
+ALL_NAMES = [*BOXES, *ROUND, "banana"]
+
+
+def corners(shape: Shape) -> np.ndarray:
+    """[V, 3] millimetres."""
+    return 1000 * np.vstack([part.vertices for part in shape.parts])
+
+
+def holds(part: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Which points [P, 3] lie in a convex part: below the planes of all its faces."""
+    offsets = (part.face_normals * part.triangles[:, 0]).sum(axis=1)
+    return (points @ part.face_normals.T <= offsets + 1e-9).all(axis=1)
+
+
+def solid(shape: Shape, points: np.ndarray) -> np.ndarray:
+    return np.any([holds(part, points) for part in shape.parts], axis=0)
+
+
+@pytest.mark.parametrize("name", ALL_NAMES)
+def test_objects_have_their_published_sizes_and_masses(name: str) -> None:
+    shape, (sizes, mass) = builtin_shape(name), {**BOXES, **ROUND, "banana": BANANA}[name]
+    points = corners(shape) if name != "mug" else corners(Shape(name, shape.parts[:-3], shape.mass))  # no handle
+    sides = np.ptp(points, axis=0)
+    if name in ROUND:
+        middle = (points.min(axis=0) + points.max(axis=0))[:2] / 2
+        found = [2 * np.linalg.norm(points[:, :2] - middle, axis=1).max(), sides[2]]
+    else:
+        found = sorted(sides) if name in BOXES else [sides[2], sides[0]]
+    np.testing.assert_allclose(found, sizes, atol=TOLERANCE)
+    assert shape.mass == pytest.approx(mass / 1000)
+
+
+@pytest.mark.parametrize("name", ALL_NAMES)
+def test_every_part_is_convex_and_watertight(name: str) -> None:
+    for part in builtin_shape(name).parts:
+        assert part.is_watertight and part.is_convex
+        assert part.volume > 0
+
+
+@pytest.mark.parametrize("name", ["mug", "a_cups"])
+def test_a_ray_down_the_middle_of_a_vessel_meets_its_floor_only(name: str) -> None:
+    shape = builtin_shape(name)
+    floor = min(shape.parts, key=lambda part: part.vertices[:, 2].max()).bounds
+    middle = floor.mean(axis=0)
+    heights = np.arange(floor[0, 2], 0.06, 0.0005)
+    ray = np.column_stack([np.full_like(heights, middle[0]), np.full_like(heights, middle[1]), heights])
+    filled = heights[solid(shape, ray)]
+    assert len(filled) > 2
+    assert filled.max() <= floor[1, 2] + 1e-9 < floor[0, 2] + 0.005
+
+
+@pytest.mark.parametrize("name", ALL_NAMES)
+def test_the_origin_is_the_centre_of_volume(name: str) -> None:
+    shape = builtin_shape(name)
+    low, high = corners(shape).min(axis=0) / 1000, corners(shape).max(axis=0) / 1000
+    points = np.random.default_rng(0).uniform(low, high, size=(100_000, 3))
+    center = points[solid(shape, points)].mean(axis=0)
+    # 1.5 mm: the corners where the mug's handle overlaps itself count twice.
+    assert np.linalg.norm(center) < 0.0015
+    assert shape.radius == pytest.approx(np.linalg.norm(corners(shape), axis=1).max() / 1000)
+
+
+def test_a_mesh_file_holds_a_group_per_part_and_is_written_once(tmp_path: Path) -> None:
+    path = write_mesh(builtin_shape("mug"), tmp_path)
+    lines = path.read_text().splitlines()
+    assert sum(line.startswith("o ") for line in lines) == len(builtin_shape("mug").parts)
+    vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)
+    np.testing.assert_allclose(1000 * vertices.min(axis=0), corners(builtin_shape("mug")).min(axis=0), atol=1e-3)
+    path.write_text("mine")
+    assert write_mesh(builtin_shape("mug"), tmp_path).read_text() == "mine"
+
+
+SHAPES = [random_shape(name) for name in RANDOM_NAMES]
+
+
+def test_they_are_as_large_and_as_heavy_as_the_real_ones() -> None:
+    real = [builtin_shape(name) for name in BUILTIN_NAMES]
+    assert min(RADIUS) <= min(shape.radius for shape in real)
+    radii, masses = np.array([shape.radius for shape in SHAPES]), np.array([shape.mass for shape in SHAPES])
+    assert ((radii >= RADIUS[0]) & (radii <= RADIUS[1])).all()
+    volumes = np.array([sum(part.volume for part in shape.parts) for shape in SHAPES])
+    assert ((masses / volumes >= DENSITY[0]) & (masses / volumes <= DENSITY[1])).all()
+    assert min(shape.mass for shape in real) < np.median(masses) < max(shape.mass for shape in real)
+
+
+def test_a_name_is_the_same_object_whatever_was_built_before() -> None:
+    again = random_shape.__wrapped__(RANDOM_NAMES[57])
+    for part, other in zip(again.parts, SHAPES[57].parts, strict=True):
+        np.testing.assert_array_equal(part.vertices, other.vertices)
+    assert again.mass == SHAPES[57].mass
+
+
+def test_they_fall_come_to_rest_and_stay_on_the_table() -> None:
+    scene = Scene(object_set=load_object_set("random"))
+    generator = np.random.default_rng(0)
+    for _ in range(2):
+        scene.sample([WHOLE_TABLE] * 5, ObjectRanges(names=RANDOM_NAMES, clearance=0.12), generator)
+        truth = scene.ground_truth()
+        assert scene.world.fastest(scene.bodies) < SETTLED_SPEED
+        assert (truth.positions[:, 2] > 0.0).all()
+    scene.close()
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+TWO_TILES: Area = (((0.3, -0.2), (0.45, -0.05)), ((0.7, 0.2), (0.85, 0.35)))
+
+
+def within(area: Area, point: np.ndarray) -> bool:
+    return any((np.array(low) <= point).all() and (point <= np.array(high)).all() for low, high in area)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=SEEDS, count=st.integers(1, 5), clearance=st.floats(0.0, 0.18))
+def test_arranged_objects_keep_their_distance_and_their_areas(seed: int, count: int, clearance: float) -> None:
+    areas = [TWO_TILES, *[WHOLE_TABLE] * (count - 1)]
+    positions = arrange(areas, clearance, np.random.default_rng(seed))
+    assert positions.shape == (count, 2)
+    assert all(within(area, point) for area, point in zip(areas, positions, strict=True))
+    assert all(np.linalg.norm(one - other) >= clearance for one, other in combinations(positions, 2))
+
+
+def test_too_small_an_area_gets_its_one_line() -> None:
+    tile: Area = (((0.3, 0.0), (0.4, 0.1)),)
+    arrange([tile], 0.15, np.random.default_rng(0))
+    with pytest.raises(ValueError, match=r"^no room for 2 objects at least 0.15 m apart .* fewer objects") as caught:
+        arrange([tile, tile], 0.15, np.random.default_rng(0))
+    assert "\n" not in str(caught.value)
+
+
+RANGES = ObjectRanges(names=("banana", "mug", "sugar_box"), scale=(0.9, 1.1), mass=(2.0, 3.0), friction=(0.6, 0.7))
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=SEEDS, count=st.integers(1, 5))
+def test_parameters_lie_within_their_ranges(seed: int, count: int) -> None:
+    sampled = sample_objects([WHOLE_TABLE] * count, RANGES, np.random.default_rng(seed))
+    assert len(sampled) == count
+    for one in sampled:
+        shape = builtin_shape(one.name)
+        assert one.name in RANGES.names
+        assert 0.9 <= one.scale <= 1.1
+        assert 2.0 * shape.mass <= one.mass <= 3.0 * shape.mass
+        assert 0.6 <= one.friction <= 0.7
+        assert np.linalg.norm(one.orientation) == pytest.approx(1.0)
+        assert (np.array(TABLE_LOW) < one.position[:2]).all() and (np.array(TABLE_HIGH) > one.position[:2]).all()
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=SEEDS)
+def test_no_object_starts_in_the_table_or_in_another_whatever_their_turn(seed: int) -> None:
+    sampled = sample_objects([WHOLE_TABLE] * 5, ObjectRanges(clearance=0.1), np.random.default_rng(seed))
+    spheres = [(np.array(one.position), one.scale * builtin_shape(one.name).radius) for one in sampled]
+    assert all(center[2] > radius for center, radius in spheres)
+    for (center, radius), (other, reach) in combinations(spheres, 2):
+        apart = np.linalg.norm(center[:2] - other[:2]) >= radius + reach
+        assert apart or abs(center[2] - other[2]) >= radius + reach
+
+
+TINY = ("ycb/brick", "ycb/mug", "ycb/angle")
+
+
+@pytest.fixture(scope="module")
+def scans(tiny_assets: Path) -> ObjectSet:
+    return load_object_set("ycb", tiny_assets)
+
+
+@pytest.fixture(scope="module")
+def scanned(scans: ObjectSet) -> Iterator[Scene]:
+    world = Scene(object_set=scans)
+    yield world
+    world.close()
+
+
+@pytest.fixture(scope="module")
+def real(real_assets: Path) -> Iterator[Scene]:
+    world = Scene(object_set=load_object_set("ycb", real_assets))
+    yield world
+    world.close()
+
+
+def test_a_name_without_its_set_means_the_object_of_every_set(tiny_assets: Path) -> None:
+    mixed = load_object_set("mixed", tiny_assets)
+    assert chosen(["mug", "ycb/brick", "banana"], mixed) == ("mug", "ycb/mug", "ycb/brick", "banana")
+    with pytest.raises(ValueError, match=r"^unknown object 'fork': choose from sugar_box, .*, brick, angle$"):
+        chosen(["mug", "fork"], mixed)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=SEEDS, count=st.integers(1, 5))
+def test_the_published_objects_are_heavy_and_dropped_and_the_target_is_the_mug(seed: int, count: int) -> None:
+    ranges = ObjectRanges(target=("mug",), kilograms=(10.0, 10.0), drop_height=0.2)
+    sampled = sample_objects([WHOLE_TABLE] * count, ranges, np.random.default_rng(seed))
+    assert sampled[0].name == "mug"
+    assert all(one.mass == 10.0 and one.position[2] >= 0.2 for one in sampled)
+
+
+def test_inertia_grows_with_mass_and_area(scans: ObjectSet, tiny_assets: Path) -> None:
+    published = json.loads((tiny_assets / "ycb" / "meta.json").read_text())["angle"]["inertia_diag"]
+    asset = scans.asset("ycb/angle")
+    np.testing.assert_allclose(asset.inertia_of(0.2, 1.0), published)
+    np.testing.assert_allclose(asset.inertia_of(0.6, 2.0), 12.0 * np.array(published))
+    assert load_object_set("builtin").asset("mug").inertia_of(1.0, 1.0) is None
+
+
+def test_a_scan_has_its_own_inertia_and_every_part_of_it_collides(scanned: Scene) -> None:
+    upright = ObjectParameters("ycb/angle", 1.0, 0.2, 0.7, (0.5, 0.0, 0.06), (0.0, 0.0, 0.0, 1.0))
+    scanned.reset([upright], np.random.default_rng(0))
+    bullet = scanned.world.client
+    inertia = bullet.getDynamicsInfo(scanned.bodies[0], -1)[2]
+    np.testing.assert_allclose(inertia, scanned.object_set.asset("ycb/angle").inertia, rtol=1e-6)
+    # A ray down beside the leg meets the foot, 6 cm lower than one down the leg: the hull of both would be met between.
+    low, high = scanned.ground_truth().positions[0, 0] + np.array([0.02, -0.02])
+    heights = [bullet.rayTest((x, 0.0, 0.5), (x, 0.0, -0.5))[0][3][2] for x in (low, high)]
+    assert max(heights) - min(heights) == pytest.approx(0.08, abs=0.005)
+
+
+def test_an_environment_takes_all_that_is_in_the_folder(tiny_assets: Path) -> None:
+    env = PushingEnv(object_set="ycb", assets=tiny_assets, objects=5)
+    assert env.ranges.names == ("brick", "mug", "angle")
+    check_env(env, skip_render_check=True)  # what it warns of is an error here
+    assert {one.name for one in env.scene.objects} <= set(TINY)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: shutil.rmtree(folder), "meta.json cannot be read (No such file or directory)"),
+        (lambda folder: (folder / "meta.json").write_text("{"), "meta.json is damaged: it is not JSON"),
+        (lambda folder: (folder / "meta.json").write_text("{}"), "meta.json is damaged: it names no object"),
+        (lambda folder: [(folder / file).unlink() for file in ("mug.obj", "angle_vhacd.obj")], "mug.obj and 1 more"),
+        (lambda folder: (folder / "meta.json").write_text('{"../mug": {}}'), "incomplete: ../mug.obj"),
+        (lambda folder: (folder / "meta.json").write_text('{"mug": {"mass": 1}}'), "mug needs a mass and an inertia"),
+        (lambda folder: (folder / "mug_vhacd.obj").write_text("v nan 0 0\n"), "mug_vhacd.obj is damaged"),
+    ],
+)
+def test_a_folder_that_lacks_something_gets_its_one_line(
+    spoil: Callable[[Path], object], said: str, tiny_assets: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(tiny_assets / "ycb", tmp_path / "ycb")
+    spoil(folder)
+    with pytest.raises(ValueError, match=re.escape(said)) as caught:
+        load_object_set("ycb", tmp_path)
+    assert "\n" not in str(caught.value) and str(folder) in str(caught.value)
+
+
+def test_without_a_folder_the_line_says_how_to_get_one() -> None:
+    with pytest.raises(ValueError, match=r"give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to"):
+        load_object_set("mixed")
+
+
+def test_the_real_objects_are_the_papers_ten(real: Scene, real_assets: Path) -> None:
+    objects = real.object_set
+    assert {name.removeprefix("ycb/") for name in objects.names} == set(BUILTIN_NAMES)
+    for name in BUILTIN_NAMES:
+        asset = objects.asset(f"ycb/{name}")
+        assert asset.mass == builtin_shape(name).mass
+        assert asset.radius == pytest.approx(builtin_shape(name).radius, rel=0.15)
+        inertia = ElementTree.parse(real_assets / "ycb" / f"{name}.urdf").find(".//inertia")
+        assert asset.inertia == tuple(float(inertia.attrib[axis]) for axis in ("ixx", "iyy", "izz"))
