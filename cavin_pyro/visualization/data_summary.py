@@ -58,8 +58,9 @@ def _draw_map(panel: Axes, counts: NDArray[np.int64], title: str) -> None:
     """The table from above as the camera sees it: up is +x, left is +y."""
     edges = [low + CELL * np.arange(n + 1) for low, n in zip(TABLE_LOW, counts.shape, strict=True)]
     mesh = panel.pcolormesh(edges[1], edges[0], _percent(counts), cmap="viridis", vmin=0.0)
-    panel.add_patch(_outline(TABLE_LOW, TABLE_HIGH, "black", "-"))
-    panel.add_patch(_outline(REACH_LOW, REACH_HIGH, "white", "--"))
+    for low, high, color, style in ((TABLE_LOW, TABLE_HIGH, "black", "-"), (REACH_LOW, REACH_HIGH, "white", "--")):
+        sides = high[1] - low[1], high[0] - low[0]
+        panel.add_patch(Rectangle((low[1], low[0]), *sides, fill=False, edgecolor=color, linestyle=style))
     panel.invert_xaxis()
     panel.set(aspect="equal")
     panel.set_title(title, fontsize=10)
@@ -70,18 +71,6 @@ def _draw_map(panel: Axes, counts: NDArray[np.int64], title: str) -> None:
     bar = panel.figure.colorbar(mesh, ax=panel, shrink=0.9)
     bar.set_label("% per cell of 2 cm", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-
-
-def _outline(low: tuple[float, float], high: tuple[float, float], color: str, style: str) -> Rectangle:
-    return Rectangle(
-        (low[1], low[0]),
-        high[1] - low[1],
-        high[0] - low[0],
-        fill=False,
-        edgecolor=color,
-        linestyle=style,
-        linewidth=1.0,
-    )
 
 
 def _percent(counts: NDArray[np.int64]) -> NDArray[np.float64]:

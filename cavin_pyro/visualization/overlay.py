@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.evaluation.rollout import PlanRecord
 from envs.tasks import Task
-from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, push_endpoints, tile_center
+from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, push_endpoints, tile_center
 
 Pixels = NDArray[np.float64]  # [..., 2]
 
@@ -24,6 +24,7 @@ REACHED_COLOR = "#C5005E"  # crimson
 PUSH_COLOR = "#1A1A1A"
 TABLE_COLOR = "#C2B9AD"  # where there is no photograph
 
+PIXELS_PER_METRE = 365.5  # of maps; that of the videos' camera, so that both views have one size
 TARGET_RADIUS = 0.07  # metres; of the circle that marks the target
 MOVING = 0.01  # metres; objects with smaller planned moves are omitted
 
@@ -33,6 +34,15 @@ class View(Protocol):
 
     def project(self, points: NDArray[np.floating]) -> Pixels:
         """Pixels (column, row) [..., 2] of points [..., 3] metres."""
+
+
+class Map:
+    """A parallel projection along z. The picture's up is +x of the table, its left +y, as in the camera's image."""
+
+    def project(self, points: NDArray[np.floating]) -> Pixels:
+        """Pixels (column, row) [..., 2] of points [..., 3] metres; heights do not matter."""
+        offset = np.asarray(TABLE_CENTER) - np.asarray(points, dtype=np.float64)[..., :2]
+        return PIXELS_PER_METRE * offset[..., ::-1]
 
 
 def tile_corners(tile: Tile, view: View) -> Pixels:

@@ -1,41 +1,189 @@
-"""The plans of an episode as a picture, over the camera's image or on a map.
+"""The plans of an episode as a picture, over the camera's image or on a map: the paper's qualitative figure.
 
-It is the paper's qualitative figure, with the end of the episode as the last panel.
+The video shows each plan with the same `draw_overlay`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord
-from cavin_pyro.visualization.overlay import TABLE_COLOR, View, reached_paths, table_box
-from cavin_pyro.visualization.panel import (
-    RETURNS,
-    counted,
-    draw_objects,
-    draw_overlay,
-    draw_paths,
-    draw_places,
-    draw_tiles,
-    legend,
+from cavin_pyro.visualization.overlay import (
+    OBSTACLE_COLOR,
+    PREDICTION_COLOR,
+    PUSH_COLOR,
+    REACHED_COLOR,
+    SUBGOAL_COLOR,
+    TABLE_COLOR,
+    Map,
+    Pixels,
+    View,
+    candidate_subgoals,
+    circle,
+    predicted_paths,
+    pushes,
+    reached_paths,
+    subgoal_chains,
+    table_box,
+    tile_corners,
 )
-from cavin_pyro.visualization.table_map import Map, draw_clouds, mark_axes
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
+from envs.markings import PLACE_RADIUS
+from envs.scene import COLORS
 from envs.sensors.camera import Camera
 from envs.tasks import Task
-from planning import Plan
+from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 PANELS = 5  # plans shown, besides the end
+CANDIDATES = 150  # dots per panel
 MARGIN = 8  # pixels around the table
+GRID = 0.25  # metres between two marks on an axis
 SUCCESS_COLOR, FAILURE_COLOR = "#1B6E1B", "#C2272D"
+# Nothing else in the picture is purple. The palest part is cut off: it would be lost on the table.
+RETURNS = ListedColormap(colormaps["Purples"](np.linspace(0.2, 1.0, 128)))
+
+Style = dict[str, Any]
+_HALO = [withStroke(linewidth=2.8, foreground="white", alpha=0.85)]
+_OBSERVED: Style = {"marker": "o", "markersize": 4.5, "color": "white", "markeredgecolor": "black", "linestyle": ""}
+_CANDIDATE: Style = {"marker": "o", "markersize": 3.5, "color": "#6A51A3", "linestyle": ""}
+_SUBGOALS: Style = {"marker": "o", "markersize": 5.5, "color": SUBGOAL_COLOR, "linewidth": 2.2}
+_SUBGOALS |= {"markeredgecolor": "black", "markeredgewidth": 0.7}
+_OBSTACLES: Style = {**_SUBGOALS, "marker": "s", "markersize": 4.5, "color": OBSTACLE_COLOR, "linewidth": 1.6}
+_PREDICTED: Style = {"marker": "x", "markersize": 4, "color": PREDICTION_COLOR, "linewidth": 1.2}
+_REACHED: Style = {"marker": "D", "markersize": 3, "color": REACHED_COLOR, "linewidth": 1.2}
+_PUSH: Style = {"arrowstyle": "-|>", "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4}
+_PLACE: Style = {"fill": False, "linewidth": 2.4}
+_TARGET: Style = {"color": PUSH_COLOR, "linestyle": "--", "linewidth": 1.5}
+
+
+def draw_overlay(
+    panel: Axes,
+    record: PlanRecord,
+    task: Task,
+    view: View,
+    scale: Normalize | None,
+    reached: NDArray[np.float32] | None = None,
+) -> None:
+    """Draw observed objects, candidates, subgoals, predictions and pushes over the panel's background.
+
+    Args:
+        scale: of the candidates' returns; None omits the candidates.
+        reached: [n, M, 3] metres, centres observed after each push; None before that.
+    """
+    if scale is not None:
+        dots, returns = candidate_subgoals(record, task, view, count=CANDIDATES)
+        panel.scatter(dots[:, 0], dots[:, 1], s=9, c=returns, norm=scale, cmap=RETURNS, alpha=0.8, zorder=2)
+    for path in predicted_paths(record, view).values():
+        panel.plot(path[:, 0], path[:, 1], **_PREDICTED, path_effects=_HALO, zorder=3)
+    for number, chain in subgoal_chains(record, view).items():
+        style = _SUBGOALS if number == 0 else _OBSTACLES
+        panel.plot(chain[:, 0], chain[:, 1], **style, markevery=slice(1, None), zorder=4 if number == 0 else 3.5)
+    _draw_pushes(panel, record, view)
+    if reached is not None:
+        draw_paths(panel, reached_paths(record, reached, view))
+    draw_objects(panel, record.centers, record.mask, view)
+    draw_places(panel, task, view)
+
+
+def draw_paths(panel: Axes, paths: Mapping[int, Pixels]) -> None:
+    """Draw the observed paths of objects."""
+    for path in paths.values():
+        panel.plot(path[:, 0], path[:, 1], **_REACHED, markevery=slice(1, None), path_effects=_HALO, zorder=6)
+
+
+def draw_tiles(panel: Axes, task: Task, view: View) -> None:
+    """Draw the task's region and goal."""
+    for group in task.tile_groups():
+        fill = to_rgba(group.color, group.opacity)
+        for tile in group.tiles:
+            corners = tile_corners(tile, view)
+            panel.add_patch(Polygon(corners, facecolor=fill, edgecolor=group.color, linewidth=1.4, zorder=1))
+
+
+def draw_objects(panel: Axes, centers: NDArray[np.float32], mask: NDArray[np.bool_], view: View) -> None:
+    """Draw the centres [M, 3] metres of the objects in the mask [M], with a ring around the target."""
+    pixels = view.project(centers[mask])
+    panel.plot(pixels[:, 0], pixels[:, 1], **_OBSERVED, zorder=6)
+    if mask[0]:
+        center, radius = circle(centers[0], view)
+        panel.add_patch(Circle(center, radius, fill=False, path_effects=_HALO, zorder=6, **_TARGET))
+
+
+def draw_places(panel: Axes, task: Task, view: View) -> None:
+    """Draw a ring in each object's colour around the place where it has to go, if the task has places."""
+    for (x, y), color in zip(task.object_places(), COLORS, strict=False):
+        center, radius = circle(np.array([x, y, 0.0]), view, PLACE_RADIUS)
+        panel.add_patch(Circle(center, radius, color=color, path_effects=_HALO, zorder=5, **_PLACE))
+
+
+def legend(task: Task, plan_records: Sequence[PlanRecord], *, candidates: bool) -> list[Line2D | Patch]:
+    """Legend entries for exactly what `draw_overlay` draws of an episode."""
+    entries: list[Line2D | Patch] = [
+        Patch(facecolor=to_rgba(group.color, group.opacity), edgecolor=group.color, label=group.name)
+        for group in task.tile_groups()
+    ]
+    if task.object_places():
+        ring: Style = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": ""}
+        entries.append(Line2D([], [], label="places", color=COLORS[0], **ring))
+    entries.append(Line2D([], [], label="target", **_TARGET))
+    entries.append(Line2D([], [], label="observed", **_OBSERVED))
+    if candidates:
+        entries.append(Line2D([], [], label="candidates", **_CANDIDATE))
+    if any(record.plan.subgoals.centers.shape[1] for record in plan_records):
+        entries.append(Line2D([], [], label="target's subgoals", **_SUBGOALS))
+        if any(record.mask[1:].any() for record in plan_records):
+            entries.append(Line2D([], [], label="obstacles' subgoals", **_OBSTACLES))
+    if any(record.plan.predicted_centers.shape[1] for record in plan_records):
+        entries.append(Line2D([], [], label="predicted", **_PREDICTED))
+    entries.append(Line2D([], [], label="reached", **_REACHED))
+    arrow: Style = {"marker": r"$\rightarrow$", "markersize": 15, "color": PUSH_COLOR, "linestyle": ""}
+    entries.append(Line2D([], [], label="push", **arrow))
+    return entries
+
+
+def counted(number: int) -> str:
+    """`1 push`, `2 pushes`."""
+    return f"{number} push" if number == 1 else f"{number} pushes"
+
+
+def _draw_pushes(panel: Axes, record: PlanRecord, view: View) -> None:
+    """Arrows, numbered behind their starts in the order of execution."""
+    for number, (start, end) in enumerate(pushes(record, view), 1):
+        order = 6 - 0.1 * number  # earlier ones on top: pushes often follow one another along a line
+        arrow = FancyArrowPatch(start, end, color=PUSH_COLOR, path_effects=_HALO, zorder=order, **_PUSH)
+        panel.add_patch(arrow)
+        x, y = start - 8 * (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)  # 8 pixels
+        panel.text(x, y, str(number), ha="center", va="center", fontsize=8, path_effects=_HALO, zorder=7)
+
+
+def draw_clouds(panel: Axes, clouds: NDArray[np.float32], mask: NDArray[np.bool_], view: View) -> None:
+    """Draw the points [M, 256, 3] metres of the objects in the mask [M], each in its object's colour."""
+    for number in np.flatnonzero(mask):
+        pixels = view.project(clouds[number])
+        panel.scatter(pixels[:, 0], pixels[:, 1], s=1.5, color=COLORS[number], linewidths=0, zorder=1.5)
+
+
+def mark_axes(panel: Axes, view: View) -> None:
+    """Name x and y, in metres."""
+    for axis, set_ticks in ((0, panel.set_yticks), (1, panel.set_xticks)):
+        marks = GRID * np.arange(np.ceil(TABLE_LOW[axis] / GRID), np.floor(TABLE_HIGH[axis] / GRID) + 1)
+        places = view.project(np.outer(marks, np.eye(3)[axis]))[:, 1 - axis]
+        set_ticks(places, [f"{mark:g}" for mark in marks], fontsize=7)
+    panel.set_xlabel("y (m)", fontsize=8)
+    panel.set_ylabel("x (m)", fontsize=8)
 
 
 def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -> None:
@@ -99,9 +247,8 @@ def draw_plan_record(
     """
     view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)
     draw_overlay(panel, record, task, view, scale, reached)
-    about = evidence_text(record.plan)
-    title = f"after {counted(record.step)}{record.prospect}{_error(record, reached)}"
-    panel.set_title("\n".join([title, about] if about else [title]), fontsize=10)
+    lines = [f"after {counted(record.step)}{_error(record, reached)}", record.prospect.removeprefix(", ")]
+    panel.set_title("\n".join(filter(None, lines)), fontsize=10)
 
 
 def return_scale(returns: NDArray[np.float32]) -> Normalize | None:
@@ -118,15 +265,6 @@ def draw_return_scale(figure: Figure, scale: Normalize, **place: Any) -> None:
     bar = figure.colorbar(ScalarMappable(scale, RETURNS), **place)
     bar.set_label("return of a candidate", fontsize=9)
     bar.ax.tick_params(labelsize=8)
-
-
-def evidence_text(plan: Plan) -> str:
-    """What planning as inference found, in one line; "" for a plan without it."""
-    if plan.evidence is None:
-        return ""
-    log_z, temperature, sizes, particles = (field[0] for field in plan.evidence)
-    fewest = f"{sizes.min():.0f} of {particles} effective"
-    return f"log Z {log_z:.2f} at temperature {temperature:.3g}, {fewest}"
 
 
 def _error(record: PlanRecord, reached: NDArray[np.float32] | None) -> str:

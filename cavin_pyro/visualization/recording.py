@@ -1,11 +1,12 @@
 """An episode in 3D on a timeline, for the rerun viewer: the world, the observations, and the plans.
 
-Everything spatial is in metres in the robot's base frame. `docs/how-to/see-a-plan.md` lists the entities.
+Everything spatial is in metres in the robot's base frame. The plans have the same candidates, chains, pushes and
+predictions as the pictures. `docs/how-to/see-a-plan.md` lists the entities.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,13 +18,86 @@ from numpy.typing import NDArray
 
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.visualization.recording_plan import log_plan, log_reached, object_name, vivid
+from cavin_pyro.visualization.overlay import (
+    OBSTACLE_COLOR,
+    PREDICTION_COLOR,
+    PUSH_COLOR,
+    REACHED_COLOR,
+    SUBGOAL_COLOR,
+    candidate_subgoals,
+    predicted_paths,
+    pushes,
+    reached_paths,
+    subgoal_chains,
+)
+from cavin_pyro.visualization.plan import RETURNS, return_scale
 from cavin_pyro.visualization.video import FRAMES_PER_SECOND, PAUSE
 from envs.markings import PLACE_RADIUS
 from envs.pushing import ObservationDict, PushingEnv
 from envs.scene import COLORS
 from envs.tasks import Task
 from envs.workspace import TILE_SIDE, tile_center
+
+CANDIDATES = 1000  # points per plan
+PUSH_HEIGHT = 0.01  # metres above the table, about the tip's
+
+
+class Space:
+    """The identity as a projection [..., 3] metres, for drawing in 3D."""
+
+    def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.asarray(points, dtype=np.float64)
+
+
+def object_name(number: int) -> str:
+    """Object 0 is the target."""
+    return "target" if number == 0 else f"obstacle_{number}"
+
+
+def vivid(color: Sequence[float]) -> list[int]:
+    """Red, green, blue and perhaps opacity in [0, 1] -> whole numbers to 255."""
+    return [round(255 * channel) for channel in color]
+
+
+def log_plan(stream: rr.RecordingStream, record: PlanRecord, task: Task) -> None:
+    """Log this plan in place of the last one, at the stream's current time."""
+    for entity in ("world/plan", "world/reached"):
+        stream.log(entity, rr.Clear(recursive=True))
+    returns = record.plan.candidate_returns[0].numpy()
+    scale = return_scale(returns)
+    if scale is not None:
+        points, values = candidate_subgoals(record, task, Space(), count=CANDIDATES)
+        colors = np.asarray(RETURNS(scale(values)))[:, :3]
+        dots = rr.Points3D(points, colors=(255 * colors).round().astype(np.uint8), radii=0.004)
+        stream.log("world/plan/candidates", dots)
+    for number, chain in subgoal_chains(record, Space()).items():
+        color = SUBGOAL_COLOR if number == 0 else OBSTACLE_COLOR
+        _log_paths(stream, "world/plan/subgoals", {number: chain}, color, radius=0.009)
+    _log_paths(stream, "world/plan/predicted", predicted_paths(record, Space()), PREDICTION_COLOR, radius=0.005)
+    ends = pushes(record, Space()) + np.array([0.0, 0.0, PUSH_HEIGHT])
+    arrows = rr.Arrows3D(
+        origins=ends[:, 0],
+        vectors=ends[:, 1] - ends[:, 0],
+        colors=vivid(to_rgb(PUSH_COLOR)),
+        radii=0.003,
+        labels=[str(number) for number in range(1, len(ends) + 1)],
+    )
+    stream.log("world/plan/pushes", arrows)
+    expected = float(record.plan.expected_return[0])
+    expectation = "" if np.isnan(expected) else f", expected return {expected:.0f}"
+    line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{record.prospect}"
+    stream.log("log", rr.TextLog(line))
+
+
+def _log_paths(
+    stream: rr.RecordingStream, entity: str, paths: Mapping[int, NDArray[np.float64]], color: str, *, radius: float
+) -> None:
+    """Lines with a ball at every point but the first, which is where the object is."""
+    for number, path in paths.items():
+        name = f"{entity}/{object_name(number)}"
+        stream.log(name, rr.LineStrips3D([path], colors=vivid(to_rgb(color)), radii=radius / 3))
+        stream.log(f"{name}/states", rr.Points3D(path[1:], colors=vivid(to_rgb(color)), radii=radius))
+
 
 TIMELINE = "video"  # seconds; the same moments as in `episode.mp4`
 POINT_RADIUS = 0.0015  # metres
@@ -53,7 +127,8 @@ class EpisodeRecording(EpisodeCallback):
         self._stream.log("world/observed/centers", rr.Points3D(centers, colors=(255, 255, 255), radii=0.006))
         if self._record is not None:
             self._reached.append(observation["centers"])
-            log_reached(self._stream, self._record, np.array(self._reached))
+            paths = reached_paths(self._record, np.array(self._reached), Space())
+            _log_paths(self._stream, "world/reached", paths, REACHED_COLOR, radius=0.006)
 
     def on_plan(self, record: PlanRecord) -> None:
         """Log the plan, and pause before it is executed."""
@@ -94,18 +169,19 @@ class EpisodeRecording(EpisodeCallback):
                 albedo_factor=vivid(part.color),
             )
             self._stream.log(f"{path}/shape_{number}", mesh, static=True)
-        around = TILE_SIDE / 2 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1], [-1, -1]])
         for group in self._task.tile_groups():
+            around = TILE_SIDE / 2 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1], [-1, -1]])
             loops = [np.array(tile_center(tile)) + around for tile in group.tiles]
-            strips = [np.column_stack([loop, np.full(len(loop), TILE_HEIGHT)]) for loop in loops]
-            lines = rr.LineStrips3D(strips, colors=vivid(to_rgb(group.color)), radii=0.002)
-            self._stream.log(f"world/tiles/{group.name.replace(' ', '_')}", lines, static=True)
+            self._log_loops(f"world/tiles/{group.name.replace(' ', '_')}", loops, to_rgb(group.color))
+        angles = np.linspace(0.0, 2.0 * np.pi, 33)
+        ring = PLACE_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
         for number, place in enumerate(self._task.object_places()):
-            angles = np.linspace(0.0, 2.0 * np.pi, 33)
-            ring = np.array(place) + PLACE_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
-            strip = np.column_stack([ring, np.full(len(ring), TILE_HEIGHT)])
-            lines = rr.LineStrips3D([strip], colors=vivid(COLORS[number]), radii=0.002)
-            self._stream.log(f"world/places/{object_name(number)}", lines, static=True)
+            self._log_loops(f"world/places/{object_name(number)}", [np.array(place) + ring], COLORS[number])
+
+    def _log_loops(self, entity: str, loops: Sequence[NDArray[np.float64]], color: Sequence[float]) -> None:
+        """Lines [P, 2] metres on the table."""
+        strips = [np.column_stack([loop, np.full(len(loop), TILE_HEIGHT)]) for loop in loops]
+        self._stream.log(entity, rr.LineStrips3D(strips, colors=vivid(color), radii=0.002), static=True)
 
     def _link_path(self, body: int, link: int) -> str:
         if body in self._scene.bodies:

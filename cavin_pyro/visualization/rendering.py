@@ -1,45 +1,89 @@
-"""Episode rendering: a table of steps, pictures of the plans, a video, and a recording."""
+"""Episode rendering: progress on the screen, a table of steps, pictures of the plans, a video, and a recording."""
 
 from __future__ import annotations
 
 import csv
-import importlib
+import importlib.util
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
-from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
+from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
-from cavin_pyro.visualization.progress import EpisodeProgress
-from cavin_pyro.visualization.video import EpisodeVideo
+from cavin_pyro.visualization.video import episode_video
 from envs.goals import SUFFIXES, save_goal
+from envs.pushing import ObservationDict
 from envs.scene import Scene
 
-EVIDENCE_COLUMNS = ("log_z", "temperature", "effective_samples")
-VIEWERS = {"rerun": "rerun"}  # the choices of `viewer=`, and the module that it needs
+SAID = {  # of a push, for people
+    "success": "goal reached",
+    "violation": "violation",
+    "fall": "an object fell",
+    "unsafe": "unsafe",
+    "ineffective": "moved nothing",
+}
+PLAN_COLUMNS = (
+    *("subgoal_distance_m", "planning_ms", "share_reaching_goal"),
+    *("log_z", "temperature", "effective_samples"),
+)
+
+
+class EpisodeProgress(EpisodeCallback):
+    """Prints each push: number, what happened, reward, the time of the plan that it began, and what is left.
+
+    Args:
+        maximum_steps: pushes after which the episode ends.
+    """
+
+    def __init__(self, maximum_steps: int) -> None:
+        self.maximum_steps = maximum_steps
+        self._began: float | None = None
+        self._planned: PlanRecord | None = None  # a plan whose first push is not made yet
+
+    def on_observation(self, observation: ObservationDict) -> None:
+        """Start the clock."""
+        self._began = self._began or time.perf_counter()
+
+    def on_plan(self, record: PlanRecord) -> None:
+        """Keep the plan for the line of its first push."""
+        self._planned = record
+
+    def on_transition(self, transition: Transition) -> None:
+        """Print the push."""
+        assert self._began is not None
+        left, rest = self.maximum_steps - transition.step, "the last"
+        if left and not (transition.success or transition.violation or transition.fall):
+            seconds = left * (time.perf_counter() - self._began) / transition.step
+            rest = f"at most {left} left, " + (f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min")
+        planned, record = "the same plan", self._planned
+        if record is not None:
+            planned = f"planned in {record.milliseconds / 1e3:.2f} s{record.prospect}"
+        what = next((text for flag, text in SAID.items() if getattr(transition, flag)), "moved")
+        line = f"push {transition.step:>2}: {what:<16} reward {transition.reward:6.2f}   {planned}   {rest}"
+        print(line, flush=True)
+        self._planned = None
 
 
 def check_viewer(viewer: object) -> None:
     """Check the option `viewer`, before anything is written.
 
     Raises:
-        UserError: unknown viewer, or one whose package is not installed.
+        UserError: unknown viewer, or its package is not installed.
     """
-    if viewer is None:
-        return
-    if viewer not in VIEWERS:
-        raise UserError(f"unknown viewer {viewer!r}: choose from {', '.join(VIEWERS)}, or null for none")
-    try:
-        importlib.import_module(VIEWERS[str(viewer)])
-    except ImportError as error:
+    if viewer not in (None, "rerun"):
+        raise UserError(f"unknown viewer {viewer!r}: choose rerun, or null for none")
+    if viewer is not None and importlib.util.find_spec("rerun") is None:
         raise UserError(
-            f"viewer={viewer} needs an optional part that is not installed ({error}): "
+            f"viewer={viewer} needs an optional part that is not installed: "
             "run python -m pip install --constraint constraints.txt '.[viewer]' in the repository"
-        ) from error
+        )
 
 
 def check_goal(path: str | None) -> None:
@@ -48,11 +92,9 @@ def check_goal(path: str | None) -> None:
     Raises:
         UserError: a suffix that no goal has, or no folder to write into.
     """
-    if path is None:
-        return
-    if Path(path).suffix.lower() not in SUFFIXES:
+    if path is not None and Path(path).suffix.lower() not in SUFFIXES:
         raise UserError(f"save_goal={path} must end in {' or '.join(SUFFIXES)}")
-    if not Path(path).parent.is_dir():
+    if path is not None and not Path(path).parent.is_dir():
         raise UserError(f"save_goal={path}: there is no folder {Path(path).parent}")
 
 
@@ -75,13 +117,13 @@ def render_episode(
     """Run one episode, print its pushes and write `episode_files` about it; returns its results' row.
 
     Args:
-        viewer: one of `VIEWERS`, whose module is installed, or None.
+        viewer: "rerun" writes a recording for it as well.
     """
     env = runner.env
     with ExitStack() as stack:
         callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
         if video:
-            callbacks.append(stack.enter_context(EpisodeVideo(folder / "episode.mp4", runner.task, env=env)))
+            callbacks.append(stack.enter_context(episode_video(folder / "episode.mp4", env, runner.task)))
         if viewer is not None:
             from cavin_pyro.visualization.recording import recording  # an optional extra
 
@@ -109,42 +151,21 @@ def write_steps(path: Path, episode: Episode) -> None:
     planned = {record.step: record for record in episode.plan_records}
     with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ["step", "x", "y", "dx", "dy", "reward", "success", "violation", "fall", "unsafe", "ineffective"]
-            + ["subgoal_distance_m", "planning_ms", "share_reaching_goal", *EVIDENCE_COLUMNS]
-        )
-        for transition in episode.transitions:
-            flags = (
-                transition.success,
-                transition.violation,
-                transition.fall,
-                transition.unsafe,
-                transition.ineffective,
-            )
-            distance = (
-                ""
-                if transition.subgoal_distance != transition.subgoal_distance
-                else f"{transition.subgoal_distance:.4f}"
-            )
-            record = planned.get(transition.step - 1)
-            took = "" if record is None else f"{record.milliseconds:.1f}"
-            share = None if record is None else record.share_reaching_goal
-            reaching = "" if share is None else f"{share:.4f}"
-            writer.writerow(
-                [
-                    transition.step,
-                    *(f"{value:.4f}" for value in transition.action),
-                    transition.reward,
-                    *(int(flag) for flag in flags),
-                ]
-                + [distance, took, reaching, *_evidence(record)]
-            )
+        writer.writerow(("step", "x", "y", "dx", "dy", "reward", *SAID, *PLAN_COLUMNS))
+        for one in episode.transitions:
+            row = [one.step, *(f"{value:.4f}" for value in one.action), one.reward]
+            row += [int(getattr(one, flag)) for flag in SAID]
+            row.append("" if np.isnan(one.subgoal_distance) else f"{one.subgoal_distance:.4f}")
+            writer.writerow(row + _about_plan(planned.get(one.step - 1)))
 
 
-def _evidence(record: PlanRecord | None) -> list[str]:
-    """The numbers of `EVIDENCE_COLUMNS`, empty for a plan without them."""
-    if record is None or record.plan.evidence is None:
-        return [""] * len(EVIDENCE_COLUMNS)
-    found = record.plan.evidence
+def _about_plan(record: PlanRecord | None) -> list[str]:
+    """The columns about the plan that a push began."""
+    if record is None:
+        return [""] * (len(PLAN_COLUMNS) - 1)
+    share, found = record.share_reaching_goal, record.plan.evidence
+    columns = [f"{record.milliseconds:.1f}", "" if share is None else f"{share:.4f}"]
+    if found is None:
+        return [*columns, "", "", ""]
     fewest = found.effective_samples[0].min()
-    return [f"{found.log_evidence[0]:.4f}", f"{found.temperature[0]:.4g}", f"{fewest:.1f}"]
+    return [*columns, f"{found.log_evidence[0]:.4f}", f"{found.temperature[0]:.4g}", f"{fewest:.1f}"]

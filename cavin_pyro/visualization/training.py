@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,16 +48,13 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
     figure = Figure(figsize=(5.0 + 2.9 * small, 4.2), dpi=DOTS_PER_INCH, layout="constrained")
     grid = figure.add_gridspec(2, 1 + small, width_ratios=[1.7, *[1.0] * small])
     loss = figure.add_subplot(grid[:, 0])
-    curves = {name: _curve(rows, f"{name}_loss") for name in COLORS}
-    _draw_curves(loss, curves)
-    loss.set_title("loss", fontsize=11)
+    _draw_curves(loss, {name: (COLORS[name], _curve(rows, f"{name}_loss")) for name in COLORS}, "loss")
     loss.legend(fontsize=9, frameon=False)
     loss.set_xlabel("training step", fontsize=9)
     for number, term in enumerate(terms):
         row, column = divmod(number, small)
         panel = figure.add_subplot(grid[row, 1 + column])
-        _draw_curves(panel, {"validation": _curve(rows, term)})
-        panel.set_title(term.removeprefix("validation_").replace("_", " "), fontsize=10)
+        _draw_curves(panel, {"validation": (COLORS["validation"], _curve(rows, term))}, term)
     save_figure(path, figure)
 
 
@@ -113,13 +111,8 @@ def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:
     figure = Figure(figsize=(10.0, 0.6 + 2.1 * rows_of_panels), layout="constrained")
     axes = figure.subplots(rows_of_panels, RUN_COLUMNS, squeeze=False)
     for panel, key in zip(axes.flat, keys, strict=False):
-        for color, (name, rows) in zip(RUN_COLORS, runs.items(), strict=False):
-            points = [(row["step"], row[key]) for row in rows if key in row]
-            panel.plot(*zip(*points, strict=True), color=color, linewidth=1.5, marker="o", markersize=3, label=name)
-        panel.set_title(key.removeprefix("validation_").replace("_", " "), fontsize=10)
-        panel.grid(color="#E4E4E4", linewidth=0.6)
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.tick_params(labelsize=8)
+        colored = zip(RUN_COLORS, runs.items(), strict=False)
+        _draw_curves(panel, {name: (color, _curve(rows, key)) for color, (name, rows) in colored}, key)
     for panel in axes.flat[len(keys) :]:
         panel.set_axis_off()
     for panel in axes.flat[: len(keys)][-RUN_COLUMNS:]:  # the lowest of each column
@@ -129,25 +122,26 @@ def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:
     return figure
 
 
-def _curve(rows: Sequence[Mapping[str, str | float]], key: str) -> NDArray[np.float64]:
+def _curve(rows: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
     """Steps and values [n, 2] of the rows that have a finite value."""
     cells = [(float(row["step"]), float(row[key])) for row in rows if row.get(key, "") not in ("", None)]
     curve = np.array(cells, dtype=np.float64).reshape(-1, 2)
     return curve[np.isfinite(curve).all(axis=1)]
 
 
-def _draw_curves(panel: Axes, curves: Mapping[str, NDArray[np.float64]]) -> None:
-    for name, curve in curves.items():
-        marker = "o" if len(curve) == 1 else None
-        panel.plot(*curve.T, color=COLORS[name], linewidth=1.4, marker=marker, label=name)
-    values = np.concatenate([curve[:, 1] for curve in curves.values()])
-    later = np.concatenate([curve[len(curve) // 20 :, 1] for curve in curves.values()])
+def _draw_curves(panel: Axes, curves: Mapping[str, tuple[str, NDArray[np.float64]]], title: str) -> None:
+    """Draw curves [n, 2] in their colours, by names for the legend; the title is a column of metrics."""
+    for name, (color, curve) in curves.items():
+        panel.plot(*curve.T, color=color, linewidth=1.4, marker="o" if len(curve) == 1 else None, label=name)
+    values = np.concatenate([curve[:, 1] for _, curve in curves.values()])
+    later = np.concatenate([curve[len(curve) // 20 :, 1] for _, curve in curves.values()])
     # A steep beginning would flatten all that follows.
     if len(values) and values.min() > 0 and values[0] > 20 * values[-1]:
         panel.set_yscale("log")
     elif len(values) and np.ptp(values) > 4 * np.ptp(later) > 0:
         margin = 0.1 * np.ptp(later)
         panel.set_ylim(later.min() - margin, later.max() + margin)
+    panel.set_title(title.removeprefix("validation_").replace("_", " "), fontsize=10)
     panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.grid(color="#DDDDDD", linewidth=0.6)

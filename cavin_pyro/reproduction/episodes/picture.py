@@ -13,7 +13,6 @@ from cavin_pyro.reproduction.episodes.replay import Replay, replay
 from cavin_pyro.reproduction.figure import DOTS_PER_INCH
 from cavin_pyro.reproduction.table import Row
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.visualization.panel import legend
 from cavin_pyro.visualization.plan import (
     FAILURE_COLOR,
     PANELS,
@@ -21,6 +20,7 @@ from cavin_pyro.visualization.plan import (
     draw_end,
     draw_plan_record,
     draw_return_scale,
+    legend,
     return_scale,
     spread_plans,
 )
