@@ -98,6 +98,7 @@ LEFT_OUT = {  # an addition, and the options without it
     "one push per plan": ("pushes_per_plan=null",),
     "warm start": ("planner.warm_start=false",),
     "idle pushes last": ("planner.idle_distance=0",),
+    "uncertain outcomes": ("planner.robustness.outcome_noise=0",),
     "perturbed rollouts": ("planner.robustness=null",),
     "failure avoidance": ("planner.avoid_failures=false",),
     "margin": ("margin=0",),
@@ -105,6 +106,7 @@ LEFT_OUT = {  # an addition, and the options without it
     "plans about the target": ("planner.nearest_objects=null",),
     "first push": ("planner.tracking_at=end",),
     "another effect": ("planner.effect_retries=0",),
+    "fewer motions": ("planner.motion_samples=1024",),
 }
 ADDITIONS = [
     Row(name, task, objects, options)

@@ -114,22 +114,31 @@ def success(name: str = "success") -> str:
 
 
 def additions() -> str:
-    """Each addition left out, beside all of them in the same scenes."""
+    """Each addition left out, beside all of them in the same scenes; a star where McNemar's p is below 0.05."""
     rows = read("additions")
+    cells = groups(rows, "task", "objects")
     everything = groups([row for row in rows if row["row"] == "all"], "task", "objects")
     lines = []
-    for (name, task, objects), found in groups(rows, "row", "task", "objects").items():
-        ms = [value for row in found for value in row["planning_ms"]]
-        line = [name, f"{task}, {objects}", len(found), rate(found)]
-        violations = sum(row["outcome"] in ("violation", "fall") for row in found)
-        line += [violations, pushes(found), f"{statistics.median(ms):.0f}"]
-        if name == "all":
-            lines.append([*line, ""])
-        else:
-            without, complete, p = paired(found, everything[task, objects])
-            lines.append([*line, f"{without}, {complete} (p = {p:.2g})"])
-    head = ["left out", "task, objects", "episodes", "success", "violations and falls", "pushes, median (mean)"]
-    return markdown([*head, "ms per plan", "succeeds alone: without it, with all"], lines)
+    for (name,), of_row in groups(rows, "row").items():
+        by_cell, line = groups(of_row, "task", "objects"), [name]
+        for cell in cells:
+            found = by_cell.get(cell, [])
+            if not found:
+                line += ["", ""]
+                continue
+            without, complete, p = paired(found, everything[cell])
+            successes = sum(row["outcome"] == "success" for row in found)
+            text = f"{100 * successes / len(found):.1f} %"
+            line.append(text if name == "all" else f"{text} ({without}, {complete}){'*' * (p < 0.05)}")
+            violations = sum(row["outcome"] in ("violation", "fall") for row in found)
+            steps = statistics.mean(row["steps"] for row in found if row["outcome"] == "success")
+            ms = statistics.median(value for row in found for value in row["planning_ms"])
+            line.append(f"{violations}, {steps:.1f}, {ms:.0f}")
+        lines.append(line)
+    counts = {cell: len(found) for cell, found in everything.items()}
+    head = [text for task, objects in cells for text in (f"{task}, {objects}: {counts[task, objects]} scenes", "...")]
+    table = markdown(["left out", *head], lines)
+    return f"{table}\nSeeds {seeds(rows)}, commit {', '.join(sorted({row['commit'] for row in rows}))}.\n"
 
 
 def reproduction() -> str:

@@ -96,3 +96,9 @@ def test_links_of_the_page_lead_somewhere(page: Path) -> None:
     generated = {ROOT / "docs" / "reference" / name for name in ("api/index.md", "commands.md")}
     found = {target: (page.parent / target).resolve() for target in targets}
     assert not [target for target, path in sorted(found.items()) if not path.exists() and path not in generated]
+
+
+def test_every_picture_is_shown_on_a_page() -> None:
+    shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
+    pictures = {*(ROOT / "docs" / "pictures").iterdir(), *(ROOT / "checkpoints").glob("*.png")}
+    assert not sorted(pictures - shown)
