@@ -20,8 +20,8 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
-    from cavin_pyro.training.factory import data_folders
     from cavin_pyro.training.pretraining import pretrain
+    from cavin_pyro.training.run import data_folders
     from cavin_pyro.visualization.training import draw_reconstructions
 
     check_sizes("autoencoder", config.autoencoder)

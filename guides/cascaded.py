@@ -1,4 +1,4 @@
-"""The guide of `models/cascaded.py` (paper, section 3.3)."""
+"""The guide of `models/cascaded.py` (paper, section 3.3), and two ablations of what it reads."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import pyro
 from torch import Tensor
 
 from guides.guide import Guide
-from guides.networks import effect_inference, motion_inference
+from guides.networks import EffectInference, MotionInference
 from models.cascaded import CascadedModel
-from models.plate import sequence_mask, windows_plate
+from models.program import sequence_mask, windows_plate
 from models.state import Window
 
 
@@ -21,19 +21,25 @@ class CascadedGuide(Guide):
 
     fits = ("cascaded",)
 
-    def __init__(self, model: CascadedModel, *, width: int = 64) -> None:
-        """The inference networks.
+    def __init__(
+        self,
+        model: CascadedModel,
+        *,
+        width: int = 64,
+        effect_reads_actions: bool = False,
+        motion_reads_effect: bool = True,
+    ) -> None:
+        """The inference networks. For `model` and `width` see `Guide`.
 
         Args:
-            model: whose codes the guide infers, and whose other dimensions it has.
-            width: width of the guide's own layers.
-
-        Raises:
-            ValueError: an incompatible model.
+            effect_reads_actions: whether the effect is inferred from the actions as well, q(c | s, s', a), as in the
+                exact posterior (guide=joint).
+            motion_reads_effect: whether the motion is inferred given the effect; without, q(z | s, a), the codes are
+                independent given the window (guide=mean_field).
         """
         super().__init__(model)
-        self.effect_inference = effect_inference(model, width=width)
-        self.motion_inference = motion_inference(model, width=width, reads_effect=True)
+        self.effect_inference = EffectInference(model, width=width, reads_actions=effect_reads_actions)
+        self.motion_inference = MotionInference(model, width=width, reads_effect=motion_reads_effect)
 
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
         """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
@@ -41,6 +47,6 @@ class CascadedGuide(Guide):
         encoded = self.model.encode(window, generate) if encoded is None else encoded
 
         with windows_plate(window), sequence_mask(window):
-            effect_code = pyro.sample("effect_code", self.effect_inference(first, last))
+            effect_code = pyro.sample("effect_code", self.effect_inference(first, last, window.actions))
             motion = self.motion_inference(encoded[:, 0], first.mask, window.actions, effect_code)
             pyro.sample("motion_code", motion)

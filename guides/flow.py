@@ -35,16 +35,12 @@ class FlowGuide(CascadedGuide):
     """
 
     def __init__(self, model: CascadedModel, *, width: int = 64, flow_width: int = 32, transforms: int = 4) -> None:
-        """The inference networks and their flows.
+        """The inference networks and their flows. For `model` see `Guide`.
 
         Args:
-            model: whose codes the guide infers, and whose other dimensions it has.
             width: width of the layers before the flows.
             flow_width: width of the hidden layer in each coupling of a flow.
             transforms: number of couplings of each flow.
-
-        Raises:
-            ValueError: an incompatible model.
         """
         super().__init__(model, width=width)
         # Wraps the existing Gaussians, so that equal seeds give both guides equal initial weights.

@@ -13,6 +13,10 @@ class Guide(Program):
 
     A guide's `forward(window, generate=False, encoded=None)` has a `pyro.sample` for every code of the model and no
     others. `encoded` is the result of `model.encode(window, generate)`, which `forward` computes if it is None.
+
+    Args:
+        model: whose codes the guide infers, and whose other dimensions it has.
+        width: width of the guide's own layers.
     """
 
     fits: ClassVar[tuple[str, ...]] = ()

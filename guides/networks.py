@@ -24,20 +24,14 @@ class EffectInference(nn.Module):
     T, with `reads_actions`; FC; Gaussian.
     """
 
-    def __init__(
-        self,
-        *,
-        effect_dimension: int = 16,
-        feature_dimension: int = 64,
-        width: int = 64,
-        reads_actions: bool = False,
-        segment_length: int = 3,
-    ) -> None:
+    def __init__(self, model: Model, *, width: int = 64, reads_actions: bool = False) -> None:
+        """For a `model` with an effect code. `width`: of all layers."""
         super().__init__()
-        self.objects = nn.Sequential(fully_connected(2 * (3 + feature_dimension), width), fully_connected(width, width))
+        inputs = 2 * (3 + model.feature_dimension)
+        self.objects = nn.Sequential(fully_connected(inputs, width), fully_connected(width, width))
         self.pushes = push_features(width) if reads_actions else None
-        self.scene = fully_connected(width + segment_length * width if reads_actions else width, width)
-        self.code: nn.Module = GaussianCode(effect_dimension, width=width)
+        self.scene = fully_connected(width + model.segment_length * width if reads_actions else width, width)
+        self.code: nn.Module = GaussianCode(model.effect_dimension, width=width)
 
     def forward(self, state: State, subgoal: State, actions: Tensor | None = None) -> TorchDistribution:
         """`state, subgoal: [...]`, `actions: [..., T, 4]` -> batch `[...]`; counts objects that are real in both."""
@@ -55,27 +49,21 @@ class EffectInference(nn.Module):
 
 
 class MotionInference(nn.Module):
-    """q_g(z | s, a, c): the motion behind the actions; with `effect_dimension=None`, q(z | s, a).
+    """q_g(z | s, a, c): the motion behind the actions; without `reads_effect`, q(z | s, a), which ignores the code.
 
     (s, c) pooled as in the action generator; FC of each push, concatenated over T; FC of both; Gaussian.
     """
 
-    def __init__(
-        self,
-        *,
-        segment_length: int = 3,
-        effect_dimension: int | None = 16,
-        motion_dimension: int = 16,
-        width: int = 64,
-        encoder_width: int = 64,
-    ) -> None:
+    def __init__(self, model: Model, *, width: int = 64, reads_effect: bool = True) -> None:
+        """For a `model` with a motion code. `width`: of all layers."""
         super().__init__()
-        self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=encoder_width)
+        code = model.effect_dimension if reads_effect else None
+        self.trunk = EffectTrunk(code, width=width, encoder_width=model.width)
         self.pool = ObjectPool(width)
         self.pushes = push_features(width)
-        self.from_pushes = nn.Linear(segment_length * width, width)
+        self.from_pushes = nn.Linear(model.segment_length * width, width)
         self.from_pooled = nn.Linear(width, width, bias=False)
-        self.code: nn.Module = GaussianCode(motion_dimension, width=width)
+        self.code: nn.Module = GaussianCode(model.motion_dimension, width=width)
 
     def forward(
         self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor | None = None
@@ -83,7 +71,7 @@ class MotionInference(nn.Module):
         """Leading dimensions broadcast.
 
         Args:
-            encoded: `[..., M, 3 * encoder_width]`, features of s from the model's `StateEncoder`.
+            encoded: `[..., M, 3 * model.width]`, features of s from the model's `StateEncoder`.
             mask: `[..., M]` of s.
             actions: `[..., T, 4]`.
             effect_code: `[..., C]`.
@@ -92,25 +80,3 @@ class MotionInference(nn.Module):
         # A linear layer on (pooled, pushes), in two parts, because only the first varies with the code.
         feature = (self.from_pooled(pooled) + self.from_pushes(self.pushes(actions))).relu()
         return self.code(feature)
-
-
-def effect_inference(model: Model, *, width: int, reads_actions: bool = False) -> EffectInference:
-    """q(c | s, s') or q(c | s, s', a) for a model with an effect code."""
-    return EffectInference(
-        effect_dimension=model.effect_dimension,
-        feature_dimension=model.feature_dimension,
-        width=width,
-        reads_actions=reads_actions,
-        segment_length=model.segment_length,
-    )
-
-
-def motion_inference(model: Model, *, width: int, reads_effect: bool) -> MotionInference:
-    """q(z | s, a, c) or q(z | s, a) for a model with a motion code."""
-    return MotionInference(
-        segment_length=model.segment_length,
-        effect_dimension=model.effect_dimension if reads_effect else None,
-        motion_dimension=model.motion_dimension,
-        width=width,
-        encoder_width=model.width,
-    )

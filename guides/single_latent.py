@@ -6,8 +6,8 @@ import pyro
 from torch import Tensor
 
 from guides.guide import Guide
-from guides.networks import effect_inference
-from models.plate import sequence_mask, windows_plate
+from guides.networks import EffectInference
+from models.program import sequence_mask, windows_plate
 from models.single_latent import SingleLatentModel
 from models.state import Window
 
@@ -24,20 +24,15 @@ class SingleLatentGuide(Guide):
     fits = ("single_latent",)
 
     def __init__(self, model: SingleLatentModel, *, width: int = 64, reads_actions: bool = False) -> None:
-        """The inference network.
+        """The inference network. For `model` and `width` see `Guide`.
 
         Args:
-            model: whose code the guide infers, and whose other dimensions it has.
-            width: width of the guide's own layers.
             reads_actions: whether the code is inferred from the actions as well, q(c | s, s', a).
-
-        Raises:
-            ValueError: an incompatible model.
         """
         super().__init__(model)
-        self.effect_inference = effect_inference(model, width=width, reads_actions=reads_actions)
+        self.effect_inference = EffectInference(model, width=width, reads_actions=reads_actions)
 
     def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
+        """`window: [B]`. The code is inferred from the window, also if the model then generates."""
         with windows_plate(window), sequence_mask(window):
             pyro.sample("effect_code", self.effect_inference(window.first, window.last, window.actions))

@@ -9,13 +9,11 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from models.model import Model
-from models.networks.action_generator import ActionGenerator
-from models.networks.dynamics import MetaDynamics
-from models.plate import sequence_mask, windows_plate
+from models.networks.dynamics import ActionGenerator, MetaDynamics
 from models.priors.prior import Prior
 from models.priors.standard import StandardPrior
+from models.program import sequence_mask, windows_plate
 from models.state import State, Window
-from models.transitions import sample_subgoal
 
 
 class CascadedModel(Model):
@@ -68,7 +66,7 @@ class CascadedModel(Model):
         """Run the process for `window: [B]`, a batch of training examples.
 
         With `generate=True` it reads only the first states; it samples subgoals, actions and next states instead of
-        observing them (next states push by push, see `models/transitions.py`). `encoded` is the result of `encode`.
+        observing them, next states push by push. `encoded` is the result of `encode`.
         Raises `ValueError` for windows of another shape or features of another length.
         """
         encoded = self.encode(window, generate) if encoded is None else encoded
@@ -79,7 +77,7 @@ class CascadedModel(Model):
                 effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
 
                 effect = self.meta_dynamics.effect(encoded[:, 0], effect_code)
-                sample_subgoal(self.scales, self.meta_dynamics(first, effect), window, generate)
+                self.sample_subgoal(self.meta_dynamics(first, effect), window, generate)
 
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first, effect_code))
 

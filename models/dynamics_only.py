@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from models.model import Model
-from models.plate import windows_plate
+from models.program import windows_plate
 from models.state import Window
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import ClassVar
 
+import pyro
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
@@ -13,10 +14,9 @@ from torch import Tensor
 from models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from models.networks.dynamics import Dynamics, PushOutcome
 from models.networks.encoder import StateEncoder
-from models.networks.shapes import fixed_shapes
+from models.networks.layers import fixed_shapes, unit
 from models.program import Program
-from models.state import State, Window
-from models.transitions import generate_transitions, observe_transitions
+from models.state import State, Window, stack_steps
 
 
 class Model(Program):
@@ -90,7 +90,7 @@ class Model(Program):
 
     @staticmethod
     def fixed_shapes() -> AbstractContextManager[None]:
-        """See `models.networks.shapes`: for planners that compile."""
+        """See `models.networks.layers`: for planners that compile."""
         return fixed_shapes()
 
     def next_state(self, state: State, action: Tensor) -> State:
@@ -102,8 +102,7 @@ class Model(Program):
 
         `state: [...]`, `action: [..., 4]` -> the state after one push.
         """
-        encoded = self.encoder(state) if self.dynamics.reads_encoding else None
-        mean, predicted = self.dynamics.outcome(state, encoded, action)
+        mean, predicted = self._outcome(state, action)
         errors = self.scales.planar_errors(uniform, None if predicted is None else predicted[..., 0])
         errors = errors * mean.mask.unsqueeze(-1)
         return mean._replace(centers=torch.cat((mean.centers[..., :2] + errors, mean.centers[..., 2:]), -1))
@@ -124,17 +123,62 @@ class Model(Program):
         first_only = generate or not self.dynamics.reads_encoding
         return self.encoder(window.states.step(slice(0, 1) if first_only else slice(0, -1)))
 
-    def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
-        """The sites of f, observed, or sampled from the first states (see `models/transitions.py`).
+    def sample_subgoal(self, mean: State, window: Window, generate: bool) -> None:
+        """s' ~ h(. | s, c) for `window: [B]` around `mean: [..., B]`, observed unless `generate` (paper, equation 2).
 
-        `encoded` is the result of `encode`, `actions: [..., B, T, 4]` the input of f for sampling.
+        Sites subgoal_centers, event `[M, 3]`, and subgoal_features, event `[M, F]`. They count the objects that are
+        real in s and s', or in s alone if s' is sampled.
+        """
+        first, last = window.first, window.last
+        counted = first.mask if generate else first.mask & last.mask
+        pyro.sample("subgoal_centers", self.scales.centers(mean, counted), obs=None if generate else last.centers)
+        pyro.sample("subgoal_features", self.scales.features(mean, counted), obs=None if generate else last.features)
+
+    def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
+        """s_t+1 ~ f(. | s_t, a_t), observed, or sampled from the first states (paper, equation 1).
+
+        `encoded` is the result of `encode`, `actions: [..., B, T, 4]` the input of f for sampling. Sites next_centers,
+        event `[T, M, 3]`, and next_features, event `[T, M, F]`. Observed, they count the transitions in
+        `transition_mask`, with the objects that are real before and after the push.
         """
         if generate:
-            generate_transitions(self.dynamics, self.encoder, self.scales, window.first, actions)
-        else:
-            if actions is not window.actions and not torch.equal(actions, window.actions):
+            self._generate_transitions(window.first, actions)
+            return
+        if actions is not window.actions and not torch.equal(actions, window.actions):
+            raise ValueError(
+                "f reads the window's actions unless it generates, so the site actions cannot be conditioned or "
+                "intervened on: put them into the window, or pass generate=True"
+            )
+        before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
+        mean, predicted = self.dynamics.outcome(before, encoded, window.actions)
+        counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
+        centers = self.scales.centers(mean, counted, event_dims=2, predicted=predicted)
+        features = self.scales.features(mean, counted, event_dims=2, predicted=predicted)
+        pyro.sample("next_centers", centers, obs=after.centers)
+        pyro.sample("next_features", features, obs=after.features)
+
+    def _generate_transitions(self, state: State, actions: Tensor) -> None:
+        """Sample push by push from `state: [B]`, at sites next_centers_t and next_features_t for t = 1, ..., T.
+
+        next_centers and next_features record all of them. Sampled features are scaled to unit length before f reads
+        them, like observed ones.
+        """
+        samples = []
+        for step, action in enumerate(actions.unbind(-2), start=1):
+            mean, predicted = self._outcome(state, action)
+            centers = pyro.sample(f"next_centers_{step}", self.scales.centers(mean, state.mask, predicted=predicted))
+            features = pyro.sample(f"next_features_{step}", self.scales.features(mean, state.mask, predicted=predicted))
+            samples.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
+            state = samples[-1]._replace(features=unit(features))
+        steps = stack_steps(samples)
+        for name, sampled in (("next_centers", steps.centers), ("next_features", steps.features)):
+            recorded = pyro.deterministic(name, sampled, event_dim=3)
+            if recorded is not sampled and not torch.equal(recorded, sampled):
                 raise ValueError(
-                    "f reads the window's actions unless it generates, so the site actions cannot be conditioned or "
-                    "intervened on: put them into the window, or pass generate=True"
+                    f"{name} only records what generation has sampled, so it cannot be conditioned or intervened on: "
+                    f"use {name}_1, ..., {name}_{len(samples)}"
                 )
-            observe_transitions(self.dynamics, self.scales, window, encoded)
+
+    def _outcome(self, state: State, action: Tensor) -> tuple[State, Tensor | None]:
+        """Mean of f, and the scales that it predicts, if it does."""
+        return self.dynamics.outcome(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)

@@ -1,11 +1,15 @@
-"""Base class of model and guide programs."""
+"""What model and guide programs share: their base class, the plate over windows and the mask of sites with codes."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Any
 
 import pyro
+from pyro import poutine
 from torch import nn
+
+from models.state import Window
 
 
 class Program(nn.Module):
@@ -20,3 +24,13 @@ class Program(nn.Module):
         if not pyro.settings.get("module_local_params"):
             pyro.module(type(self).__name__, self)
         return super().__call__(*args, **kwargs)
+
+
+def windows_plate(window: Window) -> AbstractContextManager:
+    """The plate over the independent windows of a batch `window: [B]`."""
+    return pyro.plate("windows", len(window.actions))
+
+
+def sequence_mask(window: Window) -> AbstractContextManager:
+    """Masks sites by `window.sequence_mask: [B]`."""
+    return poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]

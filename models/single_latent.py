@@ -11,13 +11,11 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from models.model import Model
-from models.networks.action_generator import ActionGenerator
-from models.networks.dynamics import MetaDynamics
-from models.plate import sequence_mask, windows_plate
+from models.networks.dynamics import ActionGenerator, MetaDynamics
 from models.priors.prior import Prior
 from models.priors.standard import StandardPrior
+from models.program import sequence_mask, windows_plate
 from models.state import State, Window
-from models.transitions import sample_subgoal
 
 
 class SingleLatentModel(Model):
@@ -82,7 +80,7 @@ class SingleLatentModel(Model):
                 effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
 
                 effect = self.meta_dynamics.effect(encoded[:, 0], effect_code)
-                sample_subgoal(self.scales, self.meta_dynamics(first, effect), window, generate)
+                self.sample_subgoal(self.meta_dynamics(first, effect), window, generate)
 
                 mean = self.action_generator(effect, first.mask)
                 observed = None if generate else window.actions

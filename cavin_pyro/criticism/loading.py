@@ -25,7 +25,7 @@ from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import check_fit, geometry_of
 from cavin_pyro.storage.models import model_of
 from cavin_pyro.storage.provenance import provenance
-from cavin_pyro.training.factory import data_folders
+from cavin_pyro.training.run import data_folders
 from guides.guide import Guide
 from models.model import Model
 from models.networks.geometry import Geometry

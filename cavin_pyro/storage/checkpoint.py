@@ -71,7 +71,7 @@ def save_checkpoint(
 ) -> None:
     """Write the parts' weights, from any device, atomically, with configuration and provenance in the header."""
     tensors = {
-        f"{part}.{name}": value.detach().cpu().contiguous()
+        f"{part}.{name}": value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for part, module in parts.items()
         for name, value in module.state_dict().items()
     }

@@ -11,7 +11,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import nn
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.training.randomness import forked
+from cavin_pyro.training.resume import forked
 from models.state import Window
 
 Site = Any  # of a trace: a dictionary of Pyro's

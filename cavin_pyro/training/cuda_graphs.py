@@ -6,6 +6,7 @@ long as the GPU needs for them.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import torch
@@ -16,11 +17,9 @@ from torch import Tensor
 
 from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.objectives import BoundObjective, Objective
-from cavin_pyro.training.randomness import forked
-from models.networks.shapes import fixed_shapes
+from cavin_pyro.training.resume import forked
+from models.networks.layers import fixed_shapes
 from models.state import Window
-from planning.backends.capture import Graph
-from planning.backends.signature import flatten
 
 
 def capturable(loss: BoundObjective, window: Window) -> bool:
@@ -31,18 +30,21 @@ def capturable(loss: BoundObjective, window: Window) -> bool:
     term. A subclass of the objective may do anything else.
     """
     objective = loss.objective
-    if type(objective) is not Objective or type(loss) is not BoundObjective:
+    if type(objective) is not Objective or type(loss) is not BoundObjective or not loss.guide.amortized:
         return False
-    if type(objective.elbo) is not Trace_ELBO or objective.elbo.num_particles != 1 or not loss.guide.amortized:
+    if type(objective.elbo) is not Trace_ELBO or objective.elbo.num_particles != 1:
         return False
-    weighted = objective.warm_up_steps or any(weight != 1.0 for weight in objective.weights(0).values())
-    return not weighted and not objective.counterfactual_weight and _reparameterized(loss, window)
+    if objective.weighted or objective.counterfactual_weight:
+        return False
+    with forked(window.actions.device), torch.no_grad():
+        sites = [*poutine.trace(loss.guide).get_trace(window).nodes.values()]
+    codes: list[Any] = [site["fn"] for site in sites if site["type"] == "sample" and not site_is_subsample(site)]
+    return all(code.has_rsample for code in codes)
 
 
-def loss_of(loss: BoundObjective, window: Window) -> Tensor:
+def capturable_loss(loss: BoundObjective, window: Window) -> Tensor:
     """The loss of a batch `[B]` that is `capturable`, summed over its windows: a scalar."""
-    encoded = loss.model.encode(window)
-    terms = elbo_terms(loss.model, loss.guide, window, encoded=encoded)
+    terms = elbo_terms(loss.model, loss.guide, window, encoded=loss.model.encode(window))
     return sum((terms | loss.terms_of_model(window)).values(), window.actions.new_zeros(()))
 
 
@@ -52,35 +54,53 @@ class CapturedLoss:
     def __init__(self, loss: BoundObjective) -> None:
         self._loss = loss
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
-        self._graphs: dict[Any, Graph[tuple[Tensor, list[Tensor | None]]]] = {}
-        self._pool = torch.cuda.graph_pool_handle()
+        self._graphs: dict[torch.Size, tuple[Any, Window, Tensor, list[Tensor | None]]] = {}
+        self._stream: Any = None  # one for all graphs, which else would share no memory
 
     def __call__(self, window: Window) -> Tensor:
         """The mean loss of a batch `[B]`, without gradients, which it writes to the parameters.
 
         Raises RuntimeError for a loss that waits for the GPU.
         """
-        tensors: list[Tensor] = []
-        signature: list[Any] = [torch.get_float32_matmul_precision()]
-        flatten(window, tensors, signature)
-        version = tuple(signature)
-        if version not in self._graphs:
-            with fixed_shapes():
-                self._graphs[version] = Graph(self._gradients, (window,), tensors, window.actions.device, self._pool)
-        value, gradients = self._graphs[version](tensors)
+        shape = window.states.centers.shape
+        if shape not in self._graphs:
+            self._graphs[shape] = self._capture(window)
+        graph, own, value, gradients = self._graphs[shape]
+        for mine, given in zip((*own.states, *own[1:]), (*window.states, *window[1:]), strict=True):
+            mine.copy_(given, non_blocking=True)
+        graph.replay()
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         return value
 
+    def _capture(self, window: Window) -> tuple[Any, Window, Tensor, list[Tensor | None]]:
+        """A graph, the window that it reads, and the loss and the gradients that each replay writes anew.
+
+        The loss is computed twice: once so that libraries allocate what they need, which no graph may do, and so that
+        an operation for which the host waits raises before the capture, which would leave the generator unusable.
+        """
+        device, own = window.actions.device, window.map(torch.clone)
+        here = torch.cuda.current_stream(device)
+        if self._stream is None:
+            self._stream, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
+        self._stream.wait_stream(here)
+        before = torch.cuda.get_sync_debug_mode()
+        try:
+            with warnings.catch_warnings(), torch.cuda.stream(self._stream), forked(device), fixed_shapes():
+                warnings.simplefilter("ignore")  # of torch, that this mode is a prototype
+                torch.cuda.set_sync_debug_mode("error")
+                self._gradients(own)
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+            here.wait_stream(self._stream)
+        graph = torch.cuda.CUDAGraph()
+        # Inside of `here`, which is then current again also if the capture fails.
+        with torch.cuda.stream(here), torch.cuda.graph(graph, pool=self._pool, stream=self._stream), fixed_shapes():
+            value, gradients = self._gradients(own)
+        return graph, own, value, gradients
+
     def _gradients(self, window: Window) -> tuple[Tensor, list[Tensor | None]]:
-        loss = loss_of(self._loss, window) / len(window.sequence_mask)
+        loss = capturable_loss(self._loss, window) / len(window.sequence_mask)
         gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
         # Copies: a gradient may be a view of another one, and the caller clips them in place.
         return loss.detach(), [None if one is None else one.clone().contiguous() for one in gradients]
-
-
-def _reparameterized(loss: BoundObjective, window: Window) -> bool:
-    with forked(window.actions.device), torch.no_grad():
-        sites = [*poutine.trace(loss.guide).get_trace(window).nodes.values()]
-    samplers: list[Any] = [site["fn"] for site in sites if site["type"] == "sample" and not site_is_subsample(site)]
-    return all(sampler.has_rsample for sampler in samplers)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
+import torch
 from pyro import poutine
 from pyro.infer import (
     ELBO,
@@ -20,49 +20,37 @@ from pyro.infer import (
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
-from cavin_pyro.training.consistency import consistency_loss
-from cavin_pyro.training.counterfactual import counterfactual_loss
-from cavin_pyro.training.gradients import DifferentiableBound, loss_with_gradients
-from cavin_pyro.training.hindsight import hindsight_loss
-from cavin_pyro.training.rollout import rollout_loss
+from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
 from guides.guide import Guide
 from models.model import Model
-from models.priors.standard import StandardPrior
 from models.state import Window
 
 CODES = ("effect_code", "motion_code")
 COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanField_ELBO)
+CENTER_UNIT = 0.005  # metres, a typical error of f after one push
+FEATURE_UNIT = 0.1  # of a vector of unit length
+SMOOTHING = 1e-6  # square metres, and of feature vectors; the distance has no gradient at 0
 
 
 class Objective:
-    """A bound, with optional weights of its KL terms, their warm-up, and four other terms.
+    """A bound, with optional weights of its KL terms, their warm-up, and two other terms.
 
     loss = -bound(with KL term i weighted by w_i * min(1, (step + 1) / warm_up_steps))
            + counterfactual_weight * counterfactual_loss + rollout_weight * rollout_loss
-           + consistency_weight * consistency_loss + hindsight_weight * hindsight_loss
 
     With weights of one, no warm-up and no other term, the defaults, this is the bound and nothing else.
 
     The validation loss, by which training chooses the best checkpoint, is another: -ELBO from one sample of the codes,
-    whatever the bound and its weights, and the rollout, consistency and hindsight terms. It has no counterfactual
-    term.
+    whatever the bound and its weights, and the rollout term. It has no counterfactual term.
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: weight of each code's KL term, positive.
         warm_up_steps: steps over which the weights of the codes' log densities (of prior and guide) grow from nearly
             zero.
-        counterfactual_weight: weight of the published code's term, see `cavin_pyro.training.counterfactual`. The
-            validation loss, which chooses the best checkpoint, does not contain it.
-        rollout_weight: weight of the error where f reads its own predictions, see `cavin_pyro.training.rollout`. The
-            bound contains each push already, so a weight trades its density for the accuracy of rollouts.
-        consistency_weight: weight of how likely sampled motions reach the subgoal, see
-            `cavin_pyro.training.consistency`; it changes the prior of motions alone.
-        consistency_motions: how many motions of each effect the consistency term samples. consistency_windows: how many
-            windows of a batch enter the consistency term.
-        hindsight_weight: weight of how far subgoals lie from what motions attain, see `cavin_pyro.training.hindsight`;
-            it changes h alone, and its choices are by h as training begins, so it is for fine-tuning.
-        hindsight_motions: how many motions of each effect the hindsight term chooses from. hindsight_windows: how many
-            windows of a batch enter the hindsight term.
+        counterfactual_weight: weight of the published code's term, see `counterfactual_loss`. The validation loss,
+            which chooses the best checkpoint, does not contain it.
+        rollout_weight: weight of the error where f reads its own predictions, see `rollout_loss`. The bound contains
+            each push already, so a weight trades its density for the accuracy of rollouts.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
@@ -76,31 +64,20 @@ class Objective:
         warm_up_steps: int = 0,
         counterfactual_weight: float = 0.0,
         rollout_weight: float = 0.0,
-        consistency_weight: float = 0.0,
-        consistency_motions: int = 32,
-        consistency_windows: int = 32,
-        hindsight_weight: float = 0.0,
-        hindsight_motions: int = 64,
-        hindsight_windows: int = 16,
     ) -> None:
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
         self.warm_up_steps = warm_up_steps
         self.counterfactual_weight = counterfactual_weight
         self.rollout_weight = rollout_weight
-        self.consistency_weight = consistency_weight
-        self.consistency_sizes = {"motions": consistency_motions, "windows": consistency_windows}
-        self.hindsight_weight = hindsight_weight
-        self.hindsight_sizes = {"motions": hindsight_motions, "windows": hindsight_windows}
         for name, weight in self.kl_weights.items():
             if name not in CODES:
                 raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
             if not weight > 0:
                 raise ValueError(f"objective.kl_weights.{name} must be positive, not {weight:g}")
-        weights = ("counterfactual_weight", "rollout_weight", "consistency_weight", "hindsight_weight")
-        numbers = {name: getattr(self, name) for name in ("warm_up_steps", *weights)}
-        if wrong := [name for name, value in numbers.items() if not 0 <= value < math.inf]:
-            raise ValueError(f"objective.{wrong[0]} must be 0 or more, not {numbers[wrong[0]]:g}")
+        for name in ("warm_up_steps", "counterfactual_weight", "rollout_weight"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"objective.{name} must be 0 or more, not {getattr(self, name):g}")
         if counterfactual_weight and elbo.num_particles != 1:
             raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
         if counterfactual_weight and not isinstance(elbo, DifferentiableBound):
@@ -110,46 +87,39 @@ class Objective:
                 f"objective.elbo {type(elbo).__name__} compiles with torch.jit.trace, which takes windows apart and "
                 "refuses the in-place layers of the networks: choose objective=trace_elbo"
             )
-        if isinstance(elbo, RenyiELBO) and (warm_up_steps or any(w != 1 for w in self.kl_weights.values())):
+        if isinstance(elbo, RenyiELBO) and self.weighted:
             raise ValueError(
                 "a Renyi bound has no KL terms to weight: leave objective.kl_weights and objective.warm_up_steps, "
                 "or choose objective=trace_elbo"
             )
 
+    @property
+    def weighted(self) -> bool:
+        """Whether a KL term has another weight than one, at any step."""
+        return bool(self.warm_up_steps) or any(weight != 1 for weight in self.kl_weights.values())
+
+    def weights(self, step: int) -> dict[str, float]:
+        """Weight of each code's KL term at a step, counted from 0."""
+        ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
+        return {name: ramp * self.kl_weights.get(name, 1.0) for name in CODES}
+
     def check(self, model: Model, guide: Guide | None = None) -> None:
         """Check that a model, and a guide, are compatible with this objective.
 
         Raises:
-            ValueError: the model generates no actions, but there is a counterfactual term; or the guide has parameters
-                for each window, but the bound is none that takes its auxiliary sites into account.
+            ValueError: the model generates no actions, but there is a counterfactual term; it has no codes, but there
+                are several particles; or the guide has parameters for each window, but the bound is none that takes
+                its auxiliary sites into account.
         """
-        if guide is not None and not guide.amortized:
-            weighted = self.warm_up_steps or any(weight != 1 for weight in self.kl_weights.values())
-            if type(self.elbo) is not Trace_ELBO or weighted:
-                raise ValueError(
-                    f"guide {type(guide).__name__} samples auxiliary sites, which this objective leaves out: "
-                    "choose objective=trace_elbo, without objective.kl_weights and objective.warm_up_steps"
-                )
+        if guide is not None and not guide.amortized and (type(self.elbo) is not Trace_ELBO or self.weighted):
+            raise ValueError(
+                f"guide {type(guide).__name__} samples auxiliary sites, which this objective leaves out: "
+                "choose objective=trace_elbo, without objective.kl_weights and objective.warm_up_steps"
+            )
         if self.counterfactual_weight and not model.codes:
             raise ValueError(
                 f"objective counterfactual needs a model that generates actions, and {type(model).__name__} does not: "
                 "choose model= from cascaded, single_latent, flat"
-            )
-
-        if self.consistency_weight and set(CODES) - set(model.codes):
-            raise ValueError(
-                "objective consistent needs a model whose motions have a prior of their own, given the effect, and "
-                f"{type(model).__name__} has none: choose model=cascaded"
-            )
-        if self.hindsight_weight and set(CODES) - set(model.codes):
-            raise ValueError(
-                "objective hindsight needs a model whose effects have subgoals and motions, and "
-                f"{type(model).__name__} has none: choose model=cascaded"
-            )
-        if self.consistency_weight and isinstance(model.get_submodule("prior_of_motions"), StandardPrior):
-            raise ValueError(
-                "objective consistent fits the prior of motions, and prior=standard has nothing to fit: choose "
-                "prior=conditional, mixture or flow"
             )
         if self.elbo.num_particles > 1 and not model.codes:
             raise ValueError(
@@ -157,16 +127,8 @@ class Objective:
                 f"{type(model).__name__} has none: choose objective=trace_elbo"
             )
 
-    def weights(self, step: int) -> dict[str, float]:
-        """Weight of each code's KL term at a step, counted from 0."""
-        ramp = min(1.0, (step + 1) / self.warm_up_steps) if self.warm_up_steps else 1.0
-        return {name: ramp * self.kl_weights.get(name, 1.0) for name in CODES}
-
     def bind(self, model: Model, guide: Guide) -> BoundObjective:
-        """The loss of one model and guide, as a module with the parameters of both.
-
-        With a hindsight term, h as it is now says what effects are asked for.
-        """
+        """The loss of one model and guide, as a module with the parameters of both."""
         self.check(model, guide)
         return BoundObjective(self, model, guide)
 
@@ -177,42 +139,32 @@ class BoundObjective(nn.Module):
     def __init__(self, objective: Objective, model: Model, guide: Guide) -> None:
         super().__init__()
         self.objective, self.model, self.guide = objective, model, guide
-        # In a tuple, so that it is no part of this module, whose weights are trained and stored.
-        self._reference = (deepcopy(model).requires_grad_(False),) if objective.hindsight_weight else ()
 
     def forward(self, window: Window, step: int) -> Tensor:
         """The loss summed over the windows `[B]`, a scalar, at a step counted from 0."""
-        bound = self._bound(window, step)
+        bound = self._negative_bound(window, step)
         return sum(self.terms_of_model(window).values(), bound)
 
     def terms_of_model(self, window: Window) -> dict[str, Tensor]:
         """The weighted terms beside the bound that read the model alone, summed over the windows `[B]`, scalars."""
-        objective, model, terms = self.objective, self.model, {}
-        if objective.rollout_weight:
-            terms["rollout"] = objective.rollout_weight * rollout_loss(model, window)
-        if objective.consistency_weight:
-            term = consistency_loss(model, window, **objective.consistency_sizes)
-            terms["consistency"] = objective.consistency_weight * term
-        for reference in self._reference:
-            term = hindsight_loss(model, window, reference, **objective.hindsight_sizes)
-            terms["hindsight"] = objective.hindsight_weight * term
-        return terms
+        weight = self.objective.rollout_weight
+        return {"rollout": weight * rollout_loss(self.model, window)} if weight else {}
 
-    def _bound(self, window: Window, step: int) -> Tensor:
+    def _negative_bound(self, window: Window, step: int) -> Tensor:
         objective = self.objective
         weights = objective.weights(step)
         model: Any = self.model
         guide: Any = self.guide
         if any(weight != 1.0 for weight in weights.values()):
             model, guide = _Weighted(weights)(model), _Weighted(weights)(guide)
-        bound = objective.elbo
-        if not isinstance(bound, DifferentiableBound):
-            return loss_with_gradients(bound, model, guide, window, list(self.parameters()))
+        elbo = objective.elbo
+        if not isinstance(elbo, DifferentiableBound):
+            return loss_with_gradients(elbo, model, guide, window, list(self.parameters()))
         encoded = self.model.encode(window)  # once for both programs
         if not objective.counterfactual_weight:
-            return bound.differentiable_loss(model, guide, window, encoded=encoded)
+            return elbo.differentiable_loss(model, guide, window, encoded=encoded)
         guided = poutine.trace(self.guide).get_trace(window, encoded=encoded)
-        loss = bound.differentiable_loss(model, poutine.replay(guide, trace=guided), window, encoded=encoded)
+        loss = elbo.differentiable_loss(model, poutine.replay(guide, trace=guided), window, encoded=encoded)
         codes = {name: guided.nodes[name]["value"] for name in CODES if name in guided.nodes}
         return loss + objective.counterfactual_weight * counterfactual_loss(self.model, window, codes)
 
@@ -242,3 +194,49 @@ def as_objective(part: Objective | ELBO) -> Objective:
     raise ValueError(
         f"an objective is cavin_pyro.training.objectives.Objective or an ELBO of Pyro, not {type(part).__name__}"
     )
+
+
+def counterfactual_loss(model: Model, window: Window, codes: Mapping[str, Any]) -> Tensor:
+    """Negative log density of s' around f's prediction for the generated actions, summed over the windows `[B]`.
+
+    a = mean of g(. | s, c, z), s_t+1 = mean of f(. | s_t, a_t) for t = 0, ..., T - 1, and s_T is compared with
+    s' under the likelihood scales. Objects count that are real in both, windows where `sequence_mask` is set.
+    The term is of the published code, for an ablation; the paper asserts that the actions of (s, c, z) lead to h(s, c).
+
+    Args:
+        codes: the sampled `effect_code` and `motion_code`, those of the two that the model has.
+    """
+    state, last = window.first, window.last
+    for action in model.actions(state, **codes).unbind(-2):
+        state = model.next_state(state, action)
+    real = window.first.mask & last.mask
+    scored = model.scales.centers(state, real).log_prob(last.centers)
+    scored = scored + model.scales.features(state, real).log_prob(last.features)
+    return -scored.where(window.sequence_mask, 0.0).sum()
+
+
+def rollout_loss(model: Model, window: Window) -> Tensor:
+    """Distances between f's own rollout and what was observed, summed over the windows `[B]`, a scalar.
+
+    s^_0 = s_0, s^_t+1 = mean of f(. | s^_t, a_t) for t = 0, ..., T - 1, and the term is the sum over t and objects of
+    |center^ - center| / 5 mm + |feature^ - feature| / 0.1. Distances, not squares, because a few pushes end with an
+    object that rolls away. Objects count that are real before and after push t, in windows whose pushes up to t all
+    count (`transition_mask`).
+
+    The bound scores each push from the state that was observed before it. A plan's later pushes start from predictions,
+    whose errors grow, and the bound does not penalise these.
+    """
+    state, counts = window.first, torch.ones_like(window.sequence_mask)
+    loss = window.actions.new_zeros(())
+    for step in range(window.segment_length):
+        state = model.next_state(state, window.actions[..., step, :])
+        before, after = window.states.step(step), window.states.step(step + 1)
+        counts = counts & window.transition_mask[..., step]
+        far = _distance(state.centers, after.centers) / CENTER_UNIT
+        far = far + _distance(state.features, after.features) / FEATURE_UNIT
+        loss = loss + far.where(before.mask & after.mask & counts.unsqueeze(-1), 0.0).sum()
+    return loss
+
+
+def _distance(one: Tensor, other: Tensor) -> Tensor:
+    return ((one - other).square().sum(-1) + SMOOTHING).sqrt()

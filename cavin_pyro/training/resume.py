@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,12 @@ from cavin_pyro.storage.files import atomic_write
 
 # What each optimizer keeps for a weight: moments as large as the weight, and Adam the number of its steps.
 ENTRIES = {"adam": ("exp_avg", "exp_avg_sq", "step"), "muon": ("momentum_buffer",)}
-NUMBERS = ("step",)  # of these, those that are single numbers
 
 
 def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
     """Write tensors of any device, and a state that JSON can hold, atomically; the file knows no device."""
-    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    # Copies: safetensors refuses tensors that share memory, as those of some automatic guides do.
+    whole = {name: value.detach().cpu().clone(memory_format=torch.contiguous_format) for name, value in tensors.items()}
     header = {"sha256": tensors_digest(whole), "state": json.dumps(state)}
     with atomic_write(path) as temporary:
         temporary.write_bytes(save(whole, metadata=header))
@@ -53,6 +53,11 @@ def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         ) from error
 
 
+def section(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with `part`, without it."""
+    return {name.removeprefix(f"{part}."): value for name, value in tensors.items() if name.startswith(f"{part}.")}
+
+
 def optimizer_tensors(optimizer: torch.optim.Optimizer, part: str = "adam") -> dict[str, Tensor]:
     """An optimizer's moments, by names that begin with `part`."""
     return {
@@ -76,18 +81,34 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
         place, _, entry = name.partition(".")
         moments.setdefault(int(place), {})[entry] = value
     parameters: list[nn.Parameter] = [one for group in optimizer.param_groups for one in group["params"]]
-    if unknown := [number for number in moments if not 0 <= number < len(parameters)]:
-        raise ValueError(f"{part}.{unknown[0]} belongs to no weight")
-    for number, parameter in enumerate(parameters):
-        for entry in ENTRIES[part] if number in moments else ():
-            moment = moments[number].get(entry)
-            if moment is None:
+    for number, entries in moments.items():
+        if not 0 <= number < len(parameters):
+            raise ValueError(f"{part}.{number} belongs to no weight")
+        for entry in ENTRIES[part]:
+            if entry not in entries:
                 raise ValueError(f"{part}.{number}.{entry} is missing")
-            if moment.shape != (() if entry in NUMBERS else parameter.shape):
+            if entries[entry].shape != (() if entry == "step" else parameters[number].shape):
                 raise ValueError(f"{part}.{number}.{entry} is of another shape")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 
-def section(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """The tensors whose names begin with a part's, without it."""
-    return {name[len(part) + 1 :]: value for name, value in tensors.items() if name.startswith(f"{part}.")}
+def forked(device: torch.device) -> AbstractContextManager[None]:
+    """Restore the generators of the CPU and of a device at the end of the block."""
+    others = [] if device.type == "cpu" else [device]
+    return torch.random.fork_rng(devices=others, device_type="cuda" if device.type == "cpu" else device.type)
+
+
+def random_states(device: torch.device) -> dict[str, Tensor]:
+    """The state of the CPU's generator, and that of the device that trains, which samples the codes."""
+    states = {"random": torch.get_rng_state()}
+    if device.type != "cpu":
+        states[f"random_{device.type}"] = torch.get_device_module(device).get_rng_state(device)
+    return states
+
+
+def restore_random_states(tensors: Mapping[str, Tensor], device: torch.device, seed: int) -> None:
+    """Return to `random_states`. A file that another device wrote has none of this one's, which `seed` then seeds."""
+    torch.set_rng_state(tensors["random"])
+    if device.type != "cpu":
+        module, own = torch.get_device_module(device), tensors.get(f"random_{device.type}")
+        module.manual_seed(seed) if own is None else module.set_rng_state(own, device)

@@ -8,27 +8,28 @@ from typing import Any
 
 import pyro
 import torch
-from omegaconf import DictConfig
-from torch import Tensor
+from omegaconf import DictConfig, ListConfig
+from torch import Tensor, nn
 
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.options import configured
-from cavin_pyro.config.parts import amortized_guides, build_guide, build_model
+from cavin_pyro.config.options import configured, shown
+from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct
 from cavin_pyro.data.dataset import content_records, read_metadata
+from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.sources import slots_of
 from cavin_pyro.data.windows import WindowTable, load_windows
-from cavin_pyro.storage.checkpoint import save_checkpoint, verify_checkpoint
-from cavin_pyro.storage.files import output_folder, write_json
-from cavin_pyro.storage.geometry import check_fit, chosen_geometry, part_name
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint, verify_checkpoint
+from cavin_pyro.storage.files import file_digest, output_folder, write_json
+from cavin_pyro.storage.geometry import check_fit, chosen_geometry, geometry_of, part_name
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
 from cavin_pyro.training.compatibility import check_compatibility
-from cavin_pyro.training.factory import build_objective, data_folders
-from cavin_pyro.training.initial import start_from, train_only
+from cavin_pyro.training.objectives import Objective, as_objective
 from cavin_pyro.training.trainer import Trainer, fixed_windows
 from guides.guide import Guide
+from models.model import Model
 from models.networks.geometry import Geometry
 
 DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
@@ -60,11 +61,6 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     data = data_folders(config.data)
     with user_input():
         objective.check(model, guide)
-    if objective.hindsight_weight and not config.initial:
-        raise UserError(
-            "objective.hindsight_weight fine-tunes: h of initial=FILE says what effects ask for. Give one, or leave "
-            "the weight 0"
-        )
     started = start_from(config, model, guide, geometry) if config.initial else {}
     train_only(config.trained, model, guide)
     signs = _mirror_signs(config.trainer.reflect, geometry, guide)
@@ -110,6 +106,72 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
     return run
+
+
+def data_folders(data: str | Sequence[str]) -> list[Path]:
+    """The option `data`: a folder, or a list of them.
+
+    Raises:
+        UserError: it is something else.
+    """
+    folders = [data] if isinstance(data, str) else data
+    listed = isinstance(folders, Sequence | ListConfig) and all(isinstance(one, str) and one for one in folders)
+    if not listed or not folders:
+        raise UserError(f"data must be a dataset folder from collect, or a list of them, not {shown(data)!r}")
+    return [Path(folder) for folder in folders]
+
+
+def build_objective(config: Config, model: Model) -> Objective:
+    """The objective, from the section `objective`.
+
+    Raises:
+        UserError: an objective that cannot be built, or that is incompatible with the model.
+    """
+    section = config["objective"]
+    check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
+    if "elbo" in section and section["elbo"] is None:
+        raise UserError("objective.elbo must be a section, not null")
+    check_sizes("objective.elbo", section.get("elbo") or {})
+    with user_input():
+        objective = as_objective(construct(section))
+        objective.check(model)
+    return objective
+
+
+def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometry) -> dict[str, Any]:
+    """Copy the weights of the checkpoint `config.initial` into model and guide, which must be of its architecture.
+
+    Returns:
+        Its digest and provenance, for that of the new one. What a calibration has found stays true where f alone is
+        trained: neither the codes' priors nor what a guide reads depends on f.
+
+    Raises:
+        UserError: there is no such file, it holds other parts, or features of another geometry.
+    """
+    path = find_checkpoint(config.initial)
+    checkpoint = load_checkpoint(path)
+    checkpoint.load_into("model", model, path)
+    checkpoint.load_into("guide", guide, path)
+    if geometry_fingerprint(geometry_of(checkpoint, path)) != geometry_fingerprint(geometry):
+        raise UserError(f"checkpoint {path} was trained with other geometric features: give its geometry= or pointnet=")
+    about = checkpoint.provenance
+    kept = {name: about[name] for name in ("calibrated",) if name in about and list(config.trained) == ["dynamics"]}
+    return {**kept, "initial": {"sha256": file_digest(path), "provenance": about}}
+
+
+def train_only(names: Sequence[str], model: Model, guide: Guide) -> None:
+    """Leave the weights of all parts but these, of the model or `guide`, as they are; no names stand for all parts.
+
+    Raises:
+        UserError: a name is of no part.
+    """
+    candidates: dict[str, nn.Module] = {**dict(model.named_children()), "guide": guide}
+    parts = {name: part for name, part in candidates.items() if any(True for _ in part.parameters())}
+    for name in names:
+        if name not in parts:
+            raise UserError(f"trained has {name!r}, which is no part of this model: choose from {', '.join(parts)}")
+    for name, part in parts.items():
+        part.requires_grad_(not names or name in names)
 
 
 def _chosen_windows(config: DictConfig) -> WindowConfig:

@@ -1,7 +1,7 @@
 """Stochastic variational inference: the loop, its validation, its checkpoints, and exact resuming.
 
-One optimizer of torch over the ELBO as a module (`cavin_pyro.training.optimizers`), because Pyro's own keep one per
-parameter and take more time than these small networks.
+Optimizers of torch over the ELBO as a module, because Pyro's own keep one per parameter and take more time than these
+small networks.
 """
 
 from __future__ import annotations
@@ -29,15 +29,21 @@ from cavin_pyro.storage.progress import ScalarLog, progress_bar
 from cavin_pyro.training.cuda_graphs import CapturedLoss, capturable
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, term_counts
 from cavin_pyro.training.objectives import Objective
-from cavin_pyro.training.optimizers import make_optimizers
-from cavin_pyro.training.randomness import forked, stored_states, take_over
-from cavin_pyro.training.reflection import reflect
-from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
+from cavin_pyro.training.resume import (
+    forked,
+    load_optimizer,
+    optimizer_tensors,
+    random_states,
+    restore_random_states,
+    resuming,
+    section,
+    write_resume,
+)
 from guides.guide import Guide
 from models.model import Model
-from models.state import Window
-from planning.backends.capture import first_line
+from models.state import State, Window
 
+SMALLEST = 5  # rows and columns of a matrix whose update Muon orthogonalises, at least
 VALIDATION_BATCH = 1024  # windows at once, which bounds the memory
 
 Row = dict[str, float]
@@ -106,15 +112,18 @@ class Trainer:
             # Pyro warns many times about one NaN; this loop checks and stops.
             warnings.filterwarnings("ignore", "Encountered", UserWarning)
             while self.step < config.steps and self.stale < config.patience:
-                running += self._update()
+                running += self._loss_and_gradients(self._sample())
+                self._apply_gradients()
                 self.step += 1
                 bar.update()
                 if self.step % config.validate_every == 0 or self.step == config.steps:
                     count = self.step - (int(self.rows[-1]["step"]) if self.rows else 0)
                     windows_per_second = count * config.batch_size / (time.perf_counter() - since)
-                    self._validate(running / count, windows_per_second, board)
+                    row = self._validate(running / count, windows_per_second)
+                    self._keep(row)
+                    board.add(row)
+                    bar.set_postfix(validation=f"{row['validation_loss']:.1f}", best=f"{self.best:.1f}")
                     running, since = 0.0, time.perf_counter()
-                    bar.set_postfix(validation=f"{self.rows[-1]['validation_loss']:.1f}", best=f"{self.best:.1f}")
 
     def _check_programs(self) -> None:
         """Let Pyro validate model and guide once, instead of in every step."""
@@ -124,35 +133,31 @@ class Trainer:
         if self.config.cuda_graphs and self.windows.device.type == "cuda" and capturable(self._loss, window):
             self._captured = CapturedLoss(self._loss)
 
-    def _update(self) -> float:
-        config = self.config
-        indices = self._fixed
+    def _sample(self) -> Window:
+        """A batch of training windows, some of them mirrored if there are mirror signs."""
+        config, indices = self.config, self._fixed
         if indices is None:
             indices = self.windows.sample(config.batch_size, self._batches, bucketed=config.batches == "bucketed")
         window = self.windows.batch(indices)
         if self._mirror_signs is not None:
             mirrored = torch.rand(len(indices), generator=self._batches) < 0.5
             window = reflect(window, send(mirrored, self.windows.device), self._mirror_signs)
-        for optimizer in self._optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = config.rate(self.step)
-        loss = self._gradients(window)
-        norm = nn.utils.clip_grad_norm_(self._loss.parameters(), config.clip_norm)
-        if not math.isfinite(norm.item()):
-            self._stop_at("gradient")
-        for optimizer in self._optimizers.values():
-            optimizer.step()
-        return loss
+        return window
 
-    def _gradients(self, window: Window) -> float:
+    def _loss_and_gradients(self, window: Window) -> float:
         """The mean loss of a batch, with its gradients in the parameters."""
         if self._captured is not None:
             try:
                 loss = self._captured(window)
             except RuntimeError as error:  # the base class of CUDA's errors
                 self._captured = None
-                why = f"since the loss cannot be captured as a CUDA graph: {first_line(error)}"
-                print(f"from step {self.step} on, steps run eagerly, {why}", file=sys.stderr, flush=True)
+                why = (str(error).splitlines() or [repr(error)])[0]
+                print(
+                    f"from step {self.step} on, steps run eagerly, since the loss cannot be captured as a CUDA graph: "
+                    f"{why}",
+                    file=sys.stderr,
+                    flush=True,
+                )
         if self._captured is None:
             for optimizer in self._optimizers.values():
                 optimizer.zero_grad(set_to_none=True)
@@ -163,6 +168,16 @@ class Trainer:
             loss.backward()
         return value
 
+    def _apply_gradients(self) -> None:
+        """A step of the optimizers with the clipped gradients and the scheduled learning rate."""
+        norm = nn.utils.clip_grad_norm_(self._loss.parameters(), self.config.clip_norm)
+        if not math.isfinite(norm.item()):
+            self._stop_at("gradient")
+        for optimizer in self._optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] = self.config.rate(self.step)
+            optimizer.step()
+
     def _stop_at(self, term: str) -> None:
         kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
         raise UserError(
@@ -170,7 +185,8 @@ class Trainer:
             "look at the data, or lower trainer.learning_rate"
         )
 
-    def _validate(self, training_loss: float, windows_per_second: float, board: ScalarLog) -> None:
+    def _validate(self, training_loss: float, windows_per_second: float) -> Row:
+        """The metrics of a validation, which are also the last of `rows`."""
         terms, loss = self._validation_terms()
         if not math.isfinite(loss):
             self._stop_at(next((name for name, value in terms.items() if not math.isfinite(value)), "loss"))
@@ -178,14 +194,7 @@ class Trainer:
         row |= {f"validation_{name}": value for name, value in terms.items()}
         row |= {"learning_rate": self.config.rate(self.step), "windows_per_second": windows_per_second}
         self.rows.append(row)
-        board.add(row)
-        if loss < self.best:
-            self.best, self.best_step, self.stale = loss, self.step, 0
-            self._save(self.step, row)
-        else:
-            self.stale += 1
-        self._write_rows()
-        self._keep()
+        return row
 
     def _validation_terms(self) -> tuple[Row, float]:
         """Terms of the validation windows, and the loss per window, always with the same noise.
@@ -215,15 +224,19 @@ class Trainer:
         means = {name: value / max(1, counts[name]) for name, value in sums.items()}
         return means, loss / sum(len(part) for part in parts)
 
-    def _write_rows(self) -> None:
+    def _keep(self, row: Row) -> None:
+        """Save the best checkpoint, the metrics, and the state from which a killed run resumes."""
+        if row["validation_loss"] < self.best:
+            self.best, self.best_step, self.stale = row["validation_loss"], self.step, 0
+            self._save(self.step, row)
+        else:
+            self.stale += 1
         with atomic_write(self.folder / "metrics.csv") as temporary, open(temporary, "w", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
             writer.writeheader()
             writer.writerows(self.rows)
-
-    def _keep(self) -> None:
         tensors: dict[str, Tensor] = {
-            **stored_states(self.windows.device),
+            **random_states(self.windows.device),
             "batches": self._batches.get_state(),
             "counters": torch.tensor([self.step, self.best, self.best_step, self.stale], dtype=torch.float64),
         }
@@ -251,13 +264,46 @@ class Trainer:
                 raise ValueError("its counters contradict one another")
             self.step, self.best, self.best_step, self.stale = int(step), best, int(best_step), int(stale)
             self._batches.set_state(tensors["batches"])
-            take_over(tensors, self.windows.device, self._seed + self.step)
+            restore_random_states(tensors, self.windows.device, self._seed + self.step)
         self.rows = [row for row in read_rows(self.folder / "metrics.csv") if row["step"] <= step]
         if not {self.step, self.best_step} <= {int(row["step"]) for row in self.rows}:
             raise UserError(
                 f"{self.folder / 'metrics.csv'} lacks step {self.step} or {self.best_step} of {self.resume_path.name}: "
                 "delete both to start again, or choose another output=DIR"
             )
+
+
+def make_optimizers(
+    name: str, parameters: Sequence[nn.Parameter], learning_rate: float
+) -> dict[str, torch.optim.Optimizer]:
+    """`adam` or `muon` as its parts, by name; all of them take every step with the same learning rate.
+
+    Muon makes the singular values of each matrix's update alike (Jordan et al., 2024), scaled so that the update is as
+    large as Adam's usually is (Liu et al., 2025, arXiv:2502.16982), so that a learning rate of Adam's fits. It does not
+    fit vectors, such as biases, or layers of a few outputs.
+    """
+    matrices = [one for one in parameters if name == "muon" and one.dim() == 2 and min(one.shape) >= SMALLEST]
+    others = [one for one in parameters if all(one is not matrix for matrix in matrices)]
+    made: dict[str, torch.optim.Optimizer] = {}
+    if matrices:
+        made["muon"] = torch.optim.Muon(matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+    if others:
+        made["adam"] = torch.optim.Adam(others, lr=learning_rate, fused=True)
+    return made
+
+
+def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:
+    """Mirror some of the windows `[B]` in the plane y = 0, about which table, reach and camera are symmetric.
+
+    Args:
+        which: `[B]` bool. signs: `[F]`, of features, see `Geometry.mirror_signs`.
+    """
+    flip = 1.0 - 2.0 * which.to(window.actions.dtype)[:, None]  # [B, 1]
+    same = torch.ones_like(flip)
+    centers = window.states.centers * torch.cat((same, flip, same), 1)[:, None, None]
+    features = torch.where(which[:, None, None, None], window.states.features * signs, window.states.features)
+    actions = window.actions * torch.cat((same, flip, same, flip), 1)[:, None]
+    return window._replace(states=State(centers, features, window.states.mask), actions=actions)
 
 
 def fixed_windows(windows: WindowTable, count: int, seed: int) -> Tensor:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from functools import reduce
+from collections.abc import Callable
+from functools import partial, reduce
 from operator import add
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from models.networks.layers import fully_connected, relative_positions
-from models.networks.neighbours import neighbours
 from models.state import State
 
 
@@ -56,3 +57,59 @@ class StateEncoder(nn.Module):
         ]
         relations = reduce(add, related) if related else torch.zeros_like(spatial)
         return torch.cat((spatial, self.geometric(state.features), relations), -1)
+
+
+class Neighbour(NamedTuple):
+    """One other object for each object of a scene."""
+
+    of: Callable[[Tensor], Tensor]  # `[..., M, D]`, with any leading dimensions -> the row of each one's neighbour
+    real: Tensor  # [..., M] bool, whether it is an object, not padding
+
+
+def squared_distances(centers: Tensor, mask: Tensor) -> Tensor:
+    """On the table, between all objects: `[..., M, M]` square metres, infinite to itself and to padding.
+
+    `centers: [..., M, 3]` metres, `mask: [..., M]`.
+    """
+    x, y = centers[..., 0], centers[..., 1]
+    squared = (x.unsqueeze(-1) - x.unsqueeze(-2)).square() + (y.unsqueeze(-1) - y.unsqueeze(-2)).square()
+    own = torch.eye(mask.shape[-1], dtype=torch.bool, device=mask.device)
+    return squared.masked_fill(own | ~mask.unsqueeze(-2), torch.inf)
+
+
+def nearest_pairs(centers: Tensor, mask: Tensor, most: int) -> Tensor:
+    """Whether object j is among the `most` nearest others of object i: `[..., M, M]` bool, for networks of all pairs.
+
+    `centers: [..., M, 2 or 3]` metres, `mask: [..., M]` bool. It may be true of padding.
+    """
+    squared = squared_distances(centers, mask.bool())
+    return squared <= squared.topk(most, largest=False).values[..., -1:]
+
+
+def neighbours(centers: Tensor, mask: Tensor, most: int | None) -> list[Neighbour]:
+    """For each object the other objects that enter its relations, at most `most` of them.
+
+    All others where there are no more than `most`, or if it is None; else the nearest on the table, so that relation
+    sums do not grow in a crowded scene, and their cost grows with the number of objects, not with its square.
+
+    Args:
+        centers: `[..., M, 3]` metres. mask: `[..., M]`.
+    """
+    others = mask.shape[-1] - 1
+    if most is None or others <= most:
+        shifts = range(1, others + 1)  # visit all pairs of different objects
+        return [Neighbour(partial(torch.roll, shifts=shift, dims=-2), mask.roll(shift, -1)) for shift in shifts]
+    with torch.no_grad():
+        nearest = squared_distances(centers, mask).topk(most, largest=False, sorted=False)
+    real = nearest.values.isfinite()
+    return [Neighbour(partial(_rows, nearest.indices[..., n].contiguous()), real[..., n]) for n in range(most)]
+
+
+def _rows(index: Tensor, values: Tensor) -> Tensor:
+    """The rows `index: [..., M]` of `values: [..., M, D]`, which may have more leading dimensions."""
+    objects = values.shape[-2]
+    index = index.expand(values.shape[:-1])
+    scenes = torch.arange(0, index.numel(), objects, device=index.device).reshape(*index.shape[:-1], 1)
+    # Whole rows of a matrix: ten times faster than `gather`, whose index has an entry for each number.
+    rows = (index + scenes).flatten()
+    return values.reshape(-1, values.shape[-1]).index_select(0, rows).reshape(values.shape)

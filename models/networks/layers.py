@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 from pyro import distributions
@@ -13,6 +16,25 @@ from torch.nn import functional
 TABLE_CENTER = (0.6, 0.0, 0.0)  # metres, in the robot's base frame
 POSITION_UNIT = 0.1  # metres; about the length of a push, so that inputs of networks are of order one
 SCALE_FLOOR = 1e-6  # lower bound on standard deviations, so that densities stay finite
+_FIXED = ContextVar("_FIXED", default=False)
+
+
+@contextmanager
+def fixed_shapes() -> Iterator[None]:
+    """Within it the shapes of all tensors must follow from the shapes of arguments, as in graphs that are exported.
+
+    Results are the same up to rounding; what need not be computed is computed all the same.
+    """
+    token = _FIXED.set(True)
+    try:
+        yield
+    finally:
+        _FIXED.reset(token)
+
+
+def shapes_are_fixed() -> bool:
+    """Whether the caller is within `fixed_shapes`: else a shape may depend on values, such as objects within reach."""
+    return _FIXED.get()
 
 
 def fully_connected(inputs: int, outputs: int) -> nn.Sequential:

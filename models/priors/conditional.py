@@ -6,7 +6,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from models.networks.layers import GaussianCode
-from models.networks.scene_context import SceneContext
+from models.priors.prior import SceneContext
 from models.state import State
 
 

@@ -7,7 +7,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from models.networks.flows import CodeFlow
-from models.networks.scene_context import SceneContext
+from models.priors.prior import SceneContext
 from models.state import State
 
 

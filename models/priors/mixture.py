@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.networks.layers import SCALE_FLOOR
-from models.networks.scene_context import SceneContext
+from models.priors.prior import SceneContext
 from models.state import State
 
 SYMMETRY_BREAKING = 1e-3  # standard deviation of the head's first weights: equal components would stay equal

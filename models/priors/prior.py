@@ -1,12 +1,14 @@
-"""The interface of priors."""
+"""The interface of priors, and what learned ones read of a scene."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
+import torch
 from pyro.distributions import TorchDistribution
-from torch import Tensor
+from torch import Tensor, nn
 
+from models.networks.layers import fully_connected, relative_positions
 from models.state import State
 
 
@@ -26,3 +28,36 @@ class Prior(Protocol):
         Leading dimensions broadcast. A planner's warm start and its optimizers other than `shooting` need a Gaussian,
         or a distribution with a method `reparameterize(noise)`.
         """
+
+
+class SceneContext(nn.Module):
+    """Feature of a state and, optionally, an effect code; cheap enough to compute for every candidate of a planner.
+
+    Per object two FC on (center, feature, effect code); sum over real objects; FC. Invariant to the order of objects
+    and to padding.
+    """
+
+    def __init__(self, *, feature_dimension: int, effect_dimension: int | None, width: int) -> None:
+        super().__init__()
+        self.from_object = nn.Linear(3 + feature_dimension, width)
+        self.from_code = None if effect_dimension is None else nn.Linear(effect_dimension, width, bias=False)
+        self.objects = fully_connected(width, width)
+        self.scene = fully_connected(width, width)
+
+    def forward(self, state: State, effect_code: Tensor | None) -> Tensor:
+        """`state: [...]`, `effect_code: [..., C]` -> `[..., width]`; leading dimensions broadcast.
+
+        Raises `ValueError` for a missing or an unexpected effect code.
+        """
+        return self.parts(state, effect_code)[1]
+
+    def parts(self, state: State, effect_code: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Features of each object `[..., M, width]`, zero for padding, and of the scene `[..., width]`."""
+        hidden = self.from_object(torch.cat((relative_positions(state.centers), state.features), -1))
+        if self.from_code is not None and effect_code is not None:
+            hidden = hidden + self.from_code(effect_code).unsqueeze(-2)
+        elif self.from_code is not None or effect_code is not None:
+            wanted = "takes no effect code" if effect_code is not None else "needs the effect code"
+            raise ValueError(f"this prior {wanted}: effect_dimension says whether it is p(z | s, c) or p(c | s)")
+        objects = self.objects(hidden.relu_()) * state.mask.unsqueeze(-1)
+        return objects, self.scene(objects.sum(-2))

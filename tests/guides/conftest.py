@@ -38,3 +38,9 @@ def _random_window(batch: int = 4, steps: int = 3, objects: int = 4, features: i
 @pytest.fixture(scope="session")
 def random_window() -> Callable[..., Window]:
     return _random_window
+
+
+@pytest.fixture
+def window() -> Window:
+    """In double precision, with parts that do not count for each term."""
+    return _random_window().map(lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)

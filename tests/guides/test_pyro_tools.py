@@ -3,69 +3,96 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import pyro
 import pytest
 import torch
-from pyro import poutine
-from pyro.infer import MCMC, NUTS, SVI, Importance, Trace_ELBO
-from pyro.infer.autoguide import AutoDelta, AutoNormal
+from pyro import infer, poutine
+from pyro.infer import MCMC, NUTS, Importance, Predictive
+from pyro.infer.reparam import LocScaleReparam
 
+from cavin_pyro.training.bounds import DifferentiableRenyiELBO
+from cavin_pyro.training.objectives import as_objective
 from guides.cascaded import CascadedGuide
-from guides.guide import Guide
-from models.cascaded import CascadedModel
 from models.likelihoods import LikelihoodScales
-from models.model import Model
 from models.state import Window
-from tests.guides.pairs import GUIDES, PAIRS, make, make_model, name_of
+from tests.guides.programs import make, make_model
 
-every_pair = pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: "-".join(map(name_of, pair)))
-
-
-@pytest.fixture
-def cascade() -> tuple[Model, Guide]:
-    return make(CascadedModel, CascadedGuide)
+PROGRAMS = [("cascaded", "cascaded"), ("single_latent", "single_latent"), ("flat", "flat"), ("dynamics", "none")]
+PARTICLES = {"num_particles": 2, "vectorize_particles": True}
+SILENT = {"strict_enumeration_warning": False}
+every_program = pytest.mark.parametrize("pair", PROGRAMS, ids="-".join)
 
 
-@every_pair
-@torch.no_grad()
-def test_features_that_are_handed_over_are_those_that_a_program_computes(
-    pair: tuple[type[Model], type[Guide]], random_window: Callable[..., Window]
+@every_program
+@pytest.mark.parametrize(
+    ("bound", "options"),
+    [
+        (infer.Trace_ELBO, {}),
+        (infer.TraceMeanField_ELBO, {}),
+        (infer.TraceGraph_ELBO, {}),
+        (infer.TraceEnum_ELBO, SILENT),
+        (infer.TraceTMC_ELBO, SILENT),
+        (infer.RenyiELBO, PARTICLES),
+        (DifferentiableRenyiELBO, PARTICLES),
+        (infer.ReweightedWakeSleep, PARTICLES),
+    ],
+)
+def test_every_bound_gives_gradients_by_option(
+    bound: Any, options: dict[str, Any], pair: tuple[str, str], random_window: Callable[..., Window]
 ) -> None:
+    """As `objective.elbo._target_` of train."""
     model, guide = make(*pair)
-    window = random_window()
-    for generate in (False, True):
-        for program in (model, guide):
-            traces = []
-            for given in ({}, {"encoded": model.encode(window, generate)}):
-                torch.manual_seed(3)
-                traces.append(poutine.trace(program).get_trace(window, generate=generate, **given))
-            computed, handed = traces
-            assert list(computed.nodes) == list(handed.nodes)
-            assert float(handed.log_prob_sum()) == pytest.approx(float(computed.log_prob_sum()), rel=1e-6)
+    objective = as_objective(bound(max_plate_nesting=1, **options))
+    if pair[0] == "dynamics" and options is PARTICLES:
+        with pytest.raises(ValueError, match="with 2 particles needs a model with codes"):
+            objective.bind(model, guide)
+        return
+    loss = objective.bind(model, guide)
+    loss(random_window(), 0).backward()
+    moved = [parameter.grad is not None and bool(parameter.grad.any()) for parameter in loss.parameters()]
+    assert sum(moved) > len(moved) / 2
 
 
-@pytest.mark.parametrize("kind", [AutoNormal, AutoDelta])
-def test_an_automatic_guide_fits_the_codes_of_one_batch(
-    kind: type[AutoNormal], cascade: tuple[Model, Guide], random_window: Callable[..., Window]
+@every_program
+def test_codes_of_a_window_regenerate_it(pair: tuple[str, str], random_window: Callable[..., Window]) -> None:
+    model, guide = make(*pair)
+    for options in ({}, {"guide": guide, "parallel": True}):
+        sampled = Predictive(model, num_samples=6, **options)(random_window(), generate=True)
+        assert sampled["next_centers"].shape == (6, 4, 3, 4, 3) and sampled["next_centers"].isfinite().all()
+        assert ("actions" in sampled) == bool(model.codes)
+        assert ("subgoal_centers" in sampled) == ("effect_code" in model.codes)
+
+
+@every_program
+def test_generation_follows_conditions_and_interventions(
+    pair: tuple[str, str], random_window: Callable[..., Window]
 ) -> None:
-    model, window = cascade[0], random_window(batch=8)
-    with pyro.settings.context(module_local_params=False):
-        automatic = kind(model)
-        svi = SVI(model, automatic, pyro.optim.Adam({"lr": 1e-2}), Trace_ELBO())
-        losses = [svi.step(window) for _ in range(30)]
-    assert sum(losses[-3:]) < sum(losses[:3])
+    model, window = make(*pair)[0], random_window()
+    site = (*model.codes, "next_centers_1")[0]
+    shape = poutine.trace(model).get_trace(window, generate=True).nodes[site]["value"].shape
+    for handler in (poutine.condition, poutine.do):
+        results = []
+        for value in (0.0, 0.0, 3.0):
+            torch.manual_seed(0)
+            program = handler(model, data={site: torch.full(shape, value)})
+            results.append(poutine.trace(program).get_trace(window, generate=True).nodes["next_centers_2"]["value"])
+        assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
+    with pytest.raises(ValueError, match="next_centers only records what generation has sampled"):
+        poutine.condition(model, data={"next_centers": torch.zeros(4, 3, 4, 3)})(window, generate=True)
 
 
 @torch.no_grad()
 def test_importance_sampling_from_the_guide_finds_the_evidence(random_window: Callable[..., Window]) -> None:
     """Wide likelihoods hardly tell about the codes, so that samples of the prior average to the same evidence."""
     wide = LikelihoodScales(center=1.0, feature=1.0, start=2.0, motion=2.0)
-    model = make_model(CascadedModel, scales=wide)
-    guide, window = CascadedGuide(model, **GUIDES[CascadedGuide]), random_window().map(lambda field: field[:1])
+    model = make_model("cascaded", scales=wide)
+    guide, window = CascadedGuide(model, width=8), random_window().map(lambda field: field[:1])
 
     def evidence(proposal: Callable[..., object] | None) -> float:
-        return float(Importance(model, proposal, num_samples=100).run(window).get_log_normalizer())
+        return float(Importance(model, proposal, num_samples=40).run(window).get_log_normalizer())
 
     from_prior = evidence(None)
     assert evidence(guide) == pytest.approx(from_prior, abs=1)
@@ -73,23 +100,32 @@ def test_importance_sampling_from_the_guide_finds_the_evidence(random_window: Ca
     assert evidence(poutine.mask(guide, mask=False)) != pytest.approx(from_prior, abs=1)
 
 
-def test_hmc_samples_the_codes_of_a_window(cascade: tuple[Model, Guide], random_window: Callable[..., Window]) -> None:
-    model = cascade[0].requires_grad_(False).eval()
+def test_nuts_and_reparameterisation_find_the_codes(random_window: Callable[..., Window]) -> None:
+    model = make_model("cascaded").requires_grad_(False).eval()
     chain = MCMC(NUTS(model, max_tree_depth=3), num_samples=3, warmup_steps=3, disable_progbar=True)
     chain.run(random_window())
     samples = chain.get_samples()
-    assert set(samples) == {"effect_code", "motion_code"}
+    assert set(samples) == set(model.codes)
     assert all(code.shape[:2] == (3, 4) and code.isfinite().all() for code in samples.values())
+    config = {name: LocScaleReparam(0.0) for name in model.codes}
+    trace = poutine.trace(poutine.reparam(model, config=config)).get_trace(random_window())
+    assert all(f"{name}_decentered" in trace.nodes for name in model.codes)
 
 
-def test_the_graph_of_a_program_can_be_rendered(
-    cascade: tuple[Model, Guide], random_window: Callable[..., Window]
-) -> None:
-    window = random_window()
-    drawn = pyro.render_model(cascade[0], model_args=(window,)).source
-    sites = pyro.infer.inspect.get_dependencies(cascade[0], (window,))["prior_dependencies"]
+def test_an_automatic_guide_of_pyro_fits_the_codes_of_one_batch(random_window: Callable[..., Window]) -> None:
+    model, window = make_model("cascaded"), random_window(batch=8)
+    with pyro.settings.context(module_local_params=False):
+        adam = pyro.optim.Adam({"lr": 1e-2})
+        svi = infer.SVI(model, infer.autoguide.AutoNormal(model), adam, infer.Trace_ELBO())
+        losses = [svi.step(window) for _ in range(30)]
+    assert sum(losses[-3:]) < sum(losses[:3])
+
+
+def test_the_graph_of_a_program_can_be_rendered(random_window: Callable[..., Window]) -> None:
+    model, window = make_model("cascaded"), random_window()
+    drawn = partial(pyro.render_model, model_args=(window,))(model).source
+    sites = infer.inspect.get_dependencies(model, (window,))["prior_dependencies"]
     assert "effect_code -> subgoal_centers" in drawn and "motion_code -> actions" in drawn
     assert "motion_code -> subgoal_centers" not in drawn
-    assert {"effect_code", "motion_code"} <= set(sites["actions"])
-    assert "motion_code" not in sites["subgoal_centers"]
-    assert "effect_code" not in sites["next_centers"]
+    assert set(model.codes) <= set(sites["actions"])
+    assert "motion_code" not in sites["subgoal_centers"] and "effect_code" not in sites["next_centers"]

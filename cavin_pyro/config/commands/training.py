@@ -10,6 +10,7 @@ from cavin_pyro.config.commands.device import DeviceOptions
 from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
 from cavin_pyro.config.options import option, seed_option
 
+OPTIMIZERS = ("adam", "muon")
 SCHEDULES = ("constant", "cosine")
 BATCHES = ("mixed", "bucketed")
 DATA = "dataset folder from collect, or several: data=[data/one,data/two]"
@@ -24,7 +25,7 @@ class TrainerConfig:
     optimizer: str = option(
         "adam",
         "optimizer of the weights; muon for matrices and Adam for the rest takes fewer steps",
-        choices="cavin_pyro.training.optimizers.OPTIMIZERS",
+        choices=OPTIMIZERS,
         group="trainer",
     )
     learning_rate: float = option(1e-4, "learning rate of the optimizer", above=0, group="trainer")

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from models.networks.contact.chosen_rows import ChosenRows
-from models.networks.contact.every_row import EveryRow
-from models.networks.contact.moments import turned_moments
-from models.networks.contact.objects import PAIR_MEASURES, pair_contact
-from models.networks.contact.reach import in_reach
+from models.networks.contact.geometry import (
+    DISPLACEMENT_UNIT,
+    MEASURES,
+    PAIR_MEASURES,
+    PUSH_UNIT,
+    REACH,
+    ToolContact,
+    endpoints,
+    in_reach,
+    pair_contact,
+)
 from models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
-from models.networks.contact.tool import DISPLACEMENT_UNIT, MEASURES, PUSH_UNIT, REACH, ToolContact, endpoints
 from models.networks.dynamics import PushOutcome
-from models.networks.layers import fully_connected, relative_positions
+from models.networks.layers import fully_connected, relative_positions, shapes_are_fixed
 from models.networks.outline import (
     FEATURES,
     HEIGHTS,
@@ -30,8 +34,8 @@ from models.networks.outline import (
     standard_features,
     standard_values,
     turned,
+    turned_moments,
 )
-from models.networks.shapes import shapes_are_fixed
 from models.state import State
 
 MAXIMUM_DISPLACEMENT = 0.2  # metres, by one push, along each axis
@@ -43,11 +47,11 @@ class ContactDynamics(PushOutcome):
     """f: mean and scale of the state after one push, from outlines of objects (`models.networks.outline.Outline`).
 
     In the frame of the push, whose origin is its start and whose x axis is its direction:
-    contact_i  = where the tool would meet outline i, and how (`models.networks.contact.tool.ToolContact`)
+    contact_i  = where the tool would meet outline i, and how (`contact.geometry.ToolContact`)
     object_i   = FC(FC(centre, outline, heights, contact; height of the centre, direction and place on the table))
     alone_i    = linear of object_i: its motion, were the other objects not there
     relation_i = sum over other real objects j of FC(FC(the same of i, the same of j, pair_ij)); pair_ij says where one
-                 would push the other, moving as if alone (`models.networks.contact.objects.pair_contact`)
+                 would push the other, moving as if alone (`contact.geometry.pair_contact`)
     motion_i, its scale = alone_i + linear of FC(object_i, relation_i)
     change of shape_i, its scale = linear of FC(FC(the same of i)): layers of their own, because 64 numbers of shape
     outweigh three of motion in the likelihood
@@ -55,9 +59,8 @@ class ContactDynamics(PushOutcome):
     Of more than `neighbours` others the nearest enter relation_i. Both changes are turned back. It takes no features of
     the state encoder. Equivariant to the order of objects; padding does not change and does not affect other objects.
 
-    With a `reach_margin` objects out of the push's reach (`models.networks.contact.reach.in_reach`) stay as they are,
-    to within `still_scale`, do not enter relations, and are not computed where shapes may depend on values
-    (`models.networks.shapes`).
+    With a `reach_margin` objects out of the push's reach (`contact.geometry.in_reach`) stay as they are, to within
+    `still_scale`, do not enter relations, and are not computed where shapes may depend on values (`fixed_shapes`).
     """
 
     typical: Tensor  # [2 K + 1]
@@ -137,7 +140,7 @@ class ContactDynamics(PushOutcome):
         self.head.bias[3] += math.log(factor)
 
     def _predict(self, state: State, action: Tensor) -> tuple[State, Rows, Tensor]:
-        """The mean `[...]`, what was computed, and logarithms of its scales `[2, R, ...]`."""
+        """The mean `[...]`, what was computed, and logarithms of its scales `[2, R]`."""
         # In here components come first and objects second, [C, M, ...]: loops then run over candidates.
         start, motion = (
             values.movedim(-1, 0).contiguous().unsqueeze(1) for values in endpoints(action, self.reach)
@@ -152,15 +155,15 @@ class ContactDynamics(PushOutcome):
         near = near_pairs(place, real, self.neighbours)
         rows = self._rows(state.features, place, length.squeeze(0), real)
 
-        # From here on objects are rows, [C, R, ...].
+        # From here on objects are rows, [C, R].
         place, push = rows.of_objects(place), rows.of_objects(torch.cat((direction, length)))
         direction, length = push.split((2, 1))
-        cosines, sines = multiples(*direction)  # [K, R, ...]
+        cosines, sines = multiples(*direction)  # [K, R]
         along, across = place.split(1)
         centers, values = rows.of_fields(state.centers), standard_values(rows.of_fields(state.features))
         shape, heights = values.split((OUTLINES * PER_OUTLINE, HEIGHTS))
         shape = turned(shape.unflatten(0, (OUTLINES, PER_OUTLINE)), cosines, sines)
-        outline = torch.addcmul(_each(self.typical, rows.shape), _each(self.spread, rows.shape), shape[0])
+        outline = torch.addcmul(self.typical.unsqueeze(1), self.spread.unsqueeze(1), shape[0])
         contact = self.contact(*place, outline, length.squeeze(0))
         table = relative_positions(centers.movedim(0, -1)).movedim(-1, 0)
         where = (along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT)
@@ -168,12 +171,10 @@ class ContactDynamics(PushOutcome):
             heights, on_table = turned_moments(heights, cosines[1], sines[1]), [table[2:]]
         else:
             on_table = [direction, table]
-        parts = (*where, shape.flatten(0, 1), heights, *on_table, contact)
-        each = torch.cat([part.expand(-1, *rows.shape) for part in parts])
-        each = each.flatten(1).T  # [R ..., inputs]
+        each = torch.cat((*where, shape.flatten(0, 1), heights, *on_table, contact)).T  # [R, inputs]
 
         move, scale = self._motion(each, place, outline, rows, rows.pairs(near)).split((3, 1))
-        change = _unflat(self.shape_head(self.shape(each)), rows.shape)
+        change = self.shape_head(self.shape(each)).T.contiguous()
         shape_change, heights_change, shape_scale = change.split((OUTLINES * PER_OUTLINE, HEIGHTS, 1))
         forward, sideways, up = MAXIMUM_DISPLACEMENT * (move * (DISPLACEMENT_UNIT / MAXIMUM_DISPLACEMENT)).tanh()
         cosine, sine = direction
@@ -188,29 +189,29 @@ class ContactDynamics(PushOutcome):
 
     def _rows(self, features: Tensor, place: Tensor, length: Tensor, real: Tensor) -> Rows:
         """The objects that are computed: `features: [..., M, 64]`, `place: [2, M, ...]`, `real: [M, ...]`."""
-        if self.reach_margin is None:
-            return EveryRow(real)
-        with torch.no_grad():
-            radius = components_first(mean_extent(features).unsqueeze(-1), real.dim() - 1).squeeze(0)
-            along, across = place
-            counting = real & in_reach(along, across, length, radius.expand(real.shape), self.reach_margin)
-        return EveryRow(counting) if shapes_are_fixed() else ChosenRows(counting)
+        counting = real
+        if self.reach_margin is not None:
+            with torch.no_grad():
+                radius = components_first(mean_extent(features).unsqueeze(-1), real.dim() - 1).squeeze(0)
+                along, across = place
+                counting = real & in_reach(along, across, length, radius.expand(real.shape), self.reach_margin)
+        return Rows(counting, every=shapes_are_fixed())
 
     def _motion(self, each: Tensor, place: Tensor, outline: Tensor, rows: Rows, pairs: Pairs | None) -> Tensor:
-        """Motion in units of `DISPLACEMENT_UNIT` and the logarithm of its scale, `[4, R, ...]`.
+        """Motion in units of `DISPLACEMENT_UNIT` and the logarithm of its scale, `[4, R]`.
 
-        each: `[R ..., inputs]`. place: `[2, R, ...]`. outline: `[2 K + 1, R, ...]`.
+        each: `[R, inputs]`. place: `[2, R]`. outline: `[2 K + 1, R]`.
         """
         alone = self.object(each)
-        motion = _unflat(self.alone(alone), rows.shape)
+        motion = self.alone(alone).T.contiguous()
         relation = each.new_zeros(len(each), self.pair.out_features)
         if pairs is not None:
             measures = pair_contact(place, outline, *_aim(motion.detach()), rows, pairs)
-            hidden = self.pair(measures.flatten(1).T)
+            hidden = self.pair(measures.T)
             hidden = hidden + rows.of_pairs(self.own, each, pairs.first) + rows.of_pairs(self.other, each, pairs.second)
-            related = self.relation(hidden.relu_()) * pairs.real.flatten().unsqueeze(-1)
-            relation = rows.sum_of_pairs(related, pairs)
-        after = _unflat(self.head(self.second(torch.cat((alone, relation), -1))), rows.shape)
+            related = self.relation(hidden.relu_()) * pairs.real.unsqueeze(-1)
+            relation = relation.index_add(0, pairs.first, related)
+        after = self.head(self.second(torch.cat((alone, relation), -1))).T.contiguous()
         return torch.cat((after[:2] + motion, after[2:]))
 
 
@@ -223,16 +224,6 @@ def _scales(logarithms: Tensor) -> Tensor:
     """`[2, ...]` -> scales of centres, in metres, and of features."""
     center, shape = logarithms.clamp(-6.0, 3.0).exp()
     return torch.stack(((0.2 * DISPLACEMENT_UNIT) * center, 0.05 * shape))
-
-
-def _each(values: Tensor, shape: Sequence[int]) -> Tensor:
-    """`[C]` -> `[C, 1, ..., 1]`, which broadcasts to `[C, *shape]`."""
-    return values.view(-1, *len(shape) * [1])
-
-
-def _unflat(values: Tensor, shape: Sequence[int]) -> Tensor:
-    """A matrix `[prod(shape), C]` -> components `[C, *shape]`."""
-    return values.T.contiguous().unflatten(1, shape)
 
 
 def _aim(motion: Tensor) -> tuple[Tensor, Tensor]:

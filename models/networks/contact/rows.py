@@ -1,63 +1,115 @@
-"""Which objects of which pushes f computes: all of them, or those that a push can reach."""
+"""Which objects of which pushes f computes: those that a push can reach, or all of them where shapes must be fixed."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from math import prod
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from models.networks.neighbours import nearest_pairs
+from models.networks.encoder import nearest_pairs
 
 
 class Pairs(NamedTuple):
-    """Ordered pairs of rows, each an object and another one; the other way round is a pair as well.
+    """Ordered pairs of rows, each an object and another one of the same push; the other way round is a pair as well."""
 
-    Tensors of pairs are `[C, P, ...]`, in which `...` is empty for rows that are numbered one by one.
-    """
-
-    first: Tensor  # [P] int64, number of the object, along dimension 1 of tensors of rows
-    second: Tensor  # [P] of the other one
+    first: Tensor  # [P] number of the object's row
+    second: Tensor  # [P] of the other one's
     exchanged: Tensor  # [P] number of the pair the other way round
-    real: Tensor  # [P, ...] bool, whether the other one counts
+    real: Tensor  # [P] bool, whether the other one counts
 
 
-class Rows(ABC):
-    """Objects of a batch of pushes `[M, ...]`, as tensors of rows `[C, R, ...]`, components first.
+class Rows:
+    """Objects of a batch of pushes `[M, ...]`, as rows `[C, R]`, components first.
 
-    Attributes:
-        shape: of rows, without their components.
+    The objects that count are numbered one by one; few others are computed, and none is written. Numbers of rows and of
+    pairs are rounded up, since libraries prepare matrix products for each new shape. With `every` object a row, the
+    shapes of all tensors follow from the shapes of the arguments, as graphs need it, with less speed.
     """
 
-    shape: tuple[int, ...]
+    def __init__(self, counting: Tensor, *, every: bool = False) -> None:
+        """`counting: [M, ...]` bool."""
+        objects, *pushes = self._all = (*counting.shape,)
+        self._counting, self._every = counting.reshape(objects, -1), every
+        if every:
+            found = torch.arange(counting.numel(), device=counting.device)
+            self._count = len(found)
+        else:
+            found = self._counting.flatten().nonzero().squeeze(1)
+            self._count = len(found)
+            found = _rounded_up(found)
+        self._found = found  # numbers of [M, ...]
+        count = max(1, prod(pushes))
+        self._pushes = found.remainder(count)
+        self._places = torch.add(found.div(count, rounding_mode="floor"), self._pushes, alpha=objects)  # of [..., M]
 
-    @abstractmethod
     def of_objects(self, values: Tensor) -> Tensor:
-        """`[C, M, ...]`, a number of objects, or of pushes with M = 1 -> rows, or what broadcasts to rows."""
+        """`[C, M, ...]`, a number of objects, or of pushes with M = 1 -> rows."""
+        one = values.shape[1] == 1
+        values = values.expand(-1, -1, *self._all[1:]).flatten(1)
+        return values.index_select(1, self._pushes if one else self._found)
 
-    @abstractmethod
     def of_fields(self, values: Tensor) -> Tensor:
         """A field of a state, `[..., M, C]`, whose leading dimensions broadcast to the batch's -> rows."""
+        return self._matrix(values).index_select(0, self._places).T.contiguous()
 
-    @abstractmethod
     def write(self, values: Tensor, changed: Tensor) -> Tensor:
         """`values: [..., M, C]` (as above) with `changed` rows in their places: `[..., M, C]`, contiguous."""
+        values, places = self._matrix(values), self._places[: self._count]
+        changed = changed[:, : self._count].T.to(values.dtype)
+        if self._every:
+            counting = self._counting.flatten().unsqueeze(1)
+            changed = torch.where(counting, changed, values.index_select(0, places))
+        objects, *pushes = self._all
+        return values.index_copy(0, places, changed).view(*pushes, objects, -1)
 
-    @abstractmethod
     def pairs(self, near: Tensor | None) -> Pairs | None:
         """Pairs of objects of the same push, None if there are none; `near: [M, M, ...]` bool, of those that count."""
+        objects, pushes = self._counting.shape
+        first, second = torch.triu_indices(objects, objects, 1, device=self._found.device)
+        firsts, seconds = self._counting.index_select(0, first), self._counting.index_select(0, second)
+        both, ways = firsts & seconds, [seconds, firsts]  # whether the other one counts, one way and the other
+        if near is not None:
+            orders = (first, second), (second, first)
+            ways = [way & of_each_pair(near, *order).flatten(1) for way, order in zip(ways, orders, strict=True)]
+            both &= ways[0] | ways[1]
+        if self._every:
+            found = torch.arange(both.numel(), device=both.device)
+            count = len(found)
+        else:
+            found = both.flatten().nonzero().squeeze(1)
+            count, found = len(found), _rounded_up(found)
+        if not count:
+            return None
+        which, push = found.div(pushes, rounding_mode="floor"), found.remainder(pushes)
+        ones, others = (torch.add(push, each[which], alpha=pushes) for each in (first, second))
+        if not self._every:
+            row = (self._counting.flatten().cumsum(0) - 1).clamp_min_(0)
+            ones, others = row.index_select(0, ones), row.index_select(0, others)
+        number = torch.arange(2 * len(found), device=found.device)
+        real = number.remainder(len(found)) < count
+        if self._every or near is not None:
+            real &= torch.cat([way.flatten()[found] for way in ways])
+        return Pairs(torch.cat((ones, others)), torch.cat((others, ones)), number.roll(len(found)), real)
 
-    @abstractmethod
     def to_pairs(self, values: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
-        """The first and the second of each pair: `[C, R, ...]` -> `[C, P, ...]`, twice."""
+        """The first and the second of each pair: `[C, R]` -> `[C, P]`, twice."""
+        values = values.T.contiguous()  # whole rows of a matrix are copied faster than columns
+        first, second = (values.index_select(0, which).T.contiguous() for which in (pairs.first, pairs.second))
+        return first, second
 
-    @abstractmethod
     def of_pairs(self, layer: nn.Module, values: Tensor, which: Tensor) -> Tensor:
-        """A layer of the first or second of each pair: matrix `[prod(R, ...), W]` -> `[prod(P, ...), W']`."""
+        """A layer of the first or second of each pair: a matrix `[R, W]` -> `[P, W']`."""
+        if self._every:  # there are fewer rows than pairs
+            return layer(values).index_select(0, which)
+        return layer(values.index_select(0, which))
 
-    @abstractmethod
-    def sum_of_pairs(self, values: Tensor, pairs: Pairs) -> Tensor:
-        """Sum over others: rows of a matrix, `[prod(P, ...), W]` -> `[prod(R, ...), W]`."""
+    def _matrix(self, values: Tensor) -> Tensor:
+        """A row for each object of each push, objects last."""
+        objects, *pushes = self._all
+        return values.expand(*pushes, objects, values.shape[-1]).flatten(0, -2)
 
 
 def components_first(values: Tensor, ranks: int) -> Tensor:
@@ -79,3 +131,9 @@ def near_pairs(place: Tensor, real: Tensor, most: int | None) -> Tensor | None:
 def of_each_pair(near: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """`near: [M, M, ...]`, numbers `[P]` of objects -> `[P, ...]`."""
     return near.flatten(0, 1).index_select(0, len(near) * first + second)
+
+
+def _rounded_up(numbers: Tensor) -> Tensor:
+    """`[R]` with zeros appended, by at most an eighth, or to 32: few lengths occur."""
+    count = len(numbers)
+    return functional.pad(numbers, (0, -count % 2 ** max(5, count.bit_length() - 4)))

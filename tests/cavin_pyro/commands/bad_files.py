@@ -76,11 +76,6 @@ BAD_FILES = [
     # Before all of the data are read.
     ("train", "data=@corrupt_data trained=[foo]", "'foo', which is no part of this model: choose from encoder, "),
     ("train", "data=@corrupt_data initial=@flat", "is of another architecture"),
-    (
-        "train",
-        "data=@corrupt_data prior=conditional objective=hindsight",
-        "objective.hindsight_weight fine-tunes: h of initial=FILE says what effects ask for",
-    ),
     ("train", "data=@corrupt_data output=@used", "holds a run with"),
     ("check", "data=@corrupt_data sizes.consistency.objects=6", "sizes.consistency.objects=6, but the model knows at"),
     ("check", "data=@corrupt_data output=@used", "holds a run with"),

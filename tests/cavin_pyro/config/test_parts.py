@@ -13,7 +13,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model, check_sizes, construct
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.storage.geometry import check_fit, load_pointnet
-from cavin_pyro.training.factory import build_objective
+from cavin_pyro.training.run import build_objective
 from models.likelihoods import PredictedScales
 from models.model import Model
 from models.networks.contact.dynamics import ContactDynamics

@@ -1,15 +1,22 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.training import pretraining
 from cavin_pyro.training.pretraining import _augment, _rate_after, pretrain
+from cavin_pyro.training.resume import write_resume
 from models.networks.pointnet import PointNet, PointNetAutoencoder
 
 
@@ -88,3 +95,54 @@ def test_a_loss_that_is_not_finite_stops_pretraining(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="the loss is not finite: lower learning_rate"):
         pretrained(tmp_path, rate=1e30)
     assert not list(tmp_path.iterdir())
+
+
+def weights(part: torch.nn.Module) -> Tensor:
+    return torch.nn.utils.parameters_to_vector(part.parameters())
+
+
+def test_interrupted_pretraining_resumes_as_if_it_had_not_been_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("whole", "broken"):
+        (tmp_path / name).mkdir()
+    whole, losses = pretrained(tmp_path / "whole", steps=20, resume=tmp_path / "whole" / "resume.safetensors")
+    plain, _ = pretrained(tmp_path / "whole", steps=20)
+    assert torch.equal(weights(plain), weights(whole))
+    written = []
+
+    def interrupted(path: Path, *state: Any) -> None:
+        write_resume(path, *state)
+        written.append(path)
+        if len(written) in (7, 12):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(pretraining, "write_resume", interrupted)
+    path = tmp_path / "broken" / "resume.safetensors"
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            pretrained(tmp_path / "broken", steps=20, resume=path)
+    again, its_losses = pretrained(tmp_path / "broken", steps=20, resume=path)
+    assert len(written) == 20  # none of the steps was made twice
+    assert torch.equal(weights(again), weights(whole)) and its_losses == losses
+    metrics = [(tmp_path / name / "metrics.csv").read_text() for name in ("whole", "broken")]
+    assert metrics[0] == metrics[1]
+
+
+def test_pretraining_goes_on_with_its_own_clouds_and_whole_files_only(tmp_path: Path) -> None:
+    path = tmp_path / "resume.safetensors"
+    pretrained(tmp_path, steps=3, resume=path)
+    good = path.read_bytes()
+    with pytest.raises(UserError, match=r"is damaged \(it was made with other clouds\): delete it to start again"):
+        pretrained(tmp_path, steps=3, resume=path, points=clouds() * 2)
+    with safe_open(path, framework="pt") as file:
+        header, tensors = file.metadata(), load_file(path)
+    state = json.loads(header["state"])
+    for changes in ({"rows": []}, {"rows": [[1, 2, 3]]}, {"step": "x"}, {"generator": {}}, {"rate": None}):
+        save_file(tensors, path, metadata={**header, "state": json.dumps({**state, **changes})})
+        with pytest.raises(UserError, match=r"resume\.safetensors is damaged"):
+            pretrained(tmp_path, steps=3, resume=path)
+    for content in (good[:-4], b"", good[: len(good) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=r"resume\.safetensors is damaged"):
+            pretrained(tmp_path, steps=3, resume=path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +12,8 @@ import pyro
 import pytest
 import torch
 from pyro.infer import Trace_ELBO
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -20,10 +21,13 @@ from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.training import trainer as trainer_module
 from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.objectives import Objective
-from cavin_pyro.training.trainer import Row, Trainer, read_rows
+from cavin_pyro.training.resume import load_optimizer, optimizer_tensors
+from cavin_pyro.training.run import _keep_best
+from cavin_pyro.training.trainer import SMALLEST, Row, Trainer, make_optimizers, read_rows
 from models.state import State
 
 SHORT = TrainerConfig(steps=8, batch_size=4, validate_every=2, validation_windows=10, learning_rate=1e-2)
@@ -84,22 +88,11 @@ def without_speed(rows: list[Row]) -> list[Row]:
     return [{name: value for name, value in row.items() if name != "windows_per_second"} for row in rows]
 
 
-def test_a_constant_learning_rate_stays() -> None:
-    config = TrainerConfig(steps=100, learning_rate=1e-3)
-    assert {config.rate(step) for step in (0, 50, 99)} == {1e-3}
-
-
-def test_a_cosine_falls_from_the_learning_rate_to_a_hundredth() -> None:
-    config = TrainerConfig(steps=100, learning_rate=1e-3, schedule="cosine")
-    rates = [config.rate(step) for step in range(101)]
-    assert rates[0] == 1e-3
-    assert rates[50] == pytest.approx(0.505e-3)
-    assert rates[100] == pytest.approx(1e-5)
-    assert all(later < earlier for earlier, later in itertools.pairwise(rates))
-
-
 def test_the_optimizer_follows_the_schedule(small: SimpleNamespace, tmp_path: Path) -> None:
+    constant = TrainerConfig(steps=100, learning_rate=1e-3)
+    assert {constant.rate(step) for step in (0, 50, 99)} == {1e-3}
     config = TrainerConfig(**{**vars(SHORT), "schedule": "cosine"})
+    assert [config.rate(step) for step in (0, 4, 8)] == pytest.approx([1e-2, 0.505e-2, 1e-4])
     run = trainer(small, tmp_path / "run", config)
     run.run()
     (group,) = run._optimizers["adam"].param_groups
@@ -148,17 +141,6 @@ def test_validation_does_not_disturb_training(small: SimpleNamespace, tmp_path: 
     assert seldom.rows[-1]["training_loss"] == pytest.approx(mean)
 
 
-def test_validation_always_uses_the_same_noise(small: SimpleNamespace, tmp_path: Path) -> None:
-    run = trainer(small, tmp_path / "run", TrainerConfig(**{**vars(SHORT), "learning_rate": 0.0}))
-    run.run()
-    assert len({row["validation_loss"] for row in run.rows}) == 1
-    terms = [value for name, value in run.rows[0].items() if name.startswith(("validation_nll", "validation_kl"))]
-    # Every window counts here, and each holds three transitions.
-    latent = [value for name, value in run.rows[0].items() if name.startswith("validation_") and "next" not in name]
-    dynamics = sum(terms) - sum(value for value in latent if value != run.rows[0]["validation_loss"])
-    assert run.rows[0]["validation_loss"] == pytest.approx(sum(terms) + 2 * dynamics, rel=1e-5)
-
-
 def test_metrics_are_means_over_what_counts_in_all_parts_of_the_validation(
     small: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,14 +166,6 @@ def test_metrics_are_means_over_what_counts_in_all_parts_of_the_validation(
         count = transitions_that_count if name.startswith("nll_next") else windows_that_count
         assert value == pytest.approx(sums[name] / count, rel=1e-6), name
     assert loss == pytest.approx(sum(sums.values()) / 9, rel=1e-6)
-
-
-def test_metrics_of_a_validation_in_which_no_window_counts_are_zero(small: SimpleNamespace, tmp_path: Path) -> None:
-    run = trainer(small, tmp_path / "run")
-    run.windows.sequence_mask[run.windows.validation] = False
-    terms, loss = run._validation_terms()
-    assert {value for name, value in terms.items() if not name.startswith("nll_next")} == {0.0}
-    assert math.isfinite(loss) and terms["nll_next_centers"] > 0
 
 
 def test_the_validation_loss_has_the_terms_of_the_model_and_not_the_counterfactual_one(
@@ -263,14 +237,6 @@ def test_a_finished_run_is_not_run_again(small: SimpleNamespace, tmp_path: Path)
     assert (again.step, len(again.rows)) == (8, 4)
 
 
-@pytest.mark.parametrize("content", [b"", b"nothing of the kind"])
-def test_a_damaged_resume_file_is_named(content: bytes, small: SimpleNamespace, tmp_path: Path) -> None:
-    trainer(small, tmp_path / "run").run()
-    (tmp_path / "run" / "resume.safetensors").write_bytes(content)
-    with pytest.raises(UserError, match=r"resume\.safetensors is damaged .* delete it to start again"):
-        trainer(small, tmp_path / "run").run()
-
-
 def poison(choose: Callable[[Trainer], Tensor]) -> Hook:
     """Puts a NaN into a parameter after the checkpoint of step 4."""
 
@@ -324,3 +290,128 @@ def test_a_gradient_that_is_not_finite_is_named(small: SimpleNamespace, tmp_path
     with pytest.raises(UserError, match="the term gradient is not finite; there is no checkpoint yet"):
         run.run()
     assert torch.equal(weights(run), before)
+
+
+PARAMETERS = 3
+Tensors = dict[str, Tensor]
+
+
+def stepped(name: str, *, without_gradient: int | None = None) -> tuple[torch.optim.Optimizer, Tensors]:
+    """An optimizer of three matrices after a step, and its moments."""
+    torch.manual_seed(0)
+    parameters = [nn.Parameter(torch.randn(6, 6)) for _ in range(PARAMETERS)]
+    (optimizer,) = make_optimizers(name, parameters, 0.1).values()
+    for number, parameter in enumerate(parameters):
+        parameter.grad = None if number == without_gradient else torch.ones_like(parameter)
+    optimizer.step()
+    return optimizer, optimizer_tensors(optimizer, name)
+
+
+@pytest.mark.parametrize("name", ["adam", "muon"])
+def test_moments_come_back_and_a_weight_without_gradient_has_none(name: str) -> None:
+    optimizer, tensors = stepped(name, without_gradient=1)
+    assert not [entry for entry in tensors if entry.startswith(f"{name}.1.")]
+    again, _ = stepped(name)
+    load_optimizer(again, tensors, name)
+    assert optimizer_tensors(again, name).keys() == tensors.keys()
+    with pytest.raises(ValueError, match=rf"^{name}\.3 belongs to no weight$"):
+        load_optimizer(optimizer, {**tensors, f"{name}.3.exp_avg": torch.zeros(6, 6)}, name)
+
+
+def test_muon_has_the_matrices_but_those_of_few_outputs_and_moves_small_gradients_as_far_as_large_ones() -> None:
+    torch.manual_seed(0)
+    module = nn.Sequential(nn.Linear(12, 20), nn.Linear(20, SMALLEST - 1))
+    made = make_optimizers("muon", list(module.parameters()), 0.01)
+    held = {name: [id(one) for one in optimizer.param_groups[0]["params"]] for name, optimizer in made.items()}
+    assert held["muon"] == [id(module[0].weight)] and len(held["adam"]) == 3
+    weight = nn.Parameter(torch.zeros(12, 20))
+    (left, _), (right, _) = (torch.linalg.qr(torch.randn(size, 12)) for size in (12, 20))
+    weight.grad = left @ torch.diag(torch.logspace(0, -1, 12)) @ right.T  # with these singular values
+    make_optimizers("muon", [weight], 0.01)["muon"].step()
+    moved = torch.diagonal(left.T @ weight.detach() @ right) / (-0.01 * 0.2 * math.sqrt(20))
+    assert moved.min() > 0.6 and moved.max() < 1.3
+
+
+@pytest.fixture(scope="module")
+def finished(small: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    trainer(small, folder).run()
+    return folder
+
+
+@pytest.fixture
+def own(finished: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("metrics.csv", "resume.safetensors"):
+        (folder / name).write_bytes((finished / name).read_bytes())
+    return folder
+
+
+def without(name: str) -> Callable[[Tensors], None]:
+    return lambda tensors: [tensors.pop(one) for one in list(tensors) if one.startswith(name)] and None
+
+
+def put(name: str, make: Callable[[Tensor], Tensor]) -> Callable[[Tensors], None]:
+    def change(tensors: Tensors) -> None:
+        full = next(one for one in sorted(tensors) if one.startswith(name))
+        tensors[full] = make(tensors[full])
+
+    return change
+
+
+CHANGES: dict[str, Callable[[Tensors], None]] = {
+    "no counters": without("counters"),
+    "a weight fewer": without("model.dynamics"),
+    "another shape": put("model.", lambda one: one[:0]),
+    "a moment of another shape": put("adam.0.exp_avg", lambda one: one[:0]),
+    "a moment of a negative number": lambda tensors: tensors.update({"adam.-1.exp_avg": torch.zeros(1)}),
+    "moments without their step": without("adam.0.step"),
+    "NaN": put("model.", lambda one: one * torch.nan),
+    "a short generator": put("batches", lambda one: one[:10]),
+    "odd counters": put("counters", lambda one: one.flip(0) - 100),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_resume_file_is_named(name: str, own: Path, small: SimpleNamespace) -> None:
+    """Also where it has the digest of what it then holds."""
+    path = own / "resume.safetensors"
+    for forged in (True, False):
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata()
+        tensors = load_file(path)
+        CHANGES[name](tensors)
+        tensors = {one: value.contiguous() for one, value in tensors.items()}
+        save_file(tensors, path, metadata={**header, "sha256": tensors_digest(tensors)} if forged else header)
+        with pytest.raises(UserError, match=r"resume\.safetensors is damaged \(.*\): delete it to start again") as no:
+            trainer(small, own).resume()
+        assert "\n" not in str(no.value)
+
+
+@pytest.mark.parametrize("content", [None, "", "a,b\n1,2\n", "step,validation_loss\n2,1\n"])
+def test_metrics_that_do_not_belong_to_the_resume_file_are_named(
+    content: str | None, own: Path, small: SimpleNamespace
+) -> None:
+    path = own / "metrics.csv"
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UserError, match=r"metrics\.csv .* start again, or choose another output=DIR"):
+        trainer(small, own).resume()
+
+
+def test_a_run_whose_best_checkpoint_is_gone_says_so_or_writes_it_again(own: Path, small: SimpleNamespace) -> None:
+    run, path, saved = trainer(small, own), own / "checkpoint.safetensors", []
+    run.resume()
+    small.save_baseline(path, "dynamics")
+    content = path.read_bytes()
+    _keep_best(run, path, lambda step, row: saved.append(step))
+    path.write_bytes(content[:-5])
+    with pytest.raises(UserError, match="is gone or damaged, and later weights cannot replace it: restore"):
+        _keep_best(run, path, lambda step, row: saved.append(step))
+    assert not saved
+    path.unlink()
+    run.best_step = run.step
+    _keep_best(run, path, lambda step, row: (saved.append(step), path.write_bytes(content)))
+    assert saved == [8]

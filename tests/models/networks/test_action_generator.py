@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.networks.action_generator import ActionGenerator
+from models.networks.dynamics import ActionGenerator
 from models.networks.layers import ObjectPool
 
 

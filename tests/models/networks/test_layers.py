@@ -5,7 +5,7 @@ import torch
 from envs.robots import STICK_RADIUS
 from envs.workspace import TABLE_CENTER as CENTER
 from envs.workspace import TABLE_HIGH, TABLE_LOW
-from models.networks.contact.tool import TOOL_RADIUS
+from models.networks.contact.geometry import TOOL_RADIUS
 from models.networks.layers import TABLE_CENTER, relative_positions
 
 

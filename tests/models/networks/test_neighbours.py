@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from models.networks.neighbours import neighbours, squared_distances
+from models.networks.encoder import neighbours, squared_distances
 from models.state import State
 
 

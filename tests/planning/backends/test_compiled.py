@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from models.networks.contact.dynamics import ContactDynamics
-from models.networks.shapes import fixed_shapes, shapes_are_fixed
+from models.networks.layers import fixed_shapes, shapes_are_fixed
 from models.state import State
 from planning import CvaeMpcPlanner, PerturbedRollouts
 from planning.backends import chunking

@@ -11,9 +11,8 @@ from torch.fx import Graph, GraphModule
 
 from models.networks.contact.dynamics import ContactDynamics
 from models.networks.encoder import StateEncoder
-from models.networks.layers import relative_positions, unit
-from models.networks.scene_context import SceneContext
-from models.networks.shapes import fixed_shapes
+from models.networks.layers import fixed_shapes, relative_positions, unit
+from models.priors.prior import SceneContext
 from models.state import State
 from planning.backends import passes
 from planning.backends.passes import FEW

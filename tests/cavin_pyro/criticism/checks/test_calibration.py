@@ -33,12 +33,10 @@ from cavin_pyro.criticism.statistics.replicates import compare, replicate
 from cavin_pyro.criticism.statistics.windows import generated, observed, repeated, seeded
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel
+from models.dynamics_only import DynamicsModel
 from models.likelihoods import LikelihoodScales
-from models.networks.dynamics import Dynamics
-from models.networks.encoder import StateEncoder
 from models.networks.pointnet import PointNet
 from models.state import State, Window
-from models.transitions import generate_transitions, observe_transitions
 
 SIZES = {"effect_dimension": 2, "motion_dimension": 2, "feature_dimension": 4, "width": 8, "maximum_objects": 3}
 COUNT = 400
@@ -187,24 +185,11 @@ def test_means_leave_only_the_codes_to_chance(right: SimpleNamespace) -> None:
     assert inferred.steps.shape == (COUNT, 3, 3, 3)
 
 
-class OnlyDynamics(PyroModule):
+class OnlyDynamics(DynamicsModel):
     """s_t+1 ~ f(s_t+1 | s_t, a_t); the pushes are given."""
 
-    codes = ()
-
     def __init__(self) -> None:
-        super().__init__()
-        self.scales = LikelihoodScales()
-        self.encoder = StateEncoder(feature_dimension=4, width=8)
-        self.dynamics = Dynamics(feature_dimension=4, width=8)
-
-    def forward(self, window: Window, generate: bool = False) -> None:
-        with pyro.plate("windows", len(window.actions)):
-            if generate:
-                generate_transitions(self.dynamics, self.encoder, self.scales, window.first, window.actions)
-            else:
-                before = window.states.step(slice(0, -1))
-                observe_transitions(self.dynamics, self.scales, window, self.encoder(before))
+        super().__init__(feature_dimension=4, width=8)
 
 
 class OwnGuide(PyroModule):

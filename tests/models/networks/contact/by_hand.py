@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
-from models.networks.contact.tool import CORNER, DISPLACEMENT_UNIT, PUSH_UNIT, REACH_HIGH, REACH_LOW, TOOL_RADIUS
+from models.networks.contact.geometry import CORNER, DISPLACEMENT_UNIT, PUSH_UNIT, REACH_HIGH, REACH_LOW, TOOL_RADIUS
 from models.networks.layers import POSITION_UNIT, TABLE_CENTER
 from models.networks.outline import (
     DIRECTIONS,

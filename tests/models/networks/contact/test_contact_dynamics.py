@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
-from models.networks.contact.tool import PUSH_UNIT, REACH_HIGH, REACH_LOW
+from models.networks.contact.geometry import PUSH_UNIT, REACH_HIGH, REACH_LOW
 from models.networks.outline import DIRECTIONS, Outline, standard_features
 from models.state import State
 from tests.models.networks.contact import by_hand

@@ -7,9 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.networks.contact.every_row import EveryRow
-from models.networks.contact.objects import PAIR_MEASURES, pair_contact
-from models.networks.contact.tool import DISPLACEMENT_UNIT
+from models.networks.contact.geometry import DISPLACEMENT_UNIT, PAIR_MEASURES, pair_contact
+from models.networks.contact.rows import Rows
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
 
 RADII = (0.03, 0.02)  # metres, of two discs
@@ -23,12 +22,12 @@ def discs() -> torch.Tensor:
 
 
 def measures(place: torch.Tensor, outlines: torch.Tensor, aim: torch.Tensor, carried: torch.Tensor) -> torch.Tensor:
-    """`[PAIR_MEASURES, M, M, ...]` of object i and another j; zeros on the diagonal."""
-    rows = EveryRow(torch.ones(carried.shape, dtype=torch.bool))
+    """`[PAIR_MEASURES, M, M]` of object i and another j; zeros on the diagonal."""
+    rows = Rows(torch.ones(carried.shape, dtype=torch.bool), every=True)
     pairs = rows.pairs(None)
     assert pairs is not None
     found = pair_contact(place, outlines, aim, carried, rows, pairs)
-    table = torch.zeros(PAIR_MEASURES, len(carried), *carried.shape)
+    table = torch.zeros(PAIR_MEASURES, len(carried), len(carried))
     table[:, pairs.first, pairs.second] = found
     return table
 
@@ -69,9 +68,9 @@ def test_a_way_that_ends_before_the_other_disc_pushes_nothing() -> None:
 
 def test_what_an_object_would_push_is_what_the_other_is_pushed_by() -> None:
     torch.manual_seed(0)
-    place, aim = 0.06 * torch.randn(2, 3, 4), torch.nn.functional.normalize(torch.randn(2, 3, 4), dim=0)
-    outlines = outline_values(Outline()(0.02 * torch.randn(4, 3, 64, 3)))[..., :PER_OUTLINE].movedim((-1, -2), (0, 1))
-    found = measures(place, outlines, aim, 0.08 * torch.rand(3, 4))
+    place, aim = 0.06 * torch.randn(2, 3), torch.nn.functional.normalize(torch.randn(2, 3), dim=0)
+    outlines = outline_values(Outline()(0.02 * torch.randn(3, 64, 3)))[..., :PER_OUTLINE].T
+    found = measures(place, outlines, aim, 0.08 * torch.rand(3))
     assert torch.equal(found[4:7], found[7:10].transpose(1, 2))
-    assert torch.equal(found[10], found[11].transpose(0, 1))
-    assert max(found[6, 0, 1].max(), found[6, 1, 0].max(), found[6, 2, 0].max()) > 0
+    assert torch.equal(found[10], found[11].T)
+    assert max(found[6, 0, 1], found[6, 1, 0], found[6, 2, 0]) > 0

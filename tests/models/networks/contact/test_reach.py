@@ -8,13 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.networks.contact.chosen_rows import ChosenRows
 from models.networks.contact.dynamics import ContactDynamics
-from models.networks.contact.every_row import EveryRow
-from models.networks.contact.reach import CARRIED, in_reach
-from models.networks.contact.tool import REACH, TOOL_RADIUS, endpoints
+from models.networks.contact.geometry import CARRIED, REACH, TOOL_RADIUS, endpoints, in_reach
+from models.networks.contact.rows import Rows
+from models.networks.layers import fixed_shapes
 from models.networks.outline import Outline, mean_extent
-from models.networks.shapes import fixed_shapes
 from models.state import State
 from tests.models.networks.contact import by_hand
 from tests.models.networks.contact.test_contact_dynamics import doubled, scene, settled, shipped
@@ -199,8 +197,8 @@ def test_few_numbers_of_rows_and_of_pairs_occur() -> None:
     rows, pairs = set(), set()
     for number in range(300):
         torch.manual_seed(number)
-        chosen = ChosenRows(torch.rand(3, 200) < number / 300)
-        rows.add(chosen.shape)
+        chosen = Rows(torch.rand(3, 200) < number / 300)
+        rows.add(chosen.of_objects(torch.zeros(1, 3, 200)).shape)
         found = chosen.pairs(None)
         pairs.add(0 if found is None else len(found.first))
     assert len(rows) < 20
@@ -208,19 +206,26 @@ def test_few_numbers_of_rows_and_of_pairs_occur() -> None:
 
 
 @pytest.mark.parametrize("near", [None, torch.rand(4, 4, 30) < 0.6])
-def test_chosen_pairs_are_those_of_all_pairs_that_count(near: torch.Tensor | None) -> None:
+def test_pairs_are_those_of_objects_that_count_also_if_every_object_is_a_row(near: torch.Tensor | None) -> None:
     torch.manual_seed(1)
     counting, values = torch.rand(4, 30) < 0.5, torch.rand(2, 4, 30)
     found = []
-    for rows in (EveryRow(counting), ChosenRows(counting)):
+    for every in (True, False):
+        rows = Rows(counting, every=every)
         pairs = rows.pairs(near)
         assert pairs is not None
         first, second = rows.to_pairs(rows.of_objects(values), pairs)
-        exchanged = first.index_select(1, pairs.exchanged)
+        assert torch.equal(first.index_select(1, pairs.exchanged), second)
         real = pairs.real
-        if isinstance(rows, EveryRow):
-            real = real & counting[pairs.first]
-        assert torch.equal(exchanged[:, real], second[:, real])
+        if every:
+            real = real & counting.flatten()[pairs.first]
         found.append({tuple(row) for row in torch.cat((first[:, real], second[:, real])).T.tolist()})
     assert found[0] == found[1]
-    assert len(found[0]) > 20
+    expected = {
+        (*values[:, i, push].tolist(), *values[:, j, push].tolist())
+        for push in range(30)
+        for i in range(4)
+        for j in range(4)
+        if i != j and counting[i, push] and counting[j, push] and (near is None or near[i, j, push])
+    }
+    assert found[0] == expected

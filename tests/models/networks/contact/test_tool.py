@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from envs.robots import STICK_RADIUS
 from envs.workspace import push_endpoints
-from models.networks.contact.tool import DISPLACEMENT_UNIT, PUSH_UNIT, REACH, TOOL_RADIUS, ToolContact, endpoints
+from models.networks.contact.geometry import DISPLACEMENT_UNIT, PUSH_UNIT, REACH, TOOL_RADIUS, ToolContact, endpoints
 from models.networks.outline import PER_OUTLINE, Outline, outline_values
 
 

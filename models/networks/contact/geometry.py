@@ -1,4 +1,4 @@
-"""Where a straight push of the tool meets an object, from the object's outline: geometry without learned numbers."""
+"""Where the tool meets objects and pushed objects meet each other, from outlines: without learned numbers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ import math
 import torch
 from torch import Tensor, nn
 
-from models.networks.outline import DIRECTIONS, OUTLINE_UNIT, PER_OUTLINE, series
+from models.networks.contact.rows import Pairs, Rows
+from models.networks.outline import (
+    DIRECTIONS,
+    HARMONICS,
+    OUTLINE_UNIT,
+    PER_OUTLINE,
+    multiples,
+    series,
+    supports,
+)
 
 REACH_LOW, REACH_HIGH = (0.30, -0.55), (0.80, 0.55)  # metres; where starts and ends of pushes may lie
 REACH = torch.tensor((REACH_LOW, REACH_HIGH), dtype=torch.float64)
@@ -16,6 +25,8 @@ DISPLACEMENT_UNIT = 0.05  # metres, a typical motion of an object
 TOOL_RADIUS = 0.01  # metres
 CORNER = 0.004  # metres; of two sides that the tool meets within so little, both count
 MEASURES = 8
+PAIR_MEASURES = 12
+CARRIED = 0.01  # metres; an object may be carried so much farther than the tool goes
 
 
 class ToolContact(nn.Module):
@@ -88,3 +99,67 @@ def endpoints(action: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     start = low + (action[..., :2] + 1.0) * ((high - low) / 2.0)
     end = torch.add(start, action[..., 2:], alpha=PUSH_UNIT).clamp(low, high)
     return start, end - start
+
+
+def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, rows: Rows, pairs: Pairs) -> Tensor:
+    """Measures of pairs of objects, of which the tool would carry each along its aim, a direction of its own.
+
+    The way until a carried object meets another is their distance along the aim, less how far both reach in that
+    direction. It passes if the gap across the aim is positive. Components come first and objects second.
+
+    Args:
+        place: `[2, R]` metres, centres in axes of the push. outlines: `[2 K + 1, R]`, in the same axes.
+        aim: `[2, R]` vectors of any length. carried: `[R]` metres along the aim, 0 without contact.
+        rows, pairs: tell which objects these are.
+
+    Returns:
+        `[PAIR_MEASURES, P]` of object i and another j, in units of `DISPLACEMENT_UNIT`: where i is, seen from
+        j, and where j would push it; if j were carried: the way until it meets i, the gap between them across the aim,
+        how far it would push i; the same three for i and j exchanged; how far both are carried.
+    """
+    cosines, sines = multiples(*aim)
+    sizes = 2, PER_OUTLINE, HARMONICS, HARMONICS, 1
+    each = torch.cat((place, outlines, cosines, sines, carried.unsqueeze(0)))
+    (place, outline, *_), (own_place, own_outline, cosines, sines, carried) = (
+        one.split(sizes) for one in rows.to_pairs(each, pairs)
+    )
+    extents = supports(torch.stack((own_outline, outline), 1), cosines.unsqueeze(1), sines.unsqueeze(1))
+    (own_ahead, _), (_, behind), (own_left, left), (own_right, right) = extents
+    offset = place - own_place
+    x, y = cosines[0], sines[0]
+    along, across = torch.addcmul(offset[0] * x, offset[1], y), torch.addcmul(offset[1] * x, offset[0], y, value=-1)
+    meet = along - own_ahead - behind
+    gap = torch.maximum(across - own_left - right, -across - own_right - left)
+    way = carried.squeeze(0)
+    push = (way - meet.clamp_min(0.0)).clamp_min(0.0) * ((gap < 0) & (meet > -0.05))
+    # Of j, if it is carried; and the same of i.
+    own = torch.stack((meet, gap, push, way))
+    other = own.index_select(1, pairs.exchanged)
+    return torch.cat((offset, push * cosines[:1], push * sines[:1], own[:3], other, own[3:])) / DISPLACEMENT_UNIT
+
+
+def in_reach(along: Tensor, across: Tensor, length: Tensor, radius: Tensor, margin: float) -> Tensor:
+    """Whether the tool, or an object that the tool moves, comes within a margin of an object: `[M, ...]` bool.
+
+    An object that the tool meets is taken for a disc that is carried along the push for the rest of its way. Objects
+    that such objects push are not asked what they push.
+
+    Args:
+        along, across: `[M, ...]` metres, centres from the push's start, in its axes. length: `[...]` metres, of the
+            push; broadcasts to `[M, ...]`. radius: `[M, ...]` metres, mean extent of the objects. margin: metres.
+    """
+    met = _squared_distance(along, across, length) < (radius + (TOOL_RADIUS + margin)).square()
+    if len(along) == 1:
+        return met
+    rest = (length - (along - radius - TOOL_RADIUS).clamp_min(0.0)).clamp_min(0.0) + CARRIED
+    # Of j, which is carried, and i: [i, j, ...].
+    ahead, aside = along.unsqueeze(1) - along, across.unsqueeze(1) - across
+    close = radius.unsqueeze(1) + (radius + (CARRIED + margin))
+    pushed = (_squared_distance(ahead, aside, rest) < close.square()) & met
+    return met | pushed.any(1)
+
+
+def _squared_distance(along: Tensor, across: Tensor, length: Tensor) -> Tensor:
+    """Of places from the way from 0 to `length` along the first axis: square metres."""
+    beyond = along - torch.minimum(along.clamp_min(0.0), length)
+    return torch.addcmul(beyond.square(), across, across)

@@ -1,0 +1,149 @@
+"""Whole trainings from the configuration: of an f that sees contact, over a checkpoint, with an automatic guide."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.loading import load_programs
+from cavin_pyro.evaluation.factory import make_runner
+from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint
+from cavin_pyro.storage.files import file_digest
+from cavin_pyro.storage.geometry import geometry_of
+from cavin_pyro.training.run import train
+from cavin_pyro.training.trainer import Trainer, reflect
+from envs.sensors.camera import Camera
+from envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
+from models.networks.contact.dynamics import ContactDynamics
+from models.networks.contact.geometry import REACH, endpoints
+from models.networks.outline import Outline
+from models.networks.pointnet import PointNet
+from models.state import State, Window
+
+CONTACT = ("geometry=outline", "dynamics=contact", "scales=predicted", "dynamics.object_width=16")
+SMALL = (
+    *("model.width=8", "trainer.batch_size=16", "trainer.validation_windows=32", "trainer.learning_rate=1e-2"),
+    *("trainer.steps=4", "trainer.validate_every=2", "windows.minimum_move=0.001", "windows.validation_fraction=0.4"),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(pushes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("train")
+    shutil.copytree(pushes, home / "pushes")  # features go there
+    run(home, "first", *CONTACT, "guide.width=8")
+    return home
+
+
+def run(home: Path, name: str, *options: str) -> Trainer:
+    return train(compose("train", *SMALL, f"data={home / 'pushes'}", f"output={home / name}", *options))
+
+
+def test_what_is_trained_is_what_plans(folder: Path) -> None:
+    path = folder / "first" / "checkpoint.safetensors"
+    assert isinstance(geometry_of(load_checkpoint(path), path), Outline)
+    small = ("planner=paper", "planner.samples=8", "planner.horizon=6", "maximum_steps=1", "objects=2")
+    runner = make_runner(compose("evaluate", f"checkpoint={path}", *small))
+    model = runner.planner.model
+    assert isinstance(model.dynamics, ContactDynamics)
+    assert torch.equal(model.dynamics.head.weight, load_checkpoint(path).tensors["model.dynamics.head.weight"])
+    assert runner.rollout(0).outcome in ("timeout", "success", "violation", "fall")
+    runner.env.close()
+
+
+def test_parts_that_are_not_trained_stay_bit_for_bit(folder: Path) -> None:
+    """What a calibration has found stays true where f alone is trained."""
+    first = load_checkpoint(folder / "first" / "checkpoint.safetensors")
+    calibrated = folder / "calibrated.safetensors"
+    records = {**first.provenance, "calibrated": [{"steps": 3}]}
+    calibrated.write_bytes(checkpoint_bytes(first.tensors, first.config, records))
+    more = (*CONTACT, "guide.width=8", f"initial={calibrated}", "objective=rollout", "trainer.reflect=true")
+    for trained, part in (("[dynamics]", "dynamics"), ("[]", None)):
+        after = load_checkpoint(
+            run(folder, f"of-{part}", f"trained={trained}", *more).folder / "checkpoint.safetensors"
+        )
+        changed = {name.split(".")[1] for name, value in first.tensors.items() if not value.equal(after.tensors[name])}
+        assert changed == {"dynamics"} if part else len(changed) > 3
+        assert after.provenance.get("calibrated") == ([{"steps": 3}] if part else None)
+        assert after.provenance["initial"] == {"sha256": file_digest(calibrated), "provenance": records}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["dynamics=contact"], "ContactDynamics reads the features of Outline, not of PointNet"),
+        ([*CONTACT, "trained=[wheels]"], "trained has 'wheels', which is no part of this model: choose from encoder, "),
+        ([*CONTACT, "initial={first}", "model.width=16"], "is of another architecture: model."),
+        (["initial=nothing"], "unknown checkpoint 'nothing': choose from cavin"),
+        (["trainer.reflect=true"], "those of PointNet have none: pass geometry=outline, or leave trainer.reflect"),
+        (["geometry=outline", "trainer.reflect=true", "guide=auto_normal"], "trainer.reflect needs a guide that"),
+        (["guide=auto_normal", "objective=mean_field_elbo"], "samples auxiliary sites, which this objective leaves"),
+        (["guide=auto_normal", "objective.warm_up_steps=5"], "without objective.kl_weights and"),
+    ],
+)
+def test_what_cannot_be_trained_gives_its_line_and_writes_nothing(folder: Path, options: list, said: str) -> None:
+    first = folder / "first" / "checkpoint.safetensors"
+    with pytest.raises(UserError) as error:
+        run(folder, "bad", *(option.format(first=first) for option in options))
+    assert said in str(error.value) and "\n" not in str(error.value)
+    assert not (folder / "bad").exists()
+
+
+@pytest.mark.parametrize("guide", ["auto_normal", "auto_iaf"])
+def test_an_automatic_guide_learns_its_windows_resumes_and_says_what_it_is(
+    guide: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = (f"guide={guide}", "trainer.batch_size=5")
+    whole = run(folder, f"{guide}-whole", *options, "trainer.steps=8")
+    assert "5 of " in capsys.readouterr().out
+    if guide == "auto_normal":
+        assert whole.rows[-1]["validation_loss"] < whole.rows[0]["validation_loss"]
+    half = run(folder, f"{guide}-half", *options)
+    again = folder / f"{guide}-again"
+    again.mkdir()
+    for name in ("resume.safetensors", "metrics.csv", "checkpoint.safetensors"):
+        shutil.copy(half.folder / name, again)
+    resumed = run(folder, again.name, *options, "trainer.steps=8")
+    for name, value in whole.guide.state_dict().items():
+        assert torch.equal(value, resumed.guide.state_dict()[name]), name
+    # The classes that the checkpoint names are known, and check says why it cannot use them.
+    path = whole.folder / "checkpoint.safetensors"
+    with pytest.raises(UserError, match="parameters for windows of its training alone: .* cascaded, flow, joint"):
+        load_programs(load_checkpoint(path), path)
+
+
+MIRROR = torch.tensor([1.0, -1.0, 1.0])
+
+
+def window_of(clouds: torch.Tensor, geometry: Outline) -> Window:
+    """Windows `[B]` of one push, from clouds `[B, 2, M, P, 3]` in the robot's frame."""
+    centers = clouds.mean(-2)
+    counts = torch.ones(len(clouds), 2, 3, dtype=torch.bool)
+    states = State(centers, geometry(clouds - centers.unsqueeze(-2)), counts)
+    actions = 2 * torch.rand(len(clouds), 1, 4, generator=torch.Generator().manual_seed(3)) - 1
+    return Window(states, actions, counts[:, :1, 0], counts[:, 0, 0])
+
+
+def test_a_mirrored_window_is_what_mirrored_clouds_give_and_others_stay() -> None:
+    geometry, generator = Outline(), torch.Generator().manual_seed(0)
+    clouds = 0.05 * torch.randn(4, 2, 3, 64, 3, generator=generator) + torch.rand(4, 1, 3, 1, 3, generator=generator)
+    which = torch.tensor([True, False, True, False])
+    recorded = window_of(clouds, geometry)
+    found = reflect(recorded, which, geometry.mirror_signs())
+    expected = window_of(torch.where(which[:, None, None, None, None], clouds * MIRROR, clouds), geometry)
+    torch.testing.assert_close(found.states.centers, expected.states.centers)
+    torch.testing.assert_close(found.states.features, expected.states.features, atol=1e-5, rtol=0)
+    assert not torch.allclose(found.states.features[0], recorded.states.features[0], atol=1e-2)
+    for one, other in zip(endpoints(found.actions, REACH), endpoints(recorded.actions, REACH), strict=True):
+        torch.testing.assert_close(one, torch.where(which[:, None, None], other * MIRROR[:2], other))
+    assert PointNet().mirror_signs() is None
+
+
+def test_the_world_is_symmetric_about_that_plane() -> None:
+    assert (REACH_LOW[1], TABLE_LOW[1]) == (-REACH_HIGH[1], -TABLE_HIGH[1])
+    assert (Camera().position[1], Camera().rotation) == (0.0, (0.0, 0.0, 0.0))

@@ -1,0 +1,48 @@
+"""Every model with each of its guides, small."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from guides.cascaded import CascadedGuide
+from guides.flat import FlatGuide
+from guides.flow import FlowGuide
+from guides.guide import Guide
+from guides.none import NoGuide
+from guides.single_latent import SingleLatentGuide
+from models.cascaded import CascadedModel
+from models.dynamics_only import DynamicsModel
+from models.flat import FlatModel
+from models.model import Model
+from models.single_latent import SingleLatentModel
+
+DIMENSION = {"effect_code": 5, "motion_code": 4}
+EFFECT, MOTION = {"effect_dimension": 5}, {"motion_dimension": 4}
+MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
+    "cascaded": (CascadedModel, EFFECT | MOTION),
+    "single_latent": (SingleLatentModel, EFFECT),
+    "flat": (FlatModel, MOTION),
+    "dynamics": (DynamicsModel, {}),
+}
+GUIDES: dict[str, tuple[type[Guide], dict[str, Any]]] = {
+    "cascaded": (CascadedGuide, {"width": 8}),
+    "mean_field": (CascadedGuide, {"width": 8, "motion_reads_effect": False}),
+    "joint": (CascadedGuide, {"width": 8, "effect_reads_actions": True}),
+    "flow": (FlowGuide, {"width": 8, "flow_width": 8}),
+    "single_latent": (SingleLatentGuide, {"width": 8}),
+    "single_latent of actions": (SingleLatentGuide, {"width": 8, "reads_actions": True}),
+    "flat": (FlatGuide, {"width": 8}),
+    "none": (NoGuide, {}),
+}
+PAIRS = [(model, guide) for model in MODELS for guide in GUIDES if model in GUIDES[guide][0].fits]
+MISFITS = [(model, guide) for model in MODELS for guide in GUIDES if model not in GUIDES[guide][0].fits]
+
+
+def make_model(name: str, **more: Any) -> Model:
+    kind, sizes = MODELS[name]
+    return kind(feature_dimension=6, width=8, **sizes, **more)
+
+
+def make(model: str, guide: str, **more: Any) -> tuple[Model, Guide]:
+    made, (kind, sizes) = make_model(model, **more), GUIDES[guide]
+    return made, kind(made, **sizes)

@@ -1,0 +1,202 @@
+"""What holds of every model with each of its guides, of flows, and of the inference networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pyro
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyro import poutine
+from pyro.infer import SVI, Trace_ELBO, TraceMeanField_ELBO
+from torch import Tensor, nn
+
+from guides.cascaded import CascadedGuide
+from guides.flow import FlowGuide
+from guides.guide import Guide
+from guides.networks import EffectInference, MotionInference
+from models.model import Model
+from models.networks.layers import SCALE_FLOOR, GaussianCode
+from models.state import State, Window
+from tests.guides.programs import DIMENSION, GUIDES, MISFITS, MODELS, PAIRS, make, make_model
+
+Pair = tuple[str, str]
+every_pair = pytest.mark.parametrize("pair", PAIRS, ids="-".join)
+
+
+def make_double(pair: Pair) -> tuple[Model, Guide]:
+    model, guide = make(*pair)
+    return model.double(), guide.double()
+
+
+def loss_of(model: Model, guide: Guide, window: Window) -> Tensor:
+    torch.manual_seed(5)
+    return Trace_ELBO()(model, guide)(window)
+
+
+@every_pair
+def test_a_guide_samples_exactly_the_codes_of_its_model(pair: Pair, random_window: Callable[..., Window]) -> None:
+    model, guide = make(*pair)
+    window = random_window()
+    in_model, in_guide = (poutine.trace(program).get_trace(window) for program in (model, guide))
+    codes = [name for name in in_model.stochastic_nodes if name != "windows"]
+    assert codes == [name for name in in_guide.stochastic_nodes if name != "windows"] == list(model.codes)
+    for name in codes:
+        assert in_guide.nodes[name]["fn"].shape() == in_model.nodes[name]["fn"].shape() == (4, DIMENSION[name])
+
+
+@pytest.mark.parametrize(("model", "guide"), MISFITS)
+def test_every_other_pair_is_refused(model: str, guide: str) -> None:
+    kind, sizes = GUIDES[guide]
+    says = f"^guide {kind.__name__} does not fit model {MODELS[model][0].__name__}; it fits {kind.fits[0]}$"
+    with pytest.raises(ValueError, match=says):
+        kind(make_model(model), **sizes)
+
+
+@every_pair
+def test_no_parameter_is_held_twice_and_each_is_trained(pair: Pair, random_window: Callable[..., Window]) -> None:
+    loss = Trace_ELBO()(*make(*pair))
+    parameters = list(loss.parameters())
+    assert len(parameters) == len({parameter.data_ptr() for parameter in parameters})
+    loss(random_window()).backward()
+    assert not [name for name, parameter in loss.named_parameters() if parameter.grad is None]
+
+
+@every_pair
+def test_svi_with_the_global_store_trains_every_parameter(pair: Pair, random_window: Callable[..., Window]) -> None:
+    window = random_window(batch=8)
+    with pyro.settings.context(module_local_params=False):
+        programs = make(*pair)
+        named = {f"{n}.{name}": p for n, program in enumerate(programs) for name, p in program.named_parameters()}
+        before = {name: parameter.detach().clone() for name, parameter in named.items()}
+        svi = SVI(*programs, pyro.optim.Adam({"lr": 3e-3}), Trace_ELBO())
+        losses = [svi.step(window) for _ in range(15)]
+    assert not [name for name, parameter in named.items() if torch.equal(parameter, before[name])]
+    assert sum(losses[-3:]) < sum(losses[:3])
+
+
+@every_pair
+def test_particles_have_codes_of_their_own_and_the_densities_of_each(pair: Pair, window: Window) -> None:
+    model, guide = make_double(pair)
+    with pyro.plate("particles", 8, dim=-2):
+        guided = poutine.trace(guide).get_trace(window)
+        joint = poutine.trace(poutine.replay(model, trace=guided)).get_trace(window)
+    joint.compute_log_prob()
+    codes = {name: guided.nodes[name]["value"] for name in model.codes}
+    assert all(code.shape == (8, 4, DIMENSION[name]) and code.std(0).min() > 0 for name, code in codes.items())
+    alone = poutine.trace(poutine.condition(model, data={name: code[3] for name, code in codes.items()}))
+    one = alone.get_trace(window)
+    one.compute_log_prob()
+    for name in joint.observation_nodes:
+        assert joint.nodes[name]["log_prob"].shape == (8, 4)
+        assert torch.allclose(joint.nodes[name]["log_prob"][3], one.nodes[name]["log_prob"], rtol=1e-9)
+
+
+@every_pair
+def test_order_of_objects_and_padding_leave_the_loss(pair: Pair, window: Window) -> None:
+    programs, states = make_double(pair), window.states
+    expected = pytest.approx(loss_of(*programs, window).item(), rel=1e-9)
+    outside = ~states.mask.unsqueeze(-1)
+    others = [states.map(lambda field, order=order: field[:, :, order]) for order in ([2, 3, 0, 1], [3, 2, 1, 0])]
+    others += [states.map(lambda field: field[:, :, :3])]  # the last object, which is padding throughout, cut off
+    others += [State(*(torch.where(outside, number, f) for f in states[:2]), states.mask) for number in (-70.0, 9.0)]
+    for other in others:
+        assert loss_of(*programs, window._replace(states=other)).item() == expected
+
+
+@every_pair
+@torch.no_grad()
+def test_features_that_are_handed_over_are_those_that_a_program_computes(
+    pair: Pair, random_window: Callable[..., Window]
+) -> None:
+    model, guide = make(*pair)
+    window = random_window()
+    for generate in (False, True):
+        for program in (model, guide):
+            traces = []
+            for given_features in ({}, {"encoded": model.encode(window, generate)}):
+                torch.manual_seed(3)
+                traces.append(poutine.trace(program).get_trace(window, generate=generate, **given_features))
+            computed, handed = traces
+            assert list(computed.nodes) == list(handed.nodes)
+            assert float(handed.log_prob_sum()) == pytest.approx(float(computed.log_prob_sum()), rel=1e-6)
+
+
+def test_saved_networks_load_into_fresh_ones(random_window: Callable[..., Window]) -> None:
+    window, pairs = random_window(), [make("cascaded", "joint"), make("cascaded", "joint")]
+    losses = [loss_of(*pair, window).item() for pair in pairs]
+    assert losses[0] != losses[1]
+    for saved, fresh in zip(*pairs, strict=True):
+        fresh.load_state_dict(saved.state_dict())
+    assert loss_of(*pairs[1], window).item() == losses[0]
+
+
+def test_a_frozen_encoder_stays_frozen(random_window: Callable[..., Window]) -> None:
+    model, guide = make("cascaded", "cascaded")
+    model.encoder.requires_grad_(False)
+    loss = Trace_ELBO()(model, guide)
+    loss(random_window()).backward()
+    assert all(parameter.grad is None for parameter in model.encoder.parameters())
+    assert all(parameter.grad is not None for parameter in loss.parameters() if parameter.requires_grad)
+
+
+def stirred() -> tuple[Model, FlowGuide, CascadedGuide]:
+    """A guide whose flows are not the identity, and the guide without flows, of the same weights."""
+    model, guide = make_double(("cascaded", "flow"))
+    plain = CascadedGuide(model, width=8).double()
+    weights = guide.state_dict().items()
+    plain.load_state_dict({name.replace(".gaussian", ""): value for name, value in weights if ".flow." not in name})
+    for name, parameter in guide.named_parameters():
+        if ".flow." in name:
+            nn.init.normal_(parameter, std=0.3)
+    return model, guide, plain
+
+
+def test_with_identity_flows_a_flow_guide_is_the_plain_guide(window: Window) -> None:
+    model, guide, plain = stirred()
+    values = [poutine.trace(one).get_trace(window).nodes["effect_code"]["value"] for one in (guide, plain)]
+    assert (values[0] - values[1]).abs().min() > 0
+    for name, parameter in guide.named_parameters():
+        if ".flow." in name and ".hyper.2." in name:
+            nn.init.zeros_(parameter)
+    assert loss_of(model, guide, window).item() == pytest.approx(loss_of(model, plain, window).item(), rel=1e-12)
+
+
+def test_every_weight_of_a_flow_learns_and_its_divergence_is_sampled(window: Window) -> None:
+    model, guide, _ = stirred()
+    loss = loss_of(model, guide, window)
+    torch.manual_seed(5)
+    assert TraceMeanField_ELBO()(model, guide)(window).item() == pytest.approx(loss.item(), rel=1e-12)
+    loss.backward()
+    assert not [name for name, one in guide.named_parameters() if one.grad is None or not one.grad.any()]
+
+
+def test_inference_depends_on_all_that_it_reads(random_window: Callable[..., Window]) -> None:
+    model = make_model("cascaded")
+    s, goal, actions = random_window().first, random_window().last, torch.randn(4, 3, 4)
+    effect = EffectInference(model, width=8)
+    for other in (goal._replace(centers=goal.centers + 0.1), goal._replace(features=-goal.features)):
+        assert not torch.allclose(effect(s, other).mean, effect(s, goal).mean, atol=1e-3)
+    motion, encoded, c = MotionInference(model, width=8), model.encoder(s), torch.randn(4, 5)
+    code = motion(encoded, s.mask, actions, c).mean
+    for other in ((encoded + 1, actions, c), (encoded, actions.flip(1), c), (encoded, actions, c + 1)):
+        assert not torch.allclose(motion(other[0], s.mask, *other[1:]).mean, code, atol=1e-4)
+
+
+def test_scales_of_codes_stay_above_the_floor() -> None:
+    head = GaussianCode(3, width=8)
+    nn.init.constant_(head.head.bias, -1e4)
+    assert torch.allclose(head(torch.randn(5, 8)).base_dist.scale, torch.tensor(SCALE_FLOOR))
+
+
+@settings(max_examples=10, deadline=None)
+@given(batch=st.lists(st.integers(1, 3), max_size=2), particles=st.integers(1, 3))
+def test_extra_dimensions_of_the_code_broadcast(batch: list[int], particles: int) -> None:
+    network = MotionInference(make_model("cascaded"), width=8)
+    encoded, mask = torch.randn(*batch, 4, 24), torch.ones(*batch, 4, dtype=torch.bool)
+    actions, c = torch.randn(*batch, 3, 4), torch.randn(particles, *batch, 5)
+    code = network(encoded, mask, actions, c)
+    assert (code.batch_shape, code.event_shape) == ((particles, *batch), (4,))
+    assert torch.allclose(code.mean[0], network(encoded, mask, actions, c[0]).mean, atol=1e-5)
