@@ -38,7 +38,7 @@ EXAMPLES = {
         "-m task=clearing,insertion,crossing episodes=50",
     ),
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
-    "reproduce": ("scale=smoke", "scale=paper shard=2/3", "scale=paper merge=[runs/a,runs/b,runs/c]"),
+    "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }
 HEADINGS = {  # of the groups, in the order of the page
     "task": "Task",

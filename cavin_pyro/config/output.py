@@ -25,7 +25,7 @@ FOLDERS = {
     "plan": ("runs/plan/{task}-{reward}-{objects}-{planner}-{seed}", ("video", "viewer")),
     "evaluate": ("runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}", ("episodes", "compare", "merge", *LAUNCH)),
     "demo": ("runs/demo", ()),
-    "reproduce": ("runs/reproduce/{scale}", ("workers", "merge")),
+    "reproduce": ("runs/reproduce/{scale}", ("workers",)),
 }
 
 

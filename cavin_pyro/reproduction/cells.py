@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.scales import TOP_ROW_OBJECTS, Scale
+from cavin_pyro.reproduction.sizes import TOP_ROW_OBJECTS, Size
 
-FIGURES = ("paper", "ours")  # kinds of planners that have a figure of their own
-PLANNERS = (*FIGURES, "variants")
-# Between one method of the paper's figure and another: what each step of the way brings.
-VARIANTS = (
-    ("cavin", "first_segment"),
-    ("cavin", "one_motion"),
-    ("cavin", "without_effects"),
-    ("sectar", "perturbed_rollouts"),
-)
+PLANNERS = ("paper", "ours")  # each has a figure of its own
 SCENES_PER_TRAINING = 1000  # so that more episodes per cell can join those of an earlier run
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One bar of the figure, or one point of its bottom row."""
+    """A bar of the figure, or a point of its bottom row, for one training: scenes `seed`, `seed + 1`, ..."""
 
     method: str
     planner: str
     task: str
     reward: str
     objects: int
-
-    @property
-    def name(self) -> str:
-        """As part of a folder's name."""
-        return f"{self.method}-{self.planner}-{self.task}-{self.reward}-{self.objects}"
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The episodes of a cell for one training. Scenes have the seeds `seed`, `seed + 1`, ..."""
-
-    cell: Cell
     training_seed: int
     seed: int
     episodes: int
@@ -49,43 +27,26 @@ class Evaluation:
     @property
     def name(self) -> str:
         """As the name of its folder."""
-        return f"{self.cell.name}-{self.training_seed}"
+        return f"{self.method}-{self.planner}-{self.task}-{self.reward}-{self.objects}-{self.training_seed}"
 
 
-def cells(scale: Scale, methods: Sequence[str], planners: Sequence[str] = PLANNERS) -> Iterator[Cell]:
-    """Of every kind of planner in `planners`; see `PLANNERS`.
+def cells(size: Size, methods: Sequence[str], planners: Sequence[str] = PLANNERS) -> Iterator[Cell]:
+    """Every cell for every training seed, which has scenes of its own that all methods share.
 
-    Top row: dense and sparse with 3 objects. Bottom row: sparse, against the number of objects. Variants: sparse, with
-    3 objects.
+    Top row: dense and sparse with 3 objects. Bottom row: sparse, against the number of objects.
     """
-    for planner in planners:
-        for task in scale.tasks:
-            if planner == "variants":
-                chosen = [one for one in VARIANTS if one[0] in methods and "sparse" in scale.rewards]
-                yield from (Cell(*one, task, "sparse", TOP_ROW_OBJECTS) for one in chosen)
-                continue
-            for method in methods:
-                if "dense" in scale.rewards:
-                    yield Cell(method, planner, task, "dense", TOP_ROW_OBJECTS)
-                if "sparse" in scale.rewards:
-                    yield from (Cell(method, planner, task, "sparse", objects) for objects in scale.object_counts)
-
-
-def evaluations(scale: Scale, methods: Sequence[str], planners: Sequence[str] = PLANNERS) -> Iterator[Evaluation]:
-    """Every cell for every training seed. A training seed has scenes of its own, which all methods share."""
-    for cell in cells(scale, methods, planners):
-        top = cell.objects == TOP_ROW_OBJECTS and cell.planner in FIGURES
-        share = -(-(scale.episodes if top else scale.bottom_episodes) // len(scale.training_seeds))
-        for number, training_seed in enumerate(scale.training_seeds):
-            yield Evaluation(cell, training_seed, scale.first_scene + number * SCENES_PER_TRAINING, share)
-
-
-def in_order(rows: Sequence[Mapping[str, Any]], scale: Scale) -> list[Any]:
-    """Rows of a table in the order of `evaluations` of all methods and planners, whatever was run first."""
-    places = {cell: place for place, cell in enumerate(cells(scale, list(METHODS)))}
-
-    def place(row: Mapping[str, Any]) -> tuple[int, int, int]:
-        cell = Cell(row["method"], row["planner"], row["task"], row["reward"], row["objects"])
-        return places[cell], row["training_seed"], row["seed"]
-
-    return sorted(rows, key=place)
+    objects = {"dense": (TOP_ROW_OBJECTS,), "sparse": size.object_counts}
+    bars = [
+        (method, planner, task, reward, count)
+        for planner in planners
+        for task in size.tasks
+        for method in methods
+        for reward in objects
+        if reward in size.rewards
+        for count in objects[reward]
+    ]
+    for bar in bars:
+        episodes = size.episodes if bar[-1] == TOP_ROW_OBJECTS else size.bottom_episodes
+        share = -(-episodes // len(size.training_seeds))
+        for number, training_seed in enumerate(size.training_seeds):
+            yield Cell(*bar, training_seed, size.first_scene + number * SCENES_PER_TRAINING, share)

@@ -2,100 +2,80 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow
-from pyarrow import parquet
+from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.rows import RENAMED, with_current_names
-from cavin_pyro.reproduction.cells import Evaluation
+from cavin_pyro.reproduction.cells import Cell
 from cavin_pyro.storage.files import atomic_write
 
 CRITERIA = ("strict", "published")
 TABLE = "episodes.parquet"
-SCHEMA = pyarrow.schema(
-    [
-        ("method", pyarrow.string()),
-        ("planner", pyarrow.string()),
-        ("task", pyarrow.string()),
-        ("reward", pyarrow.string()),
-        ("objects", pyarrow.int8()),
-        ("training_seed", pyarrow.int32()),
-        ("seed", pyarrow.int64()),
-        ("strict_outcome", pyarrow.string()),
-        ("strict_steps", pyarrow.int16()),
-        ("strict_return", pyarrow.float64()),
-        ("published_outcome", pyarrow.string()),
-        ("published_steps", pyarrow.int16()),
-        ("published_return", pyarrow.float64()),
-        ("unsafe", pyarrow.int16()),
-        ("ineffective", pyarrow.int16()),
-        ("plans", pyarrow.int16()),
-        ("plans_reaching_goal", pyarrow.int16()),  # of these, those that the model expects to reach the goal
-        ("subgoal_distance", pyarrow.float64()),  # metres, mean over segments; null for planners without subgoals
-    ]
-)
-Row = dict[str, Any]
+CELL = ["method", "planner", "task", "reward", "objects"]
+COLUMNS = {
+    **dict.fromkeys(CELL[:-1], "string"),
+    "objects": "int8",
+    "training_seed": "int32",
+    "seed": "int64",
+    **{
+        f"{criterion}_{name}": kind
+        for criterion in CRITERIA
+        for name, kind in (("outcome", "string"), ("steps", "int16"), ("return", "float64"))
+    },
+    **dict.fromkeys(("unsafe", "ineffective", "plans"), "int16"),
+    "plans_reaching_goal": "int16",  # those that the model expects to reach the goal
+    "subgoal_distance": "float64",  # metres, mean over segments; NaN for planners without subgoals
+}
 
 
-def episode_row(evaluation: Evaluation, row: Mapping[str, Any]) -> Row:
-    """A row of the table from a line of `episodes.jsonl` (current names), of an episode by the published criterion.
+def episode_row(cell: Cell, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the table from a line of `episodes.jsonl`, of an episode by the published criterion.
 
     Times are left out: they differ from run to run.
     """
-    cell = evaluation.cell
-    return {
-        "method": cell.method,
-        "planner": cell.planner,
-        "task": cell.task,
-        "reward": cell.reward,
-        "objects": cell.objects,
-        "training_seed": evaluation.training_seed,
-        "seed": row["seed"],
-        **{f"strict_{name}": row[f"strict_{name}"] for name in ("outcome", "steps", "return")},
-        **{f"published_{name}": row[name] for name in ("outcome", "steps", "return")},
-        **{name: row[name] for name in ("unsafe", "ineffective", "plans", "plans_reaching_goal", "subgoal_distance")},
-    }
+    published = {f"published_{name}": row[name] for name in ("outcome", "steps", "return")}
+    known = {**asdict(cell), **row, **published}
+    return {name: known[name] for name in COLUMNS}
 
 
-def write_table(path: Path, rows: Iterable[Row]) -> None:
-    """Write Parquet, whose bytes depend on the rows and on pyarrow's version alone."""
+def as_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Rows as `episode_row` makes them."""
+    return pd.DataFrame(list(rows), columns=list(COLUMNS)).astype(COLUMNS)
+
+
+def write_table(path: Path, table: pd.DataFrame) -> None:
+    """Write Parquet, whose bytes depend on the rows and on the versions of pandas and pyarrow alone."""
     with atomic_write(path) as temporary:
-        parquet.write_table(pyarrow.Table.from_pylist(list(rows), schema=SCHEMA), temporary)
+        table.to_parquet(temporary, index=False)
 
 
-def read_table(path: Path) -> list[Row]:
-    """The rows of a table, in their order.
+def read_table(path: Path) -> pd.DataFrame:
+    """The table of a run, in its order.
 
     Raises:
         UserError: the file cannot be read, or holds something else.
     """
     try:
-        stored = parquet.read_schema(path).names
-        old_names = {new: old for old, new in RENAMED.items() if old in stored}
-        schema = pyarrow.schema([field.with_name(old_names.get(field.name, field.name)) for field in SCHEMA])
-        return [with_current_names(row) for row in parquet.read_table(path, schema=schema).to_pylist()]
-    except (OSError, pyarrow.ArrowException) as error:
+        return pd.read_parquet(path, columns=list(COLUMNS)).astype(COLUMNS)
+    except (OSError, ValueError, KeyError, TypeError, pyarrow.ArrowException) as error:
         why = str(error).splitlines()[0]
         raise UserError(f"{path} is no table of episodes ({why}): give an episodes.parquet of reproduce") from error
 
 
-def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What tells an episode from all others in a table."""
-    return tuple(row[name] for name in ("method", "planner", "task", "reward", "objects", "training_seed", "seed"))
+def chosen_rows(table: pd.DataFrame, config: DictConfig) -> pd.DataFrame:
+    """The rows that the options `methods`, `planners`, `tasks`, `rewards` and `objects` choose.
 
-
-def episode_key(evaluation: Evaluation, seed: int) -> tuple[Any, ...]:
-    """`row_key` of an evaluation's episode in the scene `seed`."""
-    cell = evaluation.cell
-    place = cell.method, cell.planner, cell.task, cell.reward, cell.objects
-    return *place, evaluation.training_seed, seed
-
-
-def as_text(value: Any) -> str:
-    """JSON whose bytes depend on the value alone."""
-    return json.dumps(value, indent=1, sort_keys=True) + "\n"
+    Raises:
+        UserError: there is none.
+    """
+    for name in CELL:
+        table = table[table[name].isin(list(config[name if name == "objects" else f"{name}s"]))]
+    if table.empty:
+        raise UserError(f"table={config.table} has no episode of these methods, planners, tasks, rewards and objects")
+    return table

@@ -4,8 +4,7 @@ Reads jobs, a line of JSON each, and prints the exit status of each. A job has `
 and either `command` and `overrides`, which runs as `python -m cavin_pyro.<command> <overrides>` in the folder; or
 `script` and `overrides`, which runs as `python <script> <overrides>`; or `cases`, which run in turn in one process,
 each from its own `folder`, with their answers as JSON in `output`.
-With `file_limit`, no file can grow beyond so many bytes. With `stages` "forked", `reproduce` starts no interpreters;
-with `pictures` "blank", matplotlib draws none.
+With `file_limit`, no file can grow beyond so many bytes; with `pictures` "blank", matplotlib draws none.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from cavin_pyro.config.composition import check_overrides
-from tests.cavin_pyro.forked_stages import fork_stages
 
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
@@ -47,8 +45,6 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.data.collection",
     "cavin_pyro.evaluation.comparison",
     "cavin_pyro.evaluation.evaluation",
-    "cavin_pyro.reproduction.episodes.picture",
-    "cavin_pyro.reproduction.merging",
     "cavin_pyro.reproduction.pipeline",
     "cavin_pyro.reproduction.results",
     "cavin_pyro.training.pretraining",
@@ -101,8 +97,6 @@ def run(job: dict[str, Any]) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (job["file_limit"], resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     if job.get("pictures") == "blank":  # how they reach the disk is tested, not what they show
         Figure.savefig = save_blank
-    if job.get("command") == "reproduce" and job.get("stages") == "forked":
-        fork_stages(run_and_end)
     if "cases" in job:
         sys.path[0] = ""  # the folder of each case
         print(json.dumps([run_case(**case) for case in job["cases"]]))

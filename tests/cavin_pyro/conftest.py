@@ -74,16 +74,13 @@ def run_as_users(command: str, *overrides: str, folder: Path) -> Answer:
     return Answer(process.returncode, output, errors)
 
 
-def run_command(
-    command: str, *overrides: str, folder: Path, file_limit: int | None = None, stages: str = "started"
-) -> Answer:
+def run_command(command: str, *overrides: str, folder: Path, file_limit: int | None = None) -> Answer:
     """Run a command in a process of its own, from the folder, without waiting for its imports (command_server.py).
 
     Args:
         file_limit: bytes beyond which a file cannot grow.
-        stages: those of `reproduce` are `started` with an interpreter each, or `forked` as this command is.
     """
-    job = {"command": command, "overrides": overrides, "file_limit": file_limit, "stages": stages}
+    job = {"command": command, "overrides": overrides, "file_limit": file_limit}
     status, output, errors = _forked(job, folder)
     return Answer(status, output, errors)
 

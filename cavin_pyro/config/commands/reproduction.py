@@ -19,33 +19,32 @@ class ReproduceConfig(DeviceOptions):
         "how large: smoke shows that everything runs (its rates mean nothing), small trains and evaluates little, "
         "medium is half a day on 2 cores, paper takes the paper's 500,000 transitions and 1,000 episodes per cell; "
         "minimal is for tests",
-        choices="cavin_pyro.reproduction.scales.SCALES",
+        choices="cavin_pyro.reproduction.sizes.SIZES",
         group="run",
     )
-    methods: list[str] | None = option(
-        None,
-        "methods to train and evaluate, by default the paper's four, and with table= all that it has; contact is CAVIN "
-        "with networks that see contact",
+    methods: list[str] = option(
+        ["cavin", "sectar", "cvae_mpc", "mpc"],
+        "methods to train and evaluate; contact is CAVIN with networks that see contact",
         choices="cavin_pyro.reproduction.methods.METHODS",
         group="run",
     )
     planners: list[str] = option(
-        ["paper", "ours", "variants"],
-        "kinds of planners to evaluate: the paper's, ours with its additions, and what lies between the methods",
+        ["paper", "ours"],
+        "kinds of planners to evaluate: the paper's, and ours with its additions",
         choices="cavin_pyro.reproduction.cells.PLANNERS",
         group="run",
     )
     tasks: list[str] = option(
         ["clearing", "insertion", "crossing"],
         "tasks to evaluate",
-        choices="cavin_pyro.reproduction.scales.TASKS",
+        choices="cavin_pyro.reproduction.sizes.TASKS",
         group="run",
     )
     objects: list[int] = option(
         [1, 2, 3, 4, 5], "numbers of objects to evaluate with sparse rewards, at most those of the scale", group="run"
     )
     rewards: list[str] = option(
-        ["dense", "sparse"], "rewards to evaluate", choices="cavin_pyro.reproduction.scales.REWARDS", group="run"
+        ["dense", "sparse"], "rewards to evaluate", choices="cavin_pyro.reproduction.sizes.REWARDS", group="run"
     )
     episodes: int | None = option(
         None,
@@ -56,7 +55,7 @@ class ReproduceConfig(DeviceOptions):
     )
     bottom_episodes: int | None = option(
         None,
-        "episodes per cell of the bottom row and of the variants; by default the scale's",
+        "episodes per cell of the bottom row; by default the scale's",
         minimum=1,
         group="run",
         limit=10**6,
@@ -74,26 +73,16 @@ class ReproduceConfig(DeviceOptions):
         "trained then",
         group="run",
     )
-    extends: str | None = option(
-        None,
-        "a table of episodes of an earlier run with the same scale and models: its episodes are kept and not run again",
-        group="run",
-    )
     output: str | None = option(
         None, "folder for everything, where an unfinished run is resumed; by default one in runs/reproduce", group="run"
     )
     workers: int = option(2, "processes; the table does not depend on it", minimum=1, group="run", limit=1024)
     shard: str = option(
-        "1/1", "i/n: the i-th of every n trainings and their episodes, so that n machines share the work", group="run"
+        "1/1",
+        "i/n: the i-th of every n trainings and their episodes, so that n machines share the work; join their folders "
+        "in one and run the command there without shard",
+        group="run",
     )
     table: str | None = option(
         None, "a table of episodes, episodes.parquet, to draw and count; nothing is run then", group="run"
-    )
-    merge: list[str] = option([], "folders of finished shards, [a,b], whose tables are joined", group="run")
-    pictures: str | None = option(
-        None,
-        "also run the first three successes and failures of CAVIN in each task again, by this criterion, and draw them "
-        "step by step; a finished run is only drawn",
-        choices="cavin_pyro.reproduction.table.CRITERIA",
-        group="run",
     )

@@ -1,26 +1,26 @@
-"""`reproduce`, from an empty folder to the figure, in its smallest size."""
+"""`reproduce`, from an empty folder to the figure, in its smallest size, and from a table alone."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
-from filelock import FileLock
 
-from cavin_pyro.config.errors import UserError, WorkerError
-from cavin_pyro.reproduction import stages
-from cavin_pyro.reproduction.stages import Stage, run_stages
-from cavin_pyro.reproduction.table import read_table
-from cavin_pyro.storage.files import output_folder
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.reproduction.cells import cells
+from cavin_pyro.reproduction.pipeline import Stage, run_stages
+from cavin_pyro.reproduction.results import write_results
+from cavin_pyro.reproduction.sizes import SIZES
+from cavin_pyro.reproduction.table import as_table, chosen_rows, episode_row, read_table, write_table
 
-WHOLE = ("scale=minimal", "methods=[mpc]", "planners=[paper]", "workers=1", "output=whole")
-TWO_METHODS = ("scale=minimal", "methods=[cavin,mpc]", "planners=[paper]")  # in make soak
+WHOLE = ("scale=minimal", "methods=[mpc]", "planners=[paper]", "workers=1")
 RESULTS = ("episodes.parquet", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png")
 
 
@@ -28,181 +28,114 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in RESULTS}
 
 
-@pytest.fixture(scope="module")
-def reproduced(shell: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which WHOLE has run once."""
-    folder = tmp_path_factory.mktemp("reproduced")
-    first = shell.run_command("reproduce", *WHOLE, folder=folder, stages="forked")
-    assert first.status == 0, first.errors
-    assert "whole/results.md" in first.output and "whole/figure-paper-strict.png" in first.output
-    return folder
-
-
-def test_a_reproduction_goes_from_nothing_to_its_figures_and_is_never_done_again(
-    shell: SimpleNamespace, reproduced: Path
+def test_a_reproduction_killed_and_resumed_equals_an_unbroken_one_and_is_never_done_again(
+    shell: SimpleNamespace, tmp_path: Path
 ) -> None:
-    home = reproduced / "whole"
-    made = contents(home)
+    process = shell.start_command("reproduce", *WHOLE, "output=home", folder=tmp_path, quiet=True)
+    home = tmp_path / "home"
+    while process.poll() is None and not (home / "train" / "mpc-0" / "metrics.csv").exists():
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    done = shell.run_command("reproduce", *WHOLE, "output=home", folder=tmp_path)
+    assert done.status == 0 and "home/results.md" in done.output, done.errors
     finished = {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
-    episodes = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
+    episodes = {path: path.read_bytes() for path in sorted(home.rglob("episodes.jsonl"))}
     assert len(finished) == 1 and len(episodes) == 3
-    cut = sorted(episodes)[0]
-    cut.write_bytes(episodes[cut][:-20])  # as a machine that lost its power leaves it
-    for name in RESULTS:
-        (home / name).unlink()
-    again = shell.run_command("reproduce", *WHOLE, folder=reproduced, stages="forked")
-    assert again.status == 0, again.errors
-    assert contents(home) == made
+    # Trained models with the same data, in a folder of its own, from nothing.
+    (tmp_path / "models").mkdir()
+    shutil.copy(home / "train" / "mpc-0" / "checkpoint.safetensors", tmp_path / "models" / "mpc-0.safetensors")
+    whole = shell.run_command("reproduce", *WHOLE, "models=models", "output=whole", folder=tmp_path)
+    assert whole.status == 0, whole.errors
+    assert not (tmp_path / "whole" / "train").exists() and contents(tmp_path / "whole") == contents(home)
+    # More episodes, and one whose line was cut off; the others stay.
+    cut = next(iter(episodes))
+    cut.write_bytes(episodes[cut][:-20])
+    more = shell.run_command("reproduce", *WHOLE, "bottom_episodes=2", "output=home", folder=tmp_path)
+    assert more.status == 0, more.errors
+    rows = [json.loads(line) for path in episodes for line in path.read_text().splitlines()]
+    assert len(rows) == len(read_table(home / "episodes.parquet")) == 3 + 1
+    known = [json.loads(text) for path, text in episodes.items() if path != cut]
+    assert all(one in rows for one in known)
     assert finished == {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
-    other = shell.run_command("reproduce", "scale=smoke", "output=whole", folder=reproduced)
+    other = shell.run_command("reproduce", "scale=smoke", "output=home", folder=tmp_path)
     assert other.status == 2 and "holds a run with" in other.complaints[0]
 
 
-@pytest.mark.soak
-def test_a_reproduction_grows_and_extends_a_table_and_takes_models_that_are_there(
-    shell: SimpleNamespace, reproduced: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(reproduced / "whole", tmp_path / "whole")
-    home, made = tmp_path / "whole", contents(tmp_path / "whole")
-    episodes = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
-    later = {"folder": tmp_path, "stages": "forked"}
-    more = shell.run_command("reproduce", *WHOLE, "bottom_episodes=2", **later)
-    assert more.status == 0, more.errors
-    longer = {path: path.read_bytes() for path in home.rglob("episodes.jsonl")}
-    assert all(longer[path].startswith(kept) for path, kept in episodes.items())
-    assert sum(text.count(b"\n") for text in longer.values()) == 3 + 1
-    *before, last = (run["command"].split()[-1] for run in json.loads((home / "provenance.json").read_text()))
-    assert {*before} == {"output=whole"} and last == "bottom_episodes=2"
-    models = tmp_path / "models"
-    models.mkdir()
-    shutil.copy(home / "train" / "mpc-0" / "checkpoint.safetensors", models / "mpc-0.safetensors")
-    trained = shell.run_command("reproduce", *WHOLE[:-1], "models=models", "output=trained", **later)
-    assert trained.status == 0, trained.errors
-    assert not (tmp_path / "trained" / "data").exists() and not (tmp_path / "trained" / "train").exists()
-    assert contents(tmp_path / "trained") == made
-    extended = ("models=models", "bottom_episodes=3", "extends=whole/episodes.parquet", "output=extended")
-    joined = shell.run_command("reproduce", *WHOLE[:-1], *extended, **later)
-    assert joined.status == 0, joined.errors
-    rows, known = (read_table(path / "episodes.parquet") for path in (tmp_path / "extended", home))
-    assert len(rows) == 5 and [row for row in rows if row in known] == known
-    run = [path.read_text().splitlines() for path in (tmp_path / "extended").rglob("episodes.jsonl")]
-    assert sum(map(len, run)) == 5 - 4  # the other four are those of the table, and were not run again
-    records = json.loads((tmp_path / "extended" / "provenance.json").read_text())
-    assert [one["command"].split()[-1] for one in records[-2:]] == ["bottom_episodes=2", "output=extended"]
-    strange = shell.run_command("reproduce", "scale=smoke", *extended[2:3], "output=strange", folder=tmp_path)
-    assert (
-        strange.status == 2
-        and "has scene 50000 of mpc in clearing, which no run with scale=smoke has" in (strange.complaints[0])
-    )
-    lacking = shell.run_command("reproduce", "scale=minimal", "models=models", "output=lacking", folder=tmp_path)
-    expected = "models=models holds no cavin-0.safetensors: choose other methods, or train it"
-    assert lacking.status == 2 and expected in lacking.complaints[0]
-
-
-@pytest.mark.soak  # here each stage starts with an interpreter of its own
-def test_a_reproduction_killed_three_times_equals_an_unbroken_one(shell: SimpleNamespace, tmp_path: Path) -> None:
-    whole = shell.run_command("reproduce", *TWO_METHODS, "workers=1", "output=whole", folder=tmp_path)
-    assert whole.status == 0, whole.errors
-    broken = (*TWO_METHODS, "output=broken")
-    reached = ("data/metadata.json", "train/cavin-0/metrics.csv", "evaluate/*/episodes.jsonl")
-    for pattern in reached:
-        process = shell.start_command("reproduce", *broken, folder=tmp_path, quiet=True)
-        while process.poll() is None and not any((tmp_path / "broken").glob(pattern)):
-            time.sleep(0.05)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        wait_for_orphans(tmp_path / "broken")
-    done = shell.run_command("reproduce", *broken, folder=tmp_path)
-    assert done.status == 0, done.errors
-    assert contents(tmp_path / "broken") == contents(tmp_path / "whole")
-
-
-def wait_for_orphans(home: Path) -> None:
-    """Processes of a killed run hold their folders until they end."""
-    for path in home.rglob(".lock"):
-        with FileLock(path):
-            pass
-
-
-def test_a_stage_that_another_process_writes_is_refused(tmp_path: Path) -> None:
-    stage = Stage("collect", ("transitions=1",), tmp_path / "data", "statistics.png", 1.0)
-    with output_folder(stage.folder), pytest.raises(UserError, match=r"failed: .*data is being written by process \d+"):
-        stage.run()
-
-
-class Sleeping(Stage):
-    """A command that sleeps, and ends otherwise only by a signal."""
-
-    @property
-    def line(self) -> str:
-        return f"python -c 'import time; time.sleep({self.seconds})'"
-
-
-def test_an_interruption_reaches_the_stages_that_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages, "POLLING_SECONDS", 0.2)
-
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
-    began = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        run_stages([Sleeping("", (), tmp_path / name, "never", 60.0) for name in "abc"], 2, interrupt)
-    assert time.monotonic() - began < 30
-    assert not (tmp_path / "c").exists()  # it had to wait, and does not begin
-
-
-class Failing(Stage):
-    """A command that fails at once."""
-
-    @property
-    def line(self) -> str:
-        return "python -c 'import sys; sys.exit(1)'"
-
-
-def test_an_interruption_after_a_failure_reaches_the_stages_that_run(
+def test_a_failed_stage_is_told_with_its_command_and_its_last_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stages, "POLLING_SECONDS", 0.2)
-    failed = tmp_path / "a" / "log.txt"
-    calls = []
-
-    def interrupt() -> None:
-        calls.append(failed.exists())
-        if len(calls) > 10:
-            raise KeyboardInterrupt
-
-    began = time.monotonic()
-    some = [
-        Failing("", (), tmp_path / "a", "never", 1.0),
-        *(Sleeping("", (), tmp_path / name, "never", 60.0) for name in "bc"),
-    ]
-    with pytest.raises(KeyboardInterrupt):
-        run_stages(some, 2, interrupt)
-    assert time.monotonic() - began < 30
-    assert not (tmp_path / "c").exists()  # it had to wait, and does not begin after a failure
+    monkeypatch.setattr(sys, "argv", [])
+    stage = Stage("train", ("data=nowhere", "trainer.steps=0"), tmp_path / "train")
+    expected = r"train data=nowhere trainer.steps=0 output=.* failed: trainer.steps must be at least 1.* \(.*log.txt\)"
+    with pytest.raises(UserError, match=expected):
+        run_stages([stage], 1)
 
 
-def test_a_failure_is_told_when_the_stages_that_run_have_ended(tmp_path: Path) -> None:
-    some = [Failing("", (), tmp_path / "a", "never", 1.0), Sleeping("", (), tmp_path / "b", "never", 0.5)]
-    some.append(Sleeping("", (), tmp_path / "c", "never", 60.0))
-    with pytest.raises(UserError, match=r"sys.exit\(1\)' failed"):
-        run_stages(some, 2, lambda: None)
-    assert not (tmp_path / "c").exists()
+def played() -> pd.DataFrame:
+    """The table of a minimal run, in which CAVIN succeeds and MPC runs out of time."""
+    rows = []
+    for cell in cells(SIZES["minimal"], ["cavin", "mpc"], ["paper"]):
+        outcome = "success" if cell.method == "cavin" else "timeout"
+        line = {"seed": cell.seed, "outcome": outcome, "steps": 2, "return": 97.5, "unsafe": 1, "ineffective": 0}
+        line |= {"plans": 2, "plans_reaching_goal": 1, "subgoal_distance": None, "planning_ms": [1.0]}
+        line |= {f"strict_{name}": line[name] for name in ("outcome", "steps", "return")}
+        rows.append(episode_row(cell, line))
+    return as_table(rows)
 
 
-def test_a_killed_stage_is_told_with_its_signal(tmp_path: Path) -> None:
-    def kill(process: subprocess.Popen[bytes]) -> None:
-        process.kill()
+def test_a_table_comes_back_as_it_was_and_has_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        write_table(tmp_path / name, played())
+    pd.testing.assert_frame_equal(read_table(tmp_path / "one"), played())
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+    for content in (b"no table", None):
+        (tmp_path / "one").unlink()
+        if content is not None:
+            (tmp_path / "one").write_bytes(content)
+        with pytest.raises(UserError, match="one is no table of episodes"):
+            read_table(tmp_path / "one")
 
-    with pytest.raises(WorkerError, match=r"sleep\(60.0\)' was killed by signal 9; rerun"):
-        Sleeping("", (), tmp_path / "a", "never", 60.0).run(kill)
+
+def test_a_table_is_drawn_as_far_as_the_options_choose() -> None:
+    table = pd.concat([played(), played().assign(method="contact")])
+    assert set(chosen_rows(table, compose("reproduce", "table=some.parquet"))["method"]) == {"cavin", "mpc"}
+    some = compose("reproduce", "methods=[contact]", "rewards=[sparse]", "objects=[1]")
+    assert chosen_rows(table, some)[["method", "reward", "objects"]].values.tolist() == [["contact", "sparse", 1]] * 2
+    with pytest.raises(UserError, match="table=some.parquet has no episode of these methods"):
+        chosen_rows(table, compose("reproduce", "table=some.parquet", "tasks=[crossing]"))
 
 
-def test_a_failed_stage_is_told_with_its_command_and_its_last_line(tmp_path: Path) -> None:
-    stage = Stage("train", ("data=nowhere", "trainer.steps=0"), tmp_path / "train", "training.png", 1.0)
-    expected = (
-        r"train data=nowhere trainer.steps=0 output=.* failed: trainer.steps must be at least 1, not 0 \(.*log.txt\)"
-    )
-    with pytest.raises(Exception, match=expected):
-        run_stages([stage], 1, lambda: None)
-    shutil.rmtree(stage.folder)
+def test_figures_and_page_follow_from_the_table_and_have_the_same_bytes(tmp_path: Path) -> None:
+    written = []
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        made = write_results(tmp_path / name, played(), "the command")
+        written.append({path.name: path.read_bytes() for path in made})
+    assert written[0] == written[1]
+    pictures = {f"figure-paper-{one}.png" for one in ("strict", "published")}
+    assert set(written[0]) == {"results.md", "statistics.json", *pictures}
+    page = written[0]["results.md"].decode()
+    assert "| clearing | sparse | 1 | 100.0 % (20.7 to 100.0), n = 1 | 0.0 % (0.0 to 79.3), n = 1, p = 1 |" in page
+    assert "| clearing, sparse: CAVIN leads MPC | second best: 20.1 | +100.0 (-" in page and "    the command" in page
+    statistics = json.loads(written[0]["statistics.json"])
+    assert set(statistics) == {"rates", "tests"} and len(statistics["tests"]) == 2 * 3
+
+
+@pytest.mark.parametrize("only", [{"reward": "sparse"}, {"reward": "dense"}, {"objects": 1}, {"method": "mpc"}])
+def test_a_part_of_a_table_has_its_figures(only: dict[str, object], tmp_path: Path) -> None:
+    table = played()
+    for name, value in only.items():
+        table = table[table[name] == value]
+    assert all(path.stat().st_size for path in write_results(tmp_path, table, "the command"))
+
+
+def test_a_refused_command_leaves_no_folder_and_a_table_alone_is_drawn(shell: SimpleNamespace, tmp_path: Path) -> None:
+    write_table(tmp_path / "some.parquet", played())
+    for option in ("models=nowhere", "table=absent.parquet", "planners=[]"):
+        refused = shell.run_command("reproduce", "scale=minimal", option, "output=drawn", folder=tmp_path)
+        assert refused.status == 2 and len(refused.complaints) == 1
+        assert not (tmp_path / "drawn").exists()
+    drawn = shell.run_command("reproduce", "table=some.parquet", "output=drawn", folder=tmp_path)
+    assert drawn.status == 0, drawn.errors
+    assert "python -m cavin_pyro.reproduce table=some.parquet" in (tmp_path / "drawn" / "results.md").read_text()

@@ -11,17 +11,15 @@ TOP_ROW_OBJECTS = 3  # objects in the top row of the paper's figure, dense and s
 
 
 @dataclass(frozen=True)
-class Scale:
+class Size:
     """Numbers of a reproduction.
 
     Attributes:
         transitions: pushes to collect, for all methods alike. training_seeds: trainings of each method.
-        episodes: per cell of the top row. bottom_episodes: per cell of the bottom row, and of the variants of
-            `cavin_pyro.reproduction.cells.VARIANTS`. Both are shared by the training seeds; each of them gets scenes of
-            its own, which are the same for all methods.
+        episodes: per cell of the top row. bottom_episodes: per cell of the bottom row. Both are shared by the training
+            seeds; each of them gets scenes of its own, which are the same for all methods.
         first_scene: seed of the first scene; no other run uses these scenes. The training seed at place i has those
             from first_scene + 1000 i on.
-        episode_seconds, training_seconds: what an episode and a training cost on one core, roughly, for the time left.
         collection, pretraining, training, planning: further overrides of `collect`, `pretrain`, `train` and `evaluate`.
     """
 
@@ -30,8 +28,6 @@ class Scale:
     episodes: int
     bottom_episodes: int
     first_scene: int
-    episode_seconds: float
-    training_seconds: float
     tasks: tuple[str, ...] = TASKS
     object_counts: tuple[int, ...] = OBJECT_COUNTS
     rewards: tuple[str, ...] = REWARDS
@@ -60,16 +56,14 @@ QUICK_TRAINING = (
     "prior=conditional",
 )
 
-SCALES: dict[str, Scale] = {
+SIZES: dict[str, Size] = {
     # For tests: every stage once, in a minute.
-    "minimal": Scale(
+    "minimal": Size(
         transitions=100,
         training_seeds=(0,),
         episodes=1,
         bottom_episodes=1,
         first_scene=50_000,
-        episode_seconds=0.5,
-        training_seconds=5.0,
         tasks=("clearing",),
         object_counts=(1, 3),
         collection=("episodes_per_shard=5",),
@@ -78,49 +72,41 @@ SCALES: dict[str, Scale] = {
         planning=("planner.samples=8", "planner.horizon=6", "maximum_steps=2"),
     ),
     # To see that everything runs: minutes. Its success rates mean nothing.
-    "smoke": Scale(
+    "smoke": Size(
         transitions=400,
         training_seeds=(0,),
         episodes=2,
         bottom_episodes=1,
         first_scene=51_000,
-        episode_seconds=1.0,
-        training_seconds=10.0,
         collection=("episodes_per_shard=10",),
         pretraining=("clouds=1000", "steps=50", "batch_size=32"),
         training=TINY_TRAINING,
         planning=("planner.samples=32", "planner.horizon=6", "maximum_steps=3"),
     ),
-    "small": Scale(
+    "small": Size(
         transitions=20_000,
         training_seeds=(0, 1),
         episodes=10,
         bottom_episodes=4,
         first_scene=60_000,
-        episode_seconds=5.0,
-        training_seconds=180.0,
         pretraining=("clouds=20000", "steps=2000"),
         training=(*QUICK_TRAINING, "trainer.steps=4000"),
     ),
     # What two cores do in half a day, with trainings long enough to compare the methods.
-    "medium": Scale(
+    "medium": Size(
         transitions=200_000,
         training_seeds=(0, 1, 2),
         episodes=60,
         bottom_episodes=30,
         first_scene=90_000,
-        episode_seconds=2.5,
-        training_seconds=1_000.0,
         training=(*QUICK_TRAINING, "trainer.steps=36000"),
     ),
-    "paper": Scale(
+    "paper": Size(
         transitions=500_000,
         training_seeds=(0, 1, 2),
         episodes=1_000,
         bottom_episodes=300,
         first_scene=100_000,
-        episode_seconds=5.0,
-        training_seconds=15_000.0,
         training=("prior=conditional",),
     ),
 }
