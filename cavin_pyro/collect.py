@@ -17,9 +17,8 @@ def main(config: DictConfig) -> None:
     """
     from cavin_pyro.config.commands.collection import CollectionOptions
     from cavin_pyro.config.errors import UserError
-    from cavin_pyro.data.collection import check_policy, collect, repair
+    from cavin_pyro.data.collection import check_policy, collect, collecting_world, repair
     from cavin_pyro.data.summary import summarize_data
-    from cavin_pyro.data.world import collecting_world
     from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.visualization.data_summary import draw_data

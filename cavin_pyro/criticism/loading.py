@@ -16,9 +16,8 @@ from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.training_data import compare_data
-from cavin_pyro.data.collection import CollectionConfig
+from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.windows import WindowTable, load_windows
-from cavin_pyro.data.world import collecting_world
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import file_digest

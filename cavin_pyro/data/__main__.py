@@ -19,21 +19,21 @@ def _run() -> None:
     arguments = _parser().parse_args()
     folders = [Path(folder) for folder in arguments.folders]
     if arguments.action == "info":
-        from cavin_pyro.data.maintenance.info import describe
+        from cavin_pyro.data.maintenance import describe
 
         print("\n\n".join(describe(folder) for folder in folders))
     elif arguments.action == "verify":
-        from cavin_pyro.data.maintenance.verify import verify
+        from cavin_pyro.data.maintenance import verify
 
         for folder in folders:
             verify(folder)
     elif arguments.action == "merge":
-        from cavin_pyro.data.maintenance.merge import merge
+        from cavin_pyro.data.maintenance import merge
 
         metadata = merge(folders, arguments.to)
         print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
     else:
-        from cavin_pyro.data.maintenance.export import export
+        from cavin_pyro.data.export import export
 
         print(f"{export(folders[0], arguments.to)} episodes in {arguments.to}")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import time
 from collections.abc import Generator, Iterable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
@@ -13,27 +12,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from omegaconf import DictConfig
 
 from cavin_pyro import __version__
 from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptions
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.own_parts import camera_of, object_set_of, segmentation_of
+from cavin_pyro.config.own_parts import camera_of, object_set_of, own_class, plain, segmentation_of
+from cavin_pyro.config.world import check_world, object_ranges
 from cavin_pyro.data.dataset import (
+    ARRAYS,
+    COUNTS,
     Arrays,
     CorruptShardError,
-    EmptyDatasetError,
     read_metadata,
     read_shard,
     shard_path,
     write_metadata,
     write_shard,
 )
-from cavin_pyro.data.features import delete_features
 from cavin_pyro.data.model_policy import ModelPushingPolicy, PushingPolicy, load_pusher
 from cavin_pyro.launching.launcher import Launcher, as_launcher
 from cavin_pyro.storage.checkpoint import find_checkpoint
-from cavin_pyro.storage.files import atomic_write, file_digest
+from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.progress import progress_bar
 from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from envs.observation import Observation
@@ -44,8 +45,6 @@ from envs.workspace import POINTS_PER_OBJECT, object_slots
 from models.model import Model
 from models.networks.geometry import Geometry
 
-TIMING_FILE = "timing.csv"
-TIMING_HEADER = "shard,transitions,cpu_s,physics_s,rendering_s,segmentation_s,points_s\n"
 PUSHER = "contact"  # the checkpoint of policy=model, without another
 OPTIONS_OF_POLICIES = {"model": ("checkpoint", "motions"), "heuristic": ("intent_length", "perturbation_rate")}
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
@@ -68,6 +67,27 @@ class CollectionConfig(CollectionOptions):
     segmentation: Any = WorldConfig.segmentation
 
 
+def collecting_world(env: DictConfig) -> CollectionConfig:
+    """The configuration of a collection in the world of `env.*`, with default options.
+
+    Raises:
+        UserError: as `check_world` and `object_ranges`, or another robot than the stick.
+    """
+    check_world(env)
+    if env.robot != WorldConfig.robot:
+        robot = own_class(env.robot)
+        raise UserError(
+            f"random pushes are made with env.robot=stick, not {robot}: its pushes are equivalent and faster"
+        )
+    return CollectionConfig(
+        ranges=object_ranges(env),
+        object_set=plain(env.objects),
+        assets=env.assets,
+        camera=plain(env.camera),
+        segmentation=plain(env.segmentation),
+    )
+
+
 def collect(
     config: CollectionConfig,
     folder: Path,
@@ -88,27 +108,22 @@ def collect(
 
     Raises:
         UserError: the folder holds a dataset of another configuration.
-        WorkerError: a worker was killed or stopped.
+        WorkerError: a worker was killed.
     """
     metadata = _begin(config, folder)
-    if metadata["shards"] == 0:
-        delete_features(folder)  # of an earlier dataset in this folder
-    _cut_times(folder, metadata["shards"])
-    with progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar:
-        if metadata["transitions"] >= transitions:
-            return metadata
-        with closing(_shards(config, itertools.count(metadata["shards"]), workers=workers)) as shards:
-            for arrays, seconds in shards:
-                write_shard(shard_path(folder, metadata["shards"]), arrays)
-                made = int(arrays["length"].sum())
-                metadata["shards"] += 1
-                metadata["episodes"] += len(arrays["length"])
-                metadata["transitions"] += made
-                _log_time(folder, metadata["shards"] - 1, made, seconds)  # first: what does not count yet is cut off
-                _write(folder, metadata)
-                bar.update(made)
-                if metadata["transitions"] >= transitions:
-                    break
+    with (
+        progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar,
+        closing(_shards(config, itertools.count(metadata["shards"]), workers=workers)) as shards,
+    ):
+        while metadata["transitions"] < transitions:
+            arrays = next(shards)
+            write_shard(shard_path(folder, metadata["shards"]), arrays)
+            made = int(arrays["length"].sum())
+            metadata["shards"] += 1
+            metadata["episodes"] += len(arrays["length"])
+            metadata["transitions"] += made
+            write_metadata(folder, metadata)
+            bar.update(made)
     return metadata
 
 
@@ -168,20 +183,11 @@ def clutter_area(generator: np.random.Generator) -> Area:
 
 
 def _blank(config: CollectionConfig, scene: Scene) -> Arrays:
-    steps, objects = config.steps, scene.slots
-    arrays: Arrays = {
-        "centers": np.zeros((steps + 1, objects, 3), np.float32),
-        "clouds": np.zeros((steps + 1, objects, POINTS_PER_OBJECT, 3), np.float16),
-        "visible": np.zeros((steps + 1, objects), np.bool_),
-        "mask": np.zeros(objects, np.bool_),
-        "actions": np.zeros((steps, 4), np.float32),
-        "moved": np.zeros((steps, objects), np.float32),
-        **{name: np.zeros(steps, np.bool_) for name in ("unsafe", "ineffective", "fallen")},
-        "target": np.zeros(steps, np.int8),
-        "angle": np.zeros(steps, np.float32),
-        "shape": np.full(objects, -1, np.int8),
-        **{name: np.zeros(objects, np.float32) for name in ("scale", "mass", "friction")},
-    }
+    sizes = {"S": config.steps, "S+1": config.steps + 1, "M": scene.slots, "P": POINTS_PER_OBJECT}
+    arrays: Arrays = {}
+    for name, declared in ARRAYS.items():
+        shape = [one if isinstance(one, int) else sizes[one] for one in declared.dimensions[1:]]  # without E
+        arrays[name] = np.full(shape, declared.padding, declared.dtype)
     for slot, one in enumerate(scene.objects):
         arrays["shape"][slot] = scene.object_set.names.index(one.name)
         for name in ("scale", "mass", "friction"):
@@ -230,21 +236,18 @@ def _pusher(checkpoint: str) -> tuple[Model, Geometry]:
     return load_pusher(checkpoint)
 
 
-def _collect_shard(job: tuple[CollectionConfig, int]) -> tuple[Arrays, dict[str, float]]:
+def _collect_shard(job: tuple[CollectionConfig, int]) -> Arrays:
     config, shard = job
     parts = ("object_set", "assets", "camera", "segmentation", "maximum_objects")
     scene = _scene(json.dumps({name: getattr(config, name) for name in parts}))
-    began = time.process_time()
-    scene.seconds = dict.fromkeys(scene.seconds, 0.0)
     first = shard * config.episodes_per_shard
     episodes = [collect_episode(scene, config, episode) for episode in range(first, first + config.episodes_per_shard)]
-    arrays = {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
-    return arrays, {"cpu": time.process_time() - began, **scene.seconds}
+    return {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
 
 
 def _shards(
     config: CollectionConfig, numbers: Iterable[int], *, workers: int | Launcher
-) -> Generator[tuple[Arrays, dict[str, float]], None, None]:
+) -> Generator[Arrays, None, None]:
     """The shards with these numbers, in their order."""
     launcher = as_launcher(workers)
     if launcher.here:
@@ -256,32 +259,24 @@ def _shards(
 
 def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
     """Metadata of the dataset so far, checked against the requested configuration."""
-    wanted, usual = (_plain(asdict(one)) for one in (config, CollectionConfig()))
-    del wanted["assets"], usual["assets"]
+    wanted = json.loads(json.dumps(asdict(config)))  # with lists in place of tuples, as it is stored
+    del wanted["assets"]
     wanted["checkpoint"] = _digest(config)
     if not (folder / "metadata.json").exists():
-        metadata = {
+        return {
             "configuration": wanted,
             "shape_names": list(object_set_of(config.object_set, config.assets).names),
             "made_by": f"cavin_pyro {__version__}",
-            "shards": 0,
-            "episodes": 0,
-            "transitions": 0,
+            **dict.fromkeys(COUNTS, 0),
         }
-        return metadata
-    try:
-        metadata = read_metadata(folder)
-    except EmptyDatasetError:
-        (folder / "metadata.json").unlink()
-        return _begin(config, folder)
+    metadata = read_metadata(folder)
     if "sources" in metadata:
         raise UserError(f"{folder} holds a merged dataset, which cannot grow: choose another output=DIR")
-    stored = usual | metadata["configuration"]  # older versions lack later options
-    stored["ranges"] = usual["ranges"] | (stored["ranges"] or {})
+    stored = metadata["configuration"]
     for name, value in wanted.items():
-        if stored[name] != value:
+        if stored.get(name) != value:
             raise UserError(
-                f"{folder} holds a dataset with {name}={stored[name]}, not {value}: "
+                f"{folder} holds a dataset with {name}={stored.get(name)}, not {value}: "
                 "resume with the same options, or choose another output=DIR"
             )
     return metadata
@@ -292,39 +287,6 @@ def _digest(config: CollectionConfig) -> str | None:
     if config.policy != "model":
         return None
     return file_digest(find_checkpoint(config.checkpoint or PUSHER))
-
-
-def _write(folder: Path, metadata: dict[str, Any]) -> None:
-    write_metadata(folder, {name: value for name, value in metadata.items() if name not in ("format", "version")})
-
-
-def _log_time(folder: Path, shard: int, transitions: int, seconds: dict[str, float]) -> None:
-    """Log the CPU time of each shard, outside of the data, which must not depend on the machine's speed."""
-    path = folder / TIMING_FILE
-    header = "" if path.exists() else TIMING_HEADER
-    row = ",".join(f"{seconds[name]:.3f}" for name in ("cpu", "physics", "rendering", "segmentation", "points"))
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(f"{header}{shard},{transitions},{row}\n")
-
-
-def _cut_times(folder: Path, shards: int) -> None:
-    """Keep the logged times of the shards that count: a killed run may have logged another, or half of a line."""
-    path = folder / TIMING_FILE
-    if not path.exists():
-        return
-    logged = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-    counted = {str(number) for number in range(shards)}
-    kept = [line for line in logged[1:] if line.endswith("\n") and line.partition(",")[0] in counted]
-    if [TIMING_HEADER, *kept] != logged:
-        with atomic_write(path) as temporary:
-            temporary.write_text("".join([TIMING_HEADER, *kept]), encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists, so that configurations compare equal after a round trip through JSON."""
-    if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
-    return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
 def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 1) -> int:
@@ -341,9 +303,9 @@ def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 
         try:
             read_shard(shard_path(folder, number), metadata=metadata)
         except CorruptShardError as error:
-            print(f"collecting again: {error.defect}", flush=True)
+            print(f"collecting again: {error.args[0]}", flush=True)
             damaged.append(number)
     with closing(_shards(config, damaged, workers=workers)) as shards:
-        for number, (arrays, _) in zip(damaged, shards, strict=True):
+        for number, arrays in zip(damaged, shards, strict=True):
             write_shard(shard_path(folder, number), arrays)
     return len(damaged)

@@ -1,20 +1,24 @@
 """Collected episodes on disk: a folder of HDF5 files, one per shard of episodes, and a metadata file.
 
 A shard is written under a temporary name and then renamed, so each file is whole or absent; HDF5's Fletcher-32
-checksums find a shard that was damaged later. Letters: E episodes, S pushes, M objects (padded).
+checksums find a shard that was damaged later. Letters: E episodes, S pushes, M objects (padded), P points.
 
-    centers [E, S+1, M, 3] metres       clouds [E, S+1, M, 256, 3] metres from the centre, half precision
+    centers [E, S+1, M, 3] metres       clouds [E, S+1, M, P, 3] metres from the centre, half precision
     visible [E, S+1, M]                 mask [E, M]
     actions [E, S, 4] normalised        moved [E, S, M] metres, from the simulator
     unsafe, ineffective, fallen [E, S]  length [E] pushes made; what follows is padding
     target [E, S], angle [E, S]         the policy's intent (radians)
     shape, scale, mass, friction [E, M] object parameters; shape indexes `shape_names` in the metadata
     episode [E]                         number of the episode, which with the root seed makes its seed
+
+A merged dataset has the shards of several collections one after another. What these have in common is in
+`configuration`; what each has for itself, its seed above all, is in its entry of `sources`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,47 +27,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.declaration import check_file, check_values
-from cavin_pyro.data.sources import check_sources, has_possible_objects, source_of_shards, sources_of
 from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write_json
-from envs.workspace import MAXIMUM_OBJECTS
+from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, object_slots
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
-
-COLLECT_AGAIN = "collect it again, with the same options and repair=true"
-MOST_LOST = 1000  # files; each that is missing is named when the rest is used
+COUNTS = ("shards", "episodes", "transitions")
+FARTHEST = 100.0  # metres; the table ends before 1
+LARGEST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, "F": 4096}  # of each dimension
 
 Arrays = dict[str, NDArray[Any]]
 
 
-class EmptyDatasetError(UserError):
-    """A dataset that holds no episode, which collect begins again."""
+@dataclass(frozen=True)
+class Declared:
+    """An array: its type, its dimensions (E episodes, S pushes, S+1 states, M objects, P points), and its range.
+
+    `padding`: its value where there is no object.
+    """
+
+    dtype: str
+    dimensions: tuple[str | int, ...]
+    low: float = -FARTHEST
+    high: float = FARTHEST
+    padding: int = 0
+
+
+OBJECTS, PUSHES, STATES = ("E", "M"), ("E", "S"), ("E", "S+1", "M")
+ARRAYS = {
+    "centers": Declared("float32", (*STATES, 3)),
+    "clouds": Declared("float16", (*STATES, "P", 3)),
+    "visible": Declared("bool", STATES),
+    "mask": Declared("bool", OBJECTS),
+    "actions": Declared("float32", (*PUSHES, 4), -1.0, 1.0),
+    "moved": Declared("float32", (*PUSHES, "M"), 0.0),
+    **{name: Declared("bool", PUSHES) for name in ("unsafe", "ineffective", "fallen")},
+    "length": Declared("int64", ("E",), 0),
+    "target": Declared("int8", PUSHES, -1),
+    "angle": Declared("float32", PUSHES),
+    "shape": Declared("int8", OBJECTS, -1, 127, padding=-1),
+    "scale": Declared("float32", OBJECTS, 0.0),
+    "mass": Declared("float32", OBJECTS, 0.0),
+    "friction": Declared("float32", OBJECTS, 0.0),
+    "episode": Declared("int64", ("E",), 0, float("inf")),
+}
+FEATURES = {  # of files beside the shards, see `cavin_pyro.data.features`
+    "features": Declared("float32", (*STATES, "F"), -2.0, 2.0),
+    "shard_digest": Declared("uint8", (32,), 0, 255),
+}
+DECLARED = ARRAYS | FEATURES
 
 
 class CorruptShardError(UserError):
-    """A shard that is missing or corrupt.
+    """A shard that is missing or corrupt; `args[0]` says so without what to do about it."""
 
-    Attributes:
-        defect: the same line without what to do about it, for commands that are doing that.
-    """
-
-    defect: str
-
-    @classmethod
-    def of(cls, path: Path, said: str, *, merged: bool = False) -> CorruptShardError:
-        """The error about one shard. merged: its dataset, which collect refuses to repair, was made of others."""
-        defect = f"shard {path} is missing or corrupt ({said})"
-        advice = (
-            "merge the datasets again of which it was made"
-            if merged
-            else f"collect it again with python -m cavin_pyro.collect output={path.parent} repair=true and the other "
-            "options of that collection"
+    def __str__(self) -> str:
+        return (
+            f"{self.args[0]}: run its python -m cavin_pyro.collect again with repair=true, or merge again what was "
+            "merged, or train on the rest with skip_corrupt=true"
         )
-        # Not in a constructor of its own, with which an error could not leave the process that raised it.
-        error = cls(f"{defect}: {advice}, or train on the rest with skip_corrupt=true")
-        error.defect = defect
-        return error
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -73,47 +95,102 @@ def shard_path(folder: Path, number: int) -> Path:
 
 def write_shard(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write one shard atomically; equal arrays give equal bytes."""
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(_shard_bytes(arrays))
-
-
-def _shard_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    stored = {"chunks": True, "compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
     # Built in memory, because HDF5 raises errors of its own on a full disk.
     with h5py.File("shard", "w", libver="v110", driver="core", backing_store=False) as file:
         for name in sorted(arrays):
-            file.create_dataset(
-                name,
-                data=arrays[name],
-                chunks=True,
-                compression="gzip",
-                compression_opts=1,
-                shuffle=True,
-                fletcher32=True,
-            )
+            file.create_dataset(name, data=arrays[name], **stored)
         file.flush()
-        return file.id.get_file_image()
+        content = file.id.get_file_image()
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
 
 
-def read_shard(
-    path: Path, names: tuple[str, ...] | None = None, *, metadata: Mapping[str, Any] | None = None
-) -> Arrays:
-    """Read one shard, or some of its arrays; types, shapes and ranges are checked (`cavin_pyro.data.declaration`).
+def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapping[str, Any] | None = None) -> Arrays:
+    """Read one shard, or some of its arrays; types, shapes and ranges are checked.
 
     Args:
-        metadata: of the dataset, with which the numbers of episodes and of pushes must agree.
+        metadata: of the dataset, with which the numbers of episodes, pushes and objects must agree.
 
     Raises:
         CorruptShardError: the file is missing, truncated, damaged or not a shard; it is named.
     """
-    configuration = (metadata or {}).get("configuration", {})
     try:
         with h5py.File(path, "r") as file:
-            check_file(file, configuration)
+            check_file(file, (metadata or {}).get("configuration", {}))
             arrays = {name: file[name][()] for name in (names or sorted(file))}
         check_values(arrays)
         return arrays
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise CorruptShardError.of(path, str(error).splitlines()[0], merged="sources" in (metadata or {})) from error
+        raise CorruptShardError(f"shard {path} is missing or corrupt ({str(error).splitlines()[0]})") from error
+
+
+def check_file(file: h5py.File, configuration: Mapping[str, Any]) -> None:
+    """Check types and shapes of all declared arrays of a file, before any is read.
+
+    Args:
+        configuration: of the collection, which tells E, S and M. What it lacks, the arrays must agree on.
+
+    Raises:
+        ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
+    """
+    options = {"E": "episodes_per_shard", "S": "steps", "M": "maximum_objects"}
+    sizes = {name: configuration[option] for name, option in options.items() if option in configuration}
+    if "M" in sizes:
+        sizes["M"] = object_slots(sizes["M"])
+    for name in sorted(file, key=lambda one: list(DECLARED).index(one) if one in DECLARED else -1):
+        array = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+        if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external:
+            raise ValueError(f"{name} is no array in this file")
+        if name in DECLARED:
+            _check_shape(name, array, sizes)
+
+
+def _check_shape(name: str, array: h5py.Dataset, sizes: dict[str, int]) -> None:
+    declared = DECLARED[name]
+    if array.dtype != np.dtype(declared.dtype):
+        raise ValueError(f"{name} has type {array.dtype}, not {declared.dtype}")
+    if len(array.shape) == len(declared.dimensions):
+        for dimension, size in zip(declared.dimensions, array.shape, strict=True):
+            if dimension == "S+1":
+                sizes.setdefault("S", size - 1)
+            elif isinstance(dimension, str):
+                sizes.setdefault(dimension, size)
+    known = sizes | ({"S+1": sizes["S"] + 1} if "S" in sizes else {})
+    wanted = [known.get(one, one) if isinstance(one, str) else one for one in declared.dimensions]
+    if list(array.shape) != wanted or any(size > LARGEST[one] for one, size in sizes.items()):
+        raise ValueError(f"{name} has shape {list(array.shape)}, not {wanted}")
+
+
+def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Check that the values of declared arrays are finite and within their ranges.
+
+    Raises:
+        ValueError: some are not.
+    """
+    for name, array in arrays.items():
+        declared = DECLARED.get(name)
+        if declared is None or array.dtype == np.bool_ or array.size == 0:
+            continue
+        low, high = array.min(), array.max()  # NaN if any is
+        if not (declared.low <= low and high <= declared.high):
+            raise ValueError(f"{name} has values outside of {declared.low:g} to {declared.high:g}: {low:g} to {high:g}")
+
+
+def padded(arrays: Mapping[str, NDArray[Any]], objects: int) -> Arrays:
+    """Declared arrays of a shard with room for M = `objects`.
+
+    Raises:
+        UserError: one has room for more.
+    """
+    wider = {}
+    for name, array in arrays.items():
+        sizes = zip(DECLARED[name].dimensions, array.shape, strict=True)
+        ends = [(0, objects - size if dimension == "M" else 0) for dimension, size in sizes]
+        if np.min(ends) < 0:
+            raise UserError(f"{name} has room for more than {objects} objects, of which the metadata tell: verify it")
+        wider[name] = np.pad(array, ends, constant_values=DECLARED[name].padding) if np.any(ends) else array
+    return wider
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:
@@ -126,18 +203,9 @@ def read_metadata(folder: Path) -> dict[str, Any]:
 
     Raises:
         UserError: there is no dataset, or it has another format or version, or it is damaged or cannot be read.
-        EmptyDatasetError: it holds no episode.
     """
     path = folder / "metadata.json"
-    try:
-        is_file, is_dataset = folder.is_file(), path.exists()
-    except OSError as error:  # a name that is too long, or a folder that may not be looked into
-        raise UserError(
-            f"dataset {folder} cannot be read: {error.strerror}: give a folder that collect wrote"
-        ) from error
-    if is_file:
-        raise UserError(f"no dataset in {folder}, which is a file: give the folder that collect has written")
-    if not is_dataset:
+    if not path.exists():
         raise UserError(
             f"no dataset in {folder}: make one with python -m cavin_pyro.collect transitions=100000 output={folder}"
         )
@@ -149,46 +217,76 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             f"dataset {folder} has format version {metadata.get('version')}, this program reads {FORMAT_VERSION}: "
             "collect it again"
         )
-    counts = [metadata.get(name) for name in ("shards", "episodes", "transitions")]
-    if not all(type(count) is int for count in counts) or not isinstance(metadata.get("configuration"), dict):
-        raise UserError(f"{path} is damaged: configuration or counts are missing; collect the dataset again")
-    if metadata["shards"] < 1:
-        raise EmptyDatasetError(
-            f"dataset {folder} is empty: collect it again with python -m cavin_pyro.collect output={folder}"
-        )
-    _check_forms(path, metadata)
-    _check_counts(path, metadata)
-    check_sources(path, metadata)
+    try:
+        _check_metadata(metadata, files=sum(1 for _ in folder.glob("episodes-*.h5")))
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {error}; collect the dataset again, or merge it again") from error
     return metadata
 
 
-def _check_forms(path: Path, metadata: Mapping[str, Any]) -> None:
-    """Check what is looked into without being counted; older datasets lack some of it."""
-    if not isinstance(metadata["configuration"].get("ranges") or {}, dict):
-        raise UserError(f"{path} is damaged: ranges must be a table; collect the dataset again")
+def _check_metadata(metadata: Mapping[str, Any], *, files: int) -> None:
+    _check_collection(metadata)
     names = metadata.get("shape_names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{path} is damaged: shape_names must be a list of names; collect the dataset again")
-
-
-def _check_counts(path: Path, metadata: Mapping[str, Any]) -> None:
-    """Check that a dataset's counts agree with one another and with the files that are there."""
+        raise ValueError("shape_names must be a list of names")
     configuration = metadata["configuration"]
-    steps, each = configuration.get("steps"), configuration.get("episodes_per_shard", 1)
-    if not all(type(size) is int and size >= 1 for size in (steps, each)):
-        raise UserError(f"{path} is damaged: steps and episodes_per_shard must be whole numbers; collect it again")
-    if not has_possible_objects(configuration):
-        raise UserError(f"{path} is damaged: maximum_objects must be from 1 to {MAXIMUM_OBJECTS}; collect it again")
-    shards, episodes, transitions = (metadata[name] for name in ("shards", "episodes", "transitions"))
-    wrong = "episodes_per_shard" in configuration and episodes != shards * each
-    if wrong or not 0 <= transitions <= episodes * steps:
-        raise UserError(
-            f"{path} is damaged: {shards} files have not {episodes} episodes with {transitions} pushes; "
-            "collect the dataset again"
-        )
-    there = sum(1 for _ in path.parent.glob("episodes-*.h5"))
-    if shards > there + MOST_LOST:
-        raise UserError(f"{path} counts {shards} files of episodes, but {there} are there: collect the dataset again")
+    if not isinstance(configuration.get("ranges") or {}, dict):
+        raise ValueError("ranges must be a table")
+    shards, episodes, transitions = (metadata[name] for name in COUNTS)
+    each = configuration.get("episodes_per_shard")
+    if (each and episodes != shards * each) or transitions > episodes * configuration["steps"]:
+        raise ValueError(f"{shards} files have not {episodes} episodes with {transitions} pushes")
+    if shards > files + 1000:  # fewer that are missing are named one by one when the rest is used
+        raise ValueError(f"it counts {shards} files of episodes, but {files} are there")
+    sources = metadata.get("sources", [metadata])
+    if not isinstance(sources, list) or not sources:
+        raise ValueError("its sources must be a list of collections")
+    for source in sources:
+        _check_collection(source)
+        if type(source["configuration"].get("seed")) is not int:
+            raise ValueError("seed must be a whole number")
+    if "sources" in metadata:
+        totals = [sum(source[name] for source in sources) for name in COUNTS]
+        if totals != [shards, episodes, transitions] or len({seed_of(source) for source in sources}) < len(sources):
+            raise ValueError("its sources do not add up to the dataset")
+
+
+def _check_collection(metadata: Any) -> None:
+    """Check the counts of a dataset or of one of its sources, and what of its configuration is counted with."""
+    configuration = metadata.get("configuration") if isinstance(metadata, dict) else None
+    if not isinstance(configuration, dict) or not all(map(_is_count, (metadata.get(name) for name in COUNTS))):
+        raise ValueError("configuration or counts are missing")
+    usual = {"steps": None, "episodes_per_shard": 1, "maximum_objects": 1}
+    sizes: dict[str, Any] = {name: configuration.get(name, value) for name, value in usual.items()}
+    if not all(map(_is_count, sizes.values())) or sizes["maximum_objects"] > MAXIMUM_OBJECTS:
+        raise ValueError(f"{', '.join(sizes)} must be whole numbers, the last {MAXIMUM_OBJECTS} at most")
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 1
+
+
+def sources_of(metadata: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The collections in a dataset, each with `configuration`, `made_by`, `shards`, `episodes` and `transitions`."""
+    if "sources" in metadata:
+        return list(metadata["sources"])
+    return [{name: metadata.get(name) for name in ("configuration", "made_by", *COUNTS)}]
+
+
+def source_of_shards(metadata: Mapping[str, Any]) -> list[int]:
+    """For every shard of a dataset, the number of the collection that it is from."""
+    return [number for number, source in enumerate(sources_of(metadata)) for _ in range(source["shards"])]
+
+
+def seed_of(source: Mapping[str, Any]) -> int:
+    """The root seed of a collection."""
+    return source["configuration"]["seed"]
+
+
+def slots_of(metadata: Mapping[str, Any]) -> int:
+    """M, for how many objects the files of a dataset have room; of a merged one, the widest."""
+    most = (source["configuration"].get("maximum_objects", OBJECT_SLOTS) for source in sources_of(metadata))
+    return max(map(object_slots, most))
 
 
 def content_records(folder: Path) -> list[dict[str, Any]]:
@@ -200,28 +298,25 @@ def content_records(folder: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: no dataset, or one of these shards cannot be read.
     """
-    metadata, first, records = read_metadata(folder), 0, []
-    for source in sources_of(metadata):
+    first, records = 0, []
+    for source in sources_of(read_metadata(folder)):
+        fingerprint = shard_digest(shard_path(folder, first))[:12]
         names = ("transitions", "episodes", "configuration", "made_by")
-        records.append({**{name: source[name] for name in names}, "fingerprint": _fingerprint(folder, first)})
+        records.append({**{name: source[name] for name in names}, "fingerprint": fingerprint})
         first += source["shards"]
     return records
-
-
-def _fingerprint(folder: Path, shard: int) -> str:
-    return shard_digest(shard_path(folder, shard))[:12]
 
 
 def shard_digest(path: Path) -> str:
     """The SHA-256 of a shard's bytes: hexadecimal digits. It takes 3 ms for 2 MB.
 
     Raises:
-        UserError: the file cannot be read.
+        CorruptShardError: the file cannot be read.
     """
     try:
         return file_digest(path)
     except OSError as error:
-        raise UserError(f"shard {path} cannot be read ({error.strerror}): collect it again") from error
+        raise CorruptShardError(f"shard {path} is missing or corrupt ({error.strerror})") from error
 
 
 def check_distinct(folders: Sequence[Path]) -> None:
@@ -232,67 +327,47 @@ def check_distinct(folders: Sequence[Path]) -> None:
     """
     known: dict[str, Path] = {}
     for folder in folders:
-        metadata, first = read_metadata(folder), 0  # tells whether there is a dataset at all
-        for source in sources_of(metadata):
+        first = 0
+        for source in sources_of(read_metadata(folder)):
             path = shard_path(folder, first)
-            fingerprint = _fingerprint(folder, first) if path.exists() else str(path.resolve())
-            if fingerprint in known:
-                raise UserError(
-                    f"data names the same episodes twice, {known[fingerprint]} and {folder}: name them once"
-                )
-            known[fingerprint] = folder
+            content = file_digest(path) if path.exists() else str(path.resolve())
+            if content in known:
+                raise UserError(f"data names the same episodes twice, {known[content]} and {folder}: name them once")
+            known[content] = folder
             first += source["shards"]
 
 
-class EpisodeNumbers:
-    """The numbers of a dataset's episodes, each of which belongs to one episode of a collection."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._sources = folder, source_of_shards(read_metadata(folder))
-        self._seen: dict[int, set[int]] = {}
-
-    def add(self, number: int, episodes: NDArray[np.int64]) -> None:
-        """Add those of a shard.
-
-        Raises:
-            UserError: an earlier shard has one of them.
-        """
-        if repetition := self.repetition(number, episodes):
-            raise UserError(
-                f"shard {shard_path(self._folder, number)} {repetition}: "
-                "delete it and collect again with repair=true to rebuild it"
-            )
-
-    def repetition(self, number: int, episodes: NDArray[np.int64]) -> str | None:
-        """What a shard repeats, such as "repeats episode 3"; if it repeats nothing, add its episodes."""
-        seen = self._seen.setdefault(self._sources[number], set())
-        if repeated := sorted(seen & set(episodes.tolist())):
-            return f"repeats episode {repeated[0]}"
-        if len(set(episodes.tolist())) < len(episodes):
-            return "repeats episodes"
-        seen |= set(episodes.tolist())
-        return None
+def repeated_episode(known: set[tuple[int, int]], source: int, episodes: NDArray[np.int64]) -> str | None:
+    """What a shard repeats of the `known` (source, number), such as "repeats episode 3"; its own are added."""
+    for number in episodes.tolist():
+        if (source, number) in known:
+            return f"repeats episode {number}"
+        known.add((source, number))
+    return None
 
 
-def iterate_shards(folder: Path, names: tuple[str, ...], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
+def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
     """Yield (number, arrays) of a dataset's shards in order.
 
     Args:
         names: arrays to read. skip_corrupt: skip corrupt shards with a message, instead of raising.
 
     Raises:
-        UserError: no dataset, a corrupt shard, or none that is whole.
+        UserError: no dataset, a corrupt shard, one that repeats an episode of another, or none that is whole.
     """
-    metadata, whole = read_metadata(folder), 0
-    for number in range(metadata["shards"]):
+    metadata, known, whole = read_metadata(folder), set[tuple[int, int]](), 0
+    for number, source in enumerate(source_of_shards(metadata)):
+        path = shard_path(folder, number)
         try:
-            arrays = read_shard(shard_path(folder, number), names, metadata=metadata)
+            arrays = read_shard(path, ("episode", *names), metadata=metadata)
         except CorruptShardError as error:
             if not skip_corrupt:
                 raise
-            print(f"left out: {error.defect}", flush=True)
+            print(f"left out: {error.args[0]}", flush=True)
             continue
+        if repetition := repeated_episode(known, source, arrays["episode"]):
+            raise UserError(f"shard {path} {repetition}: delete it and collect again with repair=true to rebuild it")
         whole += 1
         yield number, arrays
     if whole == 0:
-        raise UserError(f"dataset {folder} has no usable shard: {COLLECT_AGAIN}")
+        raise UserError(f"dataset {folder} has no usable shard: collect it again, with the same options")

@@ -1,14 +1,13 @@
 """Geometric features of a dataset, computed once and stored beside it: `features-FINGERPRINT/episodes-NNNNN.h5`.
 
 A file of features holds the SHA-256 of the shard that they were computed from (`shard_digest`). Those of another shard
-under the same name are computed again, and so are files of older versions, which lack it.
+under the same name are computed again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import inspect
-import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,6 +19,8 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import (
+    FEATURES,
+    Arrays,
     check_distinct,
     read_metadata,
     read_shard,
@@ -27,9 +28,8 @@ from cavin_pyro.data.dataset import (
     shard_path,
     write_shard,
 )
-from cavin_pyro.data.declaration import BESIDE
-from cavin_pyro.data.held_out import find_held_out
 from cavin_pyro.storage.files import clear_abandoned
+from envs.objects.object_sets import listed, plain_name
 from models.networks.geometry import Geometry
 
 BATCH = 4096  # clouds
@@ -62,13 +62,13 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
         fingerprint: see `geometry_fingerprint`.
 
     Raises:
-        UserError: the shard is corrupt.
+        CorruptShardError: the shard is corrupt.
     """
     shard, metadata = shard_path(folder, number), read_metadata(folder)
     path = folder / f"features-{fingerprint}" / shard.name
     digest = np.frombuffer(bytes.fromhex(shard_digest(shard)), np.uint8)
     with suppress(UserError):  # there are none, or damaged ones, which is no loss
-        stored = read_shard(path, BESIDE, metadata=metadata)
+        stored = read_shard(path, tuple(FEATURES), metadata=metadata)
         if np.array_equal(stored["shard_digest"], digest):
             return stored["features"]
     features = cloud_features(geometry, read_shard(shard, ("clouds",), metadata=metadata)["clouds"])
@@ -79,15 +79,24 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
     return features
 
 
-def delete_features(folder: Path) -> None:
-    """Delete the features in a folder in which a dataset begins: an earlier one, which is gone, left them."""
-    for beside in folder.glob("features-*"):
-        if re.fullmatch(r"features-[0-9a-f]{12}", beside.name) and beside.is_dir():
-            with suppress(OSError):  # what cannot be deleted is not used: it tells of another shard
-                clear_abandoned(beside)
-                for path in beside.glob("episodes-*.h5"):
-                    path.unlink(missing_ok=True)
-                beside.rmdir()
+def find_held_out(names: Sequence[str], folders: Sequence[Path], *, option: str) -> list[tuple[int, ...]]:
+    """The numbers that objects with these names, which are held out of training, have in `shape` of each dataset.
+
+    Raises:
+        UserError: no dataset, or none has an object of such a name; `option` is where the names were given.
+    """
+    known = [read_metadata(folder).get("shape_names", []) if names else [] for folder in folders]
+    every = dict.fromkeys(plain_name(name) for one in known for name in one)
+    for name in names:
+        if name not in every:
+            where = " and ".join(map(str, folders))
+            raise UserError(f"unknown object {name!r} in {option}: choose from {listed(every)}, which are in {where}")
+    return [tuple(n for n, name in enumerate(one) if plain_name(name) in names) for one in known]
+
+
+def held_out(arrays: Arrays, numbers: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which objects [E, M] of a shard's episodes have one of these numbers."""
+    return np.isin(arrays["shape"], numbers) & (arrays["scale"] > 0.0)  # padding has no size
 
 
 def sample_clouds(
@@ -101,33 +110,28 @@ def sample_clouds(
     Raises:
         UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
     """
-    held_out = find_held_out(held_out_objects, folders, option="held_out_objects")
+    excluded = find_held_out(held_out_objects, folders, option="held_out_objects")
+    check_distinct(folders)
     shards = [
-        (folder, number, excluded, metadata)
-        for folder, excluded in zip(folders, held_out, strict=True)
+        (folder, number, numbers, metadata)
+        for folder, numbers in zip(folders, excluded, strict=True)
         for metadata in [read_metadata(folder)]
         for number in range(metadata["shards"])
     ]
     chosen = generator.permutation(len(shards))[: max(1, min(len(shards), 100))]
     each = -(-count // len(chosen))
     sampled = []
-    check_distinct(folders)
-    names = ("clouds", "visible", "length")
-    for folder, number, excluded, metadata in [shards[index] for index in sorted(chosen)]:
-        arrays = read_shard(shard_path(folder, number), (*names, *excluded.required_arrays), metadata=metadata)
+    names = ("clouds", "visible", "length", "shape", "scale")
+    for folder, number, numbers, metadata in [shards[index] for index in sorted(chosen)]:
+        arrays = read_shard(shard_path(folder, number), names, metadata=metadata)
         steps = np.arange(arrays["visible"].shape[1])
         real = arrays["visible"] & (steps[None, :, None] <= arrays["length"][:, None, None])
-        if excluded.numbers:
-            real &= ~excluded.held_out(arrays)[:, None]
+        real &= ~held_out(arrays, numbers)[:, None]
         clouds = arrays["clouds"][real]
         sampled.append(clouds[generator.permutation(len(clouds))[:each]].astype(np.float32))
     clouds = np.concatenate(sampled)[:count]
     if len(clouds) < min(count, 2):  # one to learn from and one to validate with
         where = " and ".join(map(str, folders))
-        if held_out_objects:
-            without = ", ".join(held_out_objects)
-            raise UserError(f"{where}: {len(clouds)} clouds without {without}: hold out fewer objects")
-        raise UserError(
-            f"{where}: {len(clouds)} clouds of visible objects, too few to learn from: collect more transitions"
-        )
+        without = f" without {', '.join(held_out_objects)}" if held_out_objects else ""
+        raise UserError(f"{where}: {len(clouds)} clouds of visible objects{without}, too few to learn from")
     return clouds

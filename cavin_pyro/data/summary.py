@@ -20,18 +20,6 @@ CELLS = tuple(round((high - low) / CELL) for low, high in zip(TABLE_LOW, TABLE_H
 ARRAYS = ("centers", "visible", "mask", "actions", "moved", "unsafe", "ineffective", "fallen", "length")
 
 
-def _histogram() -> NDArray[np.int64]:
-    return np.zeros(len(DISTANCES) - 1, np.int64)
-
-
-def _counts() -> NDArray[np.int64]:
-    return np.zeros(OBJECT_SLOTS + 1, np.int64)
-
-
-def _map() -> NDArray[np.int64]:
-    return np.zeros(CELLS, np.int64)
-
-
 @dataclass
 class DataSummary:
     """Counts over a dataset's pushes.
@@ -49,13 +37,13 @@ class DataSummary:
     unsafe: int = 0
     ineffective: int = 0
     fallen: int = 0
-    farthest: NDArray[np.int64] = field(default_factory=_histogram)
-    farthest_in_segment: NDArray[np.int64] = field(default_factory=_histogram)
-    objects: NDArray[np.int64] = field(default_factory=_counts)
-    objects_moved: NDArray[np.int64] = field(default_factory=_counts)
-    observed: NDArray[np.int64] = field(default_factory=_map)
-    pushed: NDArray[np.int64] = field(default_factory=_map)
-    started: NDArray[np.int64] = field(default_factory=_map)
+    farthest: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(DISTANCES) - 1, np.int64))
+    farthest_in_segment: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(DISTANCES) - 1, np.int64))
+    objects: NDArray[np.int64] = field(default_factory=lambda: np.zeros(OBJECT_SLOTS + 1, np.int64))
+    objects_moved: NDArray[np.int64] = field(default_factory=lambda: np.zeros(OBJECT_SLOTS + 1, np.int64))
+    observed: NDArray[np.int64] = field(default_factory=lambda: np.zeros(CELLS, np.int64))
+    pushed: NDArray[np.int64] = field(default_factory=lambda: np.zeros(CELLS, np.int64))
+    started: NDArray[np.int64] = field(default_factory=lambda: np.zeros(CELLS, np.int64))
 
     @property
     def episodes(self) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import os
+import tempfile
 from collections.abc import Sequence
-from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,25 +19,21 @@ from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import (
-    COLLECT_AGAIN,
     Arrays,
     CorruptShardError,
-    EpisodeNumbers,
     check_distinct,
     iterate_shards,
+    padded,
     read_metadata,
+    slots_of,
 )
-from cavin_pyro.data.declaration import padded
-from cavin_pyro.data.features import geometry_fingerprint, shard_features
-from cavin_pyro.data.held_out import find_held_out
-from cavin_pyro.data.mapped import MappedArray
-from cavin_pyro.data.sources import slots_of
+from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
 from cavin_pyro.storage.progress import progress_bar
 from models.networks.geometry import Geometry
 from models.state import State, Window
 
 SEGMENT_LENGTH = 3  # T
-NEEDED = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "episode")  # arrays of a shard
+NEEDED = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "shape", "scale")  # of a shard
 
 
 class WindowTable:
@@ -134,53 +132,54 @@ def load_windows(
     """
     config = config or WindowConfig()
     fingerprint = geometry_fingerprint(geometry)
-    lengths = {folder: read_metadata(folder)["configuration"]["steps"] for folder in folders}
-    if len(set(lengths.values())) > 1:
+    every = [read_metadata(folder) for folder in folders]
+    steps = {metadata["configuration"]["steps"] for metadata in every}
+    if len(steps) > 1:
         raise UserError(
             "datasets with episodes of different length cannot be joined: "
-            + ", ".join(f"{folder} has steps={steps}" for folder, steps in lengths.items())
+            + ", ".join(f"{folder} has steps={read_metadata(folder)['configuration']['steps']}" for folder in folders)
         )
     check_distinct(folders)
-    total = sum(read_metadata(folder)["shards"] for folder in folders)
-    slots = max(slots_of(read_metadata(folder)) for folder in folders)
-    held_out_of = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
+    excluded = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
-    with (
-        closing(_Finder(config, segment_length, seed, where, slots, storage)) as found,
-        progress_bar("reading", total=total, unit="file") as bar,
-    ):
-        for folder, held_out in zip(folders, held_out_of, strict=True):
-            needed, known, whole = (*NEEDED, *held_out.required_arrays), EpisodeNumbers(folder), 0
-            for number, arrays in iterate_shards(folder, needed, skip_corrupt=skip_corrupt):
+    states = sum(metadata["episodes"] for metadata in every) * (max(steps) + 1)
+    found = _Finder(config, segment_length, seed, where, max(map(slots_of, every)), states, storage)
+    with progress_bar("reading", total=sum(metadata["shards"] for metadata in every), unit="file") as bar:
+        for folder, numbers in zip(folders, excluded, strict=True):
+            for number, arrays in iterate_shards(folder, NEEDED, skip_corrupt=skip_corrupt):
                 try:
                     arrays["features"] = shard_features(folder, number, geometry, fingerprint)
                 except CorruptShardError as error:  # its clouds, which are read here alone, are corrupt
                     if not skip_corrupt:
                         raise
-                    print(f"left out: {error.defect}", flush=True)
+                    print(f"left out: {error.args[0]}", flush=True)
                     continue
-                known.add(number, arrays["episode"])
-                found.add(held_out.filter_episodes(arrays))
-                whole += 1
+                kept = ~held_out(arrays, numbers).any(axis=-1)
+                found.add({name: array[kept] for name, array in arrays.items()})
                 bar.update()
-            if whole == 0:
-                raise UserError(f"dataset {folder} has no usable shard: {COLLECT_AGAIN}")
-        return found.table()
+    return found.table()
 
 
 class _Finder:
     """Finds the windows in one shard after another, and holds no more of them than where they start."""
 
     def __init__(
-        self, config: WindowConfig, segment_length: int, seed: int, where: str, slots: int, storage: Path | None = None
+        self,
+        config: WindowConfig,
+        segment_length: int,
+        seed: int,
+        where: str,
+        slots: int,
+        states: int,
+        storage: Path | None,
     ) -> None:
-        """`slots`: M, that of the dataset with the most objects."""
+        """`slots`: M, that of the dataset with the most objects. `states`: how many there are at most."""
         self._config, self._length, self._seed, self._where = config, segment_length, seed, where
-        self._slots = slots
+        self._slots, self._states, self._storage = slots, states, storage
         self._turns = np.random.default_rng(seed)
-        self._positions = {name: MappedArray(storage) for name in ("centers", "features", "mask", "actions", "counts")}
+        self._stored: Arrays = {}  # positions in time, episode after episode
         self._windows: dict[str, list[NDArray[Any]]] = {"start": [], "counts": [], "episode": [], "validation": []}
-        self._episodes = 0
+        self._episodes = self._filled = 0
 
     def add(self, episodes: Arrays) -> None:
         """Add the episodes of a shard.
@@ -194,10 +193,7 @@ class _Finder:
                 f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
                 f"T={T}: collect with steps of at least that many"
             )
-        try:
-            episodes = padded(episodes, self._slots)
-        except ValueError as error:
-            raise UserError(f"dataset {self._where} is damaged: {error}") from error
+        episodes = padded(episodes, self._slots)
         mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
         visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
         counts = _transitions_that_count(episodes, visible, config.maximum_step)
@@ -230,14 +226,16 @@ class _Finder:
         )
 
     def _store(self, **arrays: NDArray[Any]) -> None:
-        """Append arrays [E, S+1, ...]: positions in time, episode after episode."""
+        """Append arrays [E, S+1, ...]."""
+        filled = self._filled + arrays["mask"].shape[0] * arrays["mask"].shape[1]
+        if filled > self._states:
+            raise UserError(f"dataset {self._where} has more episodes than its metadata tell: verify it")
         for name, array in arrays.items():
-            self._positions[name].append(array.reshape(-1, *array.shape[2:]))
-
-    def close(self) -> None:
-        """Close the temporary files; the table keeps what it maps."""
-        for array in self._positions.values():
-            array.close()
+            rows = array.reshape(-1, *array.shape[2:])
+            if name not in self._stored:
+                self._stored[name] = _mapped(self._storage, (self._states, *rows.shape[1:]), rows.dtype)
+            self._stored[name][self._filled : filled] = rows
+        self._filled = filled
 
     def table(self) -> WindowTable:
         """All windows that were found.
@@ -245,7 +243,9 @@ class _Finder:
         Raises:
             UserError: there is none to train on, or none to validate with.
         """
-        stored = {name: array.tensor() for name, array in self._positions.items()}
+        if not self._stored:
+            raise UserError(f"dataset {self._where} has no usable shard: collect it again, with the same options")
+        stored = {name: torch.from_numpy(array[: self._filled]) for name, array in self._stored.items()}
         states = State(stored["centers"], stored["features"], stored["mask"])
         table = WindowTable(states, stored["actions"], stored["counts"], self._length)
         found = {name: np.concatenate(parts) for name, parts in self._windows.items()}
@@ -261,6 +261,14 @@ class _Finder:
                     f"{self._config.minimum_move:g} m: collect more transitions"
                 )
         return table
+
+
+def _mapped(folder: Path | None, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """An array in a temporary file, which need not fit in memory; without a name, so that it goes with the process."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        # A full disk is an error here; of a mapped file it would be a signal that ends the process.
+        os.posix_fallocate(file.fileno(), 0, max(1, dtype.itemsize * math.prod(shape)))
+        return np.memmap(file, dtype, mode="r+", shape=shape)
 
 
 def _transitions_that_count(episodes: Arrays, visible: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:

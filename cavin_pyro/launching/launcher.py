@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -114,6 +115,9 @@ def _cluster(function: Callable[[Any], Any], address: str | None) -> Iterator[tu
     try:
         import ray
 
+        host, _, port = (address or "").rpartition(":")
+        if port.isdecimal() and "/" not in host:  # Ray itself tries for minutes
+            socket.create_connection((host, int(port)), timeout=10.0).close()
         ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR", include_dashboard=False)
     except ImportError as error:
         raise UserError(f"launcher=ray needs Ray ({error}): pip install -c constraints.txt '.[ray]'") from error

@@ -16,9 +16,8 @@ from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured, shown
 from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct
-from cavin_pyro.data.dataset import content_records, read_metadata
+from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
-from cavin_pyro.data.sources import slots_of
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint, verify_checkpoint
 from cavin_pyro.storage.files import file_digest, output_folder, write_json

@@ -11,7 +11,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.loading import Accept, Loaded, context_of, load_trained, unmasked_windows
 from cavin_pyro.criticism.training_data import compare_data
-from cavin_pyro.data.world import collecting_world
+from cavin_pyro.data.collection import collecting_world
 
 
 def load_pair(config: DictConfig, accept: Accept | None = None) -> dict[str, tuple[CheckContext, dict[str, Any]]]:

@@ -20,8 +20,7 @@ from cavin_pyro.config.constructors import constructor_options
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured, options
 from cavin_pyro.config.parts import build_model, construct
-from cavin_pyro.data.collection import CollectionConfig
-from cavin_pyro.data.world import collecting_world
+from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from envs.pushing import PushingEnv
 from planning import CavinPlanner
 

@@ -1,40 +1,39 @@
+"""Shards and metadata: read as written; damaged, cut or made on purpose, they are named and never used."""
+
 from __future__ import annotations
 
 import errno
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import (
-    CorruptShardError,
+    ARRAYS,
+    Arrays,
     iterate_shards,
+    padded,
     read_metadata,
     read_shard,
     shard_path,
+    slots_of,
     write_metadata,
     write_shard,
 )
-
-
-def spoil(path: Path, position: int) -> None:
-    """Flip all bits of eight bytes."""
-    content = bytearray(path.read_bytes())
-    for place in range(position, min(position + 8, len(content))):
-        content[place] ^= 0xFF
-    path.write_bytes(content)
 
 
 def test_a_shard_is_read_as_it_was_written(tmp_path: Path) -> None:
     arrays = {
         "half": np.random.default_rng(0).normal(size=(3, 70, 2)).astype(np.float16),
         "flags": np.array([True, False]),
-        "number": np.array([7], np.int64),
         "none": np.zeros((0, 3), np.float32),
     }
     write_shard(tmp_path / "a.h5", arrays)
@@ -49,6 +48,7 @@ def test_a_shard_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@settings(max_examples=30)
 @given(place=st.floats(0.0, 1.0))
 def test_a_damaged_shard_is_named_or_is_read_as_it_was_written(
     pushes: Path, tmp_path_factory: pytest.TempPathFactory, place: float
@@ -56,40 +56,80 @@ def test_a_damaged_shard_is_named_or_is_read_as_it_was_written(
     """Never other numbers than those that were written, and never another error."""
     good = shard_path(pushes, 0)
     path = tmp_path_factory.mktemp("damaged") / "episodes-00000.h5"
-    path.write_bytes(good.read_bytes())
-    spoil(path, int(place * (path.stat().st_size - 1)))
+    content = bytearray(good.read_bytes())
+    start = int(place * (len(content) - 1))
+    content[start : start + 8] = bytes(byte ^ 0xFF for byte in content[start : start + 8])
+    path.write_bytes(content)
     whole = read_shard(good)
     try:
         arrays = read_shard(path)
     except UserError as error:
-        assert f"shard {path} is missing or corrupt" in str(error)
-        assert "\n" not in str(error)
+        assert f"shard {path} is missing or corrupt" in str(error) and "\n" not in str(error)
     else:
         assert arrays.keys() == whole.keys()
         assert all(np.array_equal(arrays[name], whole[name]) for name in whole)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
-def test_a_truncated_shard_is_named(share: float, own_pushes: Path) -> None:
+def linked(path: Path, arrays: Arrays) -> None:
+    write_shard(path.with_name("other.h5"), arrays)
+    with h5py.File(path, "a") as file:
+        del file["actions"]
+        file["actions"] = h5py.ExternalLink("other.h5", "/actions")
+
+
+def bomb(path: Path, arrays: Arrays) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("centers", (10**9, 11, 5, 3), np.float32, chunks=(10**4, 11, 5, 3), compression="gzip")
+
+
+def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Path, Arrays], None]:
+    return lambda path, arrays: write_shard(path, {**arrays, name: change(arrays[name])})
+
+
+SPOILT: dict[str, tuple[Callable[[Path, Arrays], Any], str]] = {
+    "missing": (lambda path, arrays: path.unlink(), "No such file|unable to open"),
+    "cut": (lambda path, arrays: path.write_bytes(path.read_bytes()[:500]), "truncated|unable"),
+    "an array less": (lambda path, arrays: write_shard(path, {"mask": arrays["mask"]}), "object"),
+    "fewer": (changed("actions", lambda one: one[1:]), r"actions has shape \[3, 6, 4\], not \[4, 6, 4\]"),
+    "too wide": (changed("mask", lambda one: np.pad(one, ((0, 0), (0, 1)))), r"mask has shape \[4, 6\], not \[4, 5\]"),
+    "another type": (changed("actions", lambda one: one.astype(float)), "actions has type float64, not float32"),
+    "text": (changed("actions", lambda one: one.astype("S8")), r"actions has type \|S8, not float32"),
+    "not finite": (changed("actions", lambda one: one * np.nan), "actions has values outside of -1 to 1: nan to nan"),
+    "out of range": (changed("actions", lambda one: one + 2), "actions has values outside of -1 to 1"),
+    "elsewhere": (linked, "actions is no array in this file"),
+    "unpacks to 660 gigabytes": (bomb, r"centers has shape \[1000000000, 11, 5, 3\]"),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_a_shard_that_does_not_fit_is_named_and_can_be_skipped(
+    kind: str, own_pushes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, said = SPOILT[kind]
     path = shard_path(own_pushes, 1)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    said = r"episodes-00001\.h5 is missing or corrupt .*skip_corrupt=true"
-    with pytest.raises(CorruptShardError, match=said) as found:
-        read_shard(path)
-    assert f": collect it again with python -m cavin_pyro.collect output={own_pushes} repair=true and" in str(
-        found.value
-    )
-    in_another_process = pickle.loads(pickle.dumps(found.value))
-    assert (str(in_another_process), in_another_process.defect) == (str(found.value), found.value.defect)
-    with pytest.raises(UserError, match="merge the datasets again"):  # collect repairs no merged dataset
-        read_shard(path, metadata={"sources": []})
+    change(path, read_shard(path))
+    with pytest.raises(UserError, match=rf"^shard .*episodes-00001\.h5 is missing or corrupt \(.*({said})") as refused:
+        list(iterate_shards(own_pushes, ("actions", "mask")))
+    assert "\n" not in str(refused.value) and "repair=true" in str(refused.value)
+    assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)  # from another process
+    kept = [number for number, _ in iterate_shards(own_pushes, ("actions", "mask"), skip_corrupt=True)]
+    assert kept == [0, 2]
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"left out: shard {path}") and "repair" not in line
 
 
-def test_a_shard_that_lacks_an_array_is_named(tmp_path: Path) -> None:
-    write_shard(tmp_path / "a.h5", {"centers": np.zeros((2, 4, 5, 3), np.float32)})
-    with pytest.raises(UserError, match=r"a\.h5 is missing or corrupt \(.*clouds"):
-        read_shard(tmp_path / "a.h5", ("centers", "clouds"))
+def test_shards_come_in_order_and_none_repeats_an_episode(own_pushes: Path) -> None:
+    shards = list(iterate_shards(own_pushes, ("length",)))
+    assert [number for number, _ in shards] == [0, 1, 2]
+    assert np.concatenate([arrays["episode"] for _, arrays in shards]).tolist() == list(range(12))
+    assert read_metadata(own_pushes)["transitions"] == sum(arrays["length"].sum() for _, arrays in shards)
+    shard_path(own_pushes, 2).write_bytes(shard_path(own_pushes, 0).read_bytes())
+    with pytest.raises(UserError, match=r"episodes-00002\.h5 repeats episode 0"):
+        list(iterate_shards(own_pushes, ("length",)))
+    for number in range(3):
+        shard_path(own_pushes, number).unlink()
+    with pytest.raises(UserError, match="has no usable shard: collect it again"):
+        list(iterate_shards(own_pushes, ("length",), skip_corrupt=True))
 
 
 def test_a_full_disk_leaves_no_half_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,32 +144,16 @@ def test_a_full_disk_leaves_no_half_shard(tmp_path: Path, monkeypatch: pytest.Mo
     assert not list(tmp_path.iterdir())
 
 
-def test_shards_come_in_order(pushes: Path) -> None:
-    shards = list(iterate_shards(pushes, ("episode", "length")))
-    assert [number for number, _ in shards] == [0, 1, 2]
-    assert np.concatenate([arrays["episode"] for _, arrays in shards]).tolist() == list(range(12))
-    metadata = read_metadata(pushes)
-    assert metadata["episodes"] == 12
-    assert metadata["transitions"] == sum(arrays["length"].sum() for _, arrays in shards)
-
-
-def test_corrupt_shards_are_skipped_and_named(own_pushes: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = shard_path(own_pushes, 1)
-    spoil(path, path.stat().st_size // 2)
-    with pytest.raises(UserError, match=r"episodes-00001\.h5 is missing or corrupt"):
-        list(iterate_shards(own_pushes, ("clouds", "episode")))
-    kept = list(iterate_shards(own_pushes, ("clouds", "episode"), skip_corrupt=True))
-    assert [number for number, _ in kept] == [0, 2]
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith(f"left out: shard {path}")
-    assert line.endswith(")")  # no advice about what is being done
-
-
-def test_a_dataset_without_any_whole_shard_is_refused(own_pushes: Path) -> None:
-    for number in range(3):
-        shard_path(own_pushes, number).unlink()
-    with pytest.raises(UserError, match="has no usable shard: collect it again"):
-        list(iterate_shards(own_pushes, ("episode",), skip_corrupt=True))
+def test_padding_adds_slots_without_objects(pushes: Path) -> None:
+    arrays = read_shard(shard_path(pushes, 0))
+    assert set(arrays) == set(ARRAYS)
+    wider = padded(arrays, 8)
+    assert (wider["shape"][:, 5:] == -1).all() and not wider["mask"][:, 5:].any()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(wider[name][tuple(map(slice, array.shape))], array, err_msg=name)
+    with pytest.raises(UserError, match="room for more than 4 objects"):
+        padded(arrays, 4)
+    assert slots_of(read_metadata(pushes)) == 5
 
 
 @pytest.mark.parametrize(
@@ -137,16 +161,23 @@ def test_a_dataset_without_any_whole_shard_is_refused(own_pushes: Path) -> None:
     [
         ({"format": "photographs"}, "does not describe a dataset of this program"),
         ({"version": 2}, "has format version 2, this program reads 1: collect it again"),
-        ({"shards": 0}, "is empty: collect it again"),
-        ({"shards": "three"}, "is damaged"),
-        ({"transitions": None}, "is damaged"),
-        ({"configuration": 5}, "is damaged"),
+        ({"shards": 0}, "is damaged: configuration or counts are missing"),
+        ({"transitions": None}, "is damaged: configuration or counts are missing"),
+        ({"configuration": 5}, "is damaged: configuration or counts are missing"),
+        ({"configuration": {"steps": "6"}}, "maximum_objects must be whole numbers"),
+        ({"configuration": {"steps": 6, "maximum_objects": 11}}, "must be whole numbers, the last 10 at most"),
+        ({"shape_names": [["mug"]]}, "shape_names must be a list of names"),
+        ({"shards": 10**9}, "files have not 12 episodes"),
+        ({"shards": 10**9, "episodes": 4 * 10**9}, "counts 1000000000 files of episodes, but 3 are there"),
+        ({"transitions": 10**9}, "3 files have not 12 episodes with 1000000000 pushes"),
+        ({"sources": []}, "its sources must be a list of collections"),
+        ({"sources": [{"shards": 3}]}, "configuration or counts are missing"),
     ],
 )
-def test_metadata_of_something_else_are_refused(changes: dict, said: str, own_pushes: Path) -> None:
+def test_metadata_that_cannot_be_are_refused_at_once(changes: dict, said: str, own_pushes: Path) -> None:
     write_metadata(own_pushes, {**read_metadata(own_pushes), **changes})
     with pytest.raises(UserError, match=said):
-        read_metadata(own_pushes)
+        list(iterate_shards(own_pushes, ("episode",), skip_corrupt=True))
 
 
 def test_a_folder_without_a_dataset_says_how_to_make_one(tmp_path: Path) -> None:

@@ -1,17 +1,12 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from types import SimpleNamespace
 
-import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path
 from cavin_pyro.data.summary import CELL, DISTANCES, DataSummary, summarize_data
-from cavin_pyro.visualization.data_summary import draw_data
 from envs.workspace import TABLE_LOW, normalised_push
 
 PLACE = (0.50, 0.10)  # metres
@@ -76,33 +71,8 @@ def test_what_moves_farther_than_the_histogram_counts_in_its_last_bin() -> None:
     assert summary.farthest[-1] == 1
 
 
-@pytest.mark.soak
-def test_a_dataset_is_drawn(pushes: Path, tmp_path: Path) -> None:
-    one, drawn = DataSummary(), []
-    one.add(episode())
-    for summary in (one, summarize_data(pushes)):
-        draw_data(tmp_path / "statistics.png", summary)
-        drawn.append(imageio.imread(tmp_path / "statistics.png"))
-    assert drawn[0].shape == drawn[1].shape
-    assert (drawn[0] != drawn[1]).any(axis=-1).mean() > 0.05
-    assert [path.name for path in tmp_path.iterdir()] == ["statistics.png"]
-
-
 def test_a_corrupt_file_is_named_and_left_out(own_pushes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = summarize_data(own_pushes).pushes
     shard_path(own_pushes, 1).write_bytes(b"nothing")
     assert 0 < summarize_data(own_pushes).pushes < whole
     assert "left out: shard" in capsys.readouterr().out
-    for number in (0, 2):
-        shard_path(own_pushes, number).unlink()
-    with pytest.raises(UserError, match="has no usable shard"):
-        summarize_data(own_pushes)
-
-
-def test_collect_leaves_figures_and_a_picture(shell: SimpleNamespace, tmp_path: Path) -> None:
-    overrides = ["transitions=6", "steps=3", "episodes_per_shard=1", f"output={tmp_path / 'data'}"]
-    assert shell.run_command("collect", *overrides, "workers=1", folder=tmp_path).status == 0
-    figures = json.loads((tmp_path / "data" / "statistics.json").read_text())
-    assert figures["pushes"] == read_metadata(tmp_path / "data")["transitions"]
-    assert sum(figures["objects_moved"]) == pytest.approx(1.0)
-    assert imageio.imread(tmp_path / "data" / "statistics.png").shape[2] == 4

@@ -5,24 +5,27 @@ Minari is an optional extra, imported here alone.
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 import shutil
-import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cavin_pyro import __version__
-from cavin_pyro.config.errors import UserError, WorkerError
-from cavin_pyro.data.dataset import Arrays, iterate_shards, read_metadata
-from cavin_pyro.data.declaration import ARRAYS, BESIDE, padded
-from cavin_pyro.data.sources import seed_of, slots_of, source_of_shards, sources_of
-from cavin_pyro.launching.launcher import Launcher
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.dataset import (
+    ARRAYS,
+    Arrays,
+    iterate_shards,
+    padded,
+    read_metadata,
+    seed_of,
+    slots_of,
+    source_of_shards,
+    sources_of,
+)
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
 from envs.workspace import POINTS_PER_OBJECT
@@ -34,7 +37,6 @@ if TYPE_CHECKING:
 OBSERVED = ("centers", "clouds", "visible")  # of every state; `mask` is the same in all states of an episode
 TOLD = ("moved", "unsafe", "ineffective", "fallen", "target", "angle")  # of every push, as `infos`
 OBJECTS = ("shape", "scale", "mass", "friction")  # of an episode, among its `options`
-HDF5_ERROR = r"\berrno = (\d+)"  # the system's error within HDF5's
 DESCRIPTION = (
     "Random pushes of objects on a table by a heuristic policy. An observation has the objects' centres in metres, "
     "their clouds in metres from the centre, whether the camera saw them, and which of the slots hold an object. An "
@@ -49,90 +51,45 @@ def export(folder: Path, target: Path) -> int:
         How many episodes were written.
 
     Raises:
-        UserError: Minari is not installed, a name that it does not take, no dataset, a corrupt shard, or `target` holds
-            a dataset.
-        OSError: the disk refused.
+        UserError: Minari is not installed, a name that it does not take, no dataset, a corrupt shard, `target` holds a
+            dataset, or the disk refused.
     """
     try:
-        import minari  # noqa: F401 - to tell at once that it is missing
+        import minari
+        from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
         raise UserError(f"export needs Minari ({error}): pip install -c constraints.txt '.[minari]'") from error
     if not re.fullmatch(r"[\w-]+-v\d+", target.resolve().name):
         raise UserError(f"--to {target} must end in a name and a version, as Minari wants: --to {target}-v0")
-    read_metadata(folder)
+    metadata = read_metadata(folder)
     with output_folder(target):
         written, partial = target / "data", target / ".data.partial"
         if written.exists():
             raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
         shutil.rmtree(partial, ignore_errors=True)  # of a killed run
         try:
-            # A process of its own, because HDF5 crashes when it ends if it could not write something before.
-            with closing(Launcher(workers=1).run(_write, [(folder, partial)])) as finished:
-                ((_, count),) = finished
+            storage = MinariStorage.new(
+                partial.resolve(),  # because Minari takes the size of what it has written from a relative path twice
+                observation_space=observation_space(slots_of(metadata)),
+                action_space=_box((4,), np.float32, 1.0),
+                data_format="hdf5",
+            )
+            storage.update_metadata(
+                {
+                    "dataset_id": target.resolve().name,
+                    "minari_version": minari.__version__,
+                    "algorithm_name": "heuristic pushing policy",
+                    "description": DESCRIPTION,
+                    "cavin_pyro": {**metadata, "exported_by": f"cavin_pyro {__version__}"},
+                }
+            )
+            storage.update_episodes(_episodes(folder))
             partial.rename(written)
-        except WorkerError:
-            print(file=sys.stderr)  # below the progress bar that the worker has left
-            raise
+        except (OSError, RuntimeError) as error:  # HDF5 raises both on a full disk
+            raise UserError(f"{target} could not be written ({str(error).splitlines()[0]})") from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-    return count
-
-
-def _write(folders: tuple[Path, Path]) -> int:
-    """Write a dataset into a folder with Minari's writer, in a process that ends after it; returns the episodes.
-
-    Raises:
-        OSError: HDF5 or the system could not write.
-    """
-    import minari
-    from minari.dataset.minari_storage import MinariStorage
-
-    folder, target = folders
-    with _one_error_of_the_disk(target):
-        storage = MinariStorage.new(
-            target.resolve(),  # because Minari takes the size of what it has written from a relative path twice
-            observation_space=observation_space(slots_of(read_metadata(folder))),
-            action_space=_box((4,), np.float32, 1.0),
-            data_format="hdf5",
-        )
-        storage.update_metadata(
-            {
-                "dataset_id": target.resolve().parent.name,
-                "minari_version": minari.__version__,
-                "algorithm_name": "heuristic pushing policy",
-                "description": DESCRIPTION,
-                "cavin_pyro": {**read_metadata(folder), "exported_by": f"cavin_pyro {__version__}"},
-            }
-        )
-        storage.update_episodes(_episodes(folder))
-    return int(storage.total_episodes)
-
-
-@contextmanager
-def _one_error_of_the_disk(target: Path) -> Iterator[None]:
-    """Raise the first error of the system behind what HDF5 raises, and behind what it only prints when objects close.
-
-    Raises:
-        OSError: HDF5 or the system could not write.
-    """
-    told: list[str] = []
-    hooks = sys.excepthook, sys.unraisablehook  # h5py calls both for an error in a destructor
-    sys.excepthook = lambda kind, error, trace: told.append(str(error))
-    sys.unraisablehook = lambda unraisable: told.append(str(unraisable.exc_value))
-    try:
-        try:
-            yield
-        except (OSError, RuntimeError) as error:
-            text = f"{error} errno = {getattr(error, 'errno', None)}"
-            if not re.search(HDF5_ERROR, text):
-                raise
-            told.append(text)
-    finally:
-        sys.excepthook, sys.unraisablehook = hooks
-    for number in re.findall(HDF5_ERROR, "\n".join(told)):
-        raise OSError(int(number), os.strerror(int(number)), str(target.parent))
-    if told:
-        raise OSError(errno.EIO, told[0], str(target.parent))
+    return int(metadata["episodes"])
 
 
 def observation_space(slots: int) -> Dict:
@@ -162,9 +119,8 @@ def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
 
     metadata = read_metadata(folder)
     seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
-    names = tuple(name for name in ARRAYS if name not in BESIDE)
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
-        for number, shard in iterate_shards(folder, names):
+        for number, shard in iterate_shards(folder, tuple(ARRAYS)):
             arrays = padded(shard, slots_of(metadata))
             for index in range(len(arrays["length"])):
                 options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}

@@ -1,0 +1,250 @@
+"""Looking after datasets: what is in one, whether it is whole, and joining several of one world."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from cavin_pyro import __version__
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import shown
+from cavin_pyro.data.dataset import (
+    ARRAYS,
+    COUNTS,
+    FEATURES,
+    Arrays,
+    check_distinct,
+    check_file,
+    check_values,
+    read_metadata,
+    read_shard,
+    repeated_episode,
+    seed_of,
+    shard_digest,
+    shard_path,
+    source_of_shards,
+    sources_of,
+    write_metadata,
+)
+from cavin_pyro.storage.files import atomic_write, output_folder
+from cavin_pyro.storage.progress import progress_bar
+from envs.workspace import MAXIMUM_OBJECTS
+
+WORLD = ("object_set", "camera", "segmentation", "ranges", "steps")  # options that merged datasets have in common
+_UNREADABLE = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError)  # what h5py raises
+
+
+def describe(folder: Path) -> str:
+    """Pushes, episodes, files, objects, world, and how full a dataset is; only small arrays are read.
+
+    Raises:
+        UserError: no dataset.
+    """
+    metadata = read_metadata(folder)
+    configuration, sources = metadata["configuration"], sources_of(metadata)
+    whole, by_count, by_shape = _count(folder, metadata)
+    full = metadata["transitions"] / (metadata["episodes"] * configuration["steps"])
+    features = sorted(path for path in folder.glob("features-*") if path.is_dir())
+    told = {*WORLD, "seed"}
+    rows = {
+        "dataset": f"{folder}, made by {', '.join(sorted({str(source.get('made_by')) for source in sources}))}",
+        "pushes": f"{metadata['transitions']} in {metadata['episodes']} episodes of at most {configuration['steps']}: "
+        f"{full:.1%} full",
+        "files": f"{whole} of {metadata['shards']} readable, {_size(folder.glob('episodes-*.h5'))}; features of "
+        f"{len(features)} geometries, {_size(file for one in features for file in one.glob('*.h5'))}",
+        "seeds": ", ".join(f"{seed_of(source)} ({source['episodes']} episodes)" for source in sources),
+        "objects": ", ".join(map("{} {}".format, metadata.get("shape_names", []), by_shape)),
+        "on the table": ", ".join(f"{n}: {count}" for n, count in enumerate(by_count) if count)
+        + " (objects: episodes)",
+        "world": ", ".join(f"{name} {configuration.get(name, '?')}" for name in WORLD[:3]),
+        "ranges": _listed(configuration.get("ranges") or {}),
+        "policy": _listed({name: value for name, value in configuration.items() if name not in told}),
+    }
+    return "\n".join(f"{name:<14}{value}" for name, value in rows.items())
+
+
+def _count(folder: Path, metadata: Mapping[str, Any]) -> tuple[int, list[int], list[int]]:
+    """How many files are readable; episodes by their number of objects; objects in episodes by their shape."""
+    by_count, by_shape = np.zeros(MAXIMUM_OBJECTS + 1, np.int64), np.zeros(128, np.int64)
+    whole = 0
+    for number in range(metadata["shards"]):
+        try:
+            arrays = read_shard(shard_path(folder, number), ("mask", "shape"), metadata=metadata)
+        except UserError:
+            continue  # `verify` names it
+        whole += 1
+        by_count += np.bincount(arrays["mask"].sum(axis=-1), minlength=len(by_count))
+        by_shape += np.bincount(arrays["shape"][arrays["shape"] >= 0], minlength=len(by_shape))
+    return whole, by_count.tolist(), by_shape.tolist()
+
+
+def _size(files: Iterator[Path]) -> str:
+    return f"{sum(file.stat().st_size for file in files) / 1e6:,.1f} MB"
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    """Options as on the command line; long lists of names by their length."""
+    short = {name: f"[{len(value)} names]" if name == "names" and value else value for name, value in values.items()}
+    return ", ".join(f"{name}={shown(value)}" for name, value in short.items())
+
+
+def verify(folder: Path) -> None:
+    """Print each defect of a dataset in a line, or that there is none.
+
+    Raises:
+        UserError: no dataset, or it has defects.
+    """
+    count = 0
+    for defect in find_defects(folder):
+        print(defect, flush=True)
+        count += 1
+    if count:
+        raise UserError(
+            f"{folder} has {count} defect{'s' if count > 1 else ''}: python -m cavin_pyro.collect repair=true, with "
+            "the options of the collection, collects damaged files again; train makes damaged features again"
+        )
+    metadata = read_metadata(folder)
+    print(f"{folder}: {metadata['shards']} files with {metadata['episodes']} episodes, no defect")
+
+
+def find_defects(folder: Path) -> Iterator[str]:
+    """The defects of a dataset, one line each; every array of every counted file is read.
+
+    Raises:
+        UserError: no dataset, or metadata that cannot be used.
+    """
+    metadata = read_metadata(folder)
+    known, lengths = set[tuple[int, int]](), list[int]()
+    beside = [one for one in sorted(folder.glob("features-*")) if one.is_dir()]
+    with progress_bar("verifying", total=metadata["shards"], unit="file") as bar:
+        for number, source in enumerate(source_of_shards(metadata)):
+            path, arrays = shard_path(folder, number), Arrays()
+            found = [*_damage(path, ARRAYS, metadata, arrays), *_contradictions(arrays, metadata)]
+            if "episode" in arrays and (repetition := repeated_episode(known, source, arrays["episode"])):
+                found.append(f"it {repetition}")
+            yield from (f"{path}: {defect}" for defect in found)
+            for features in (one / path.name for one in beside if (one / path.name).exists()):
+                stored = Arrays()
+                yield from (f"{features}: {defect}" for defect in _damage(features, FEATURES, metadata, stored))
+                if (
+                    not found
+                    and "shard_digest" in stored
+                    and stored["shard_digest"].tobytes().hex() != shard_digest(path)
+                ):
+                    yield f"{features}: it is of other content than {path}"
+            if "length" in arrays:
+                lengths.append(int(arrays["length"].sum()))
+            bar.update()
+    if len(lengths) == metadata["shards"] and sum(lengths) != metadata["transitions"]:
+        yield f"{folder / 'metadata.json'}: counts {metadata['transitions']} transitions, the files have {sum(lengths)}"
+
+
+def _damage(path: Path, names: Mapping[str, Any], metadata: Mapping[str, Any], arrays: Arrays) -> Iterator[str]:
+    """What is wrong with a file by itself; what can be read of it goes into `arrays`."""
+    try:
+        with h5py.File(path, "r") as file:
+            check_file(file, metadata["configuration"])
+            for name in names:
+                try:
+                    array = file[name][()]
+                    check_values({name: array})
+                    arrays[name] = array
+                except _UNREADABLE as error:
+                    yield f"array {name}: {str(error).splitlines()[0]}"
+    except _UNREADABLE as error:
+        yield str(error).splitlines()[0] if path.exists() else "it is missing"
+
+
+def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str]:
+    """Contradictions between readable arrays of a shard and the metadata."""
+    if {"length", "actions"} <= set(arrays) and (arrays["length"] > arrays["actions"].shape[1]).any():
+        yield f"array length: {arrays['length'].max()} pushes in an episode of {arrays['actions'].shape[1]}"
+    if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= len(metadata["shape_names"]):
+        yield f"array shape: object {arrays['shape'].max()} of {len(metadata['shape_names'])} in metadata.json"
+    if {"mask", "visible"} <= set(arrays) and (arrays["visible"] & ~arrays["mask"][:, None]).any():
+        yield "array visible: an object that mask denies is visible"
+
+
+def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:
+    """Copy the files of all datasets, one after another, into a new dataset. Its metadata come last.
+
+    Training on it equals training on `data=[DIR,DIR]`: episodes keep their numbers and their seeds.
+
+    Returns:
+        The metadata of the new dataset.
+
+    Raises:
+        UserError: fewer than two datasets, different worlds, a seed in two of them, a defect, or `target` holds data.
+    """
+    if len(folders) < 2:
+        raise UserError("merge takes at least two datasets: merge DIR DIR --to DIR")
+    every = [read_metadata(folder) for folder in folders]
+    _check_same_world(folders, every)
+    _check_seeds(folders, every)
+    check_distinct(folders)
+    with output_folder(target):
+        if (target / "metadata.json").exists() or any(target.resolve() == folder.resolve() for folder in folders):
+            raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
+        for folder in folders:
+            if defect := next(find_defects(folder), None):
+                raise UserError(f"{defect}; python -m cavin_pyro.data verify {folder} names every defect")
+        files = [(folder, n) for folder, one in zip(folders, every, strict=True) for n in range(one["shards"])]
+        with progress_bar("copying", total=len(files), unit="file") as bar:
+            for number, (folder, n) in enumerate(files):
+                _copy(shard_path(folder, n), shard_path(target, number))
+                for features in folder.glob(f"features-*/{shard_path(folder, n).name}"):
+                    beside = target / features.parent.name
+                    beside.mkdir(exist_ok=True)
+                    _copy(features, shard_path(beside, number))
+                bar.update()
+        metadata = _merged(every)
+        write_metadata(target, metadata)
+    return metadata
+
+
+def _merged(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    sources = [source for one in every for source in sources_of(one)]
+    first, *others = [source["configuration"] for source in sources]
+    missing = object()  # what is not the same in all sources stands in theirs alone
+    common = {name: value for name, value in first.items() if all(o.get(name, missing) == value for o in others)}
+    return {
+        "configuration": common,
+        "shape_names": every[0].get("shape_names", []),
+        "made_by": f"cavin_pyro {__version__}",
+        **{name: sum(one[name] for one in every) for name in COUNTS},
+        "sources": sources,
+    }
+
+
+def _check_same_world(folders: Sequence[Path], every: Sequence[dict[str, Any]]) -> None:
+    worlds = [{**one["configuration"], "shape_names": one.get("shape_names")} for one in every]
+    for folder, world in zip(folders[1:], worlds[1:], strict=True):
+        for name in (*WORLD, "shape_names"):
+            if world.get(name) != worlds[0].get(name):
+                raise UserError(
+                    f"{folders[0]} and {folder} are not of the same world ({name} is {worlds[0].get(name)} and "
+                    f"{world.get(name)}): merge datasets of one world, or train on several with data=[DIR,DIR]"
+                )
+
+
+def _check_seeds(folders: Sequence[Path], every: Sequence[dict[str, Any]]) -> None:
+    known: dict[int, Path] = {}
+    for folder, one in zip(folders, every, strict=True):
+        for source in sources_of(one):
+            seed = seed_of(source)
+            if seed in known:
+                raise UserError(
+                    f"{known[seed]} and {folder} both have episodes of seed={seed}, which may be the same ones: "
+                    "collect one of them with another seed"
+                )
+            known[seed] = folder
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_write(target) as temporary:
+        shutil.copyfile(source, temporary)

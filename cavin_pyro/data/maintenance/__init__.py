@@ -1,1 +1,0 @@
-"""What `python -m cavin_pyro.data` does with datasets: info, verify, merge, export."""
