@@ -65,19 +65,14 @@ class HeuristicPushingPolicy:
             action = self._propose(observation)
             if action is not None:
                 self._left -= 1
-                return self._perturb(action) if self._perturbation_rate > 0.0 else action
+                if self._perturbation_rate > 0.0 and self._generator.random() < self._perturbation_rate:
+                    start, _ = push_endpoints(action)
+                    moved = start + self._generator.normal(scale=PERTURBATION, size=2)
+                    action[:2] = np.clip(normalised_push(moved, np.zeros(2))[:2], -1.0, 1.0)
+                return action
             self._new_intent(observation)
         action = self._generator.uniform(-1.0, 1.0, size=4)
         self.intent, self._left = Intent(-1, float(np.arctan2(action[3], action[2]))), 0
-        return action
-
-    def _perturb(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The action, or with probability `perturbation_rate` the same motion from another start."""
-        if self._generator.random() >= self._perturbation_rate:
-            return action
-        start, _ = push_endpoints(action)
-        moved = start + self._generator.normal(scale=PERTURBATION, size=2)
-        action[:2] = np.clip(normalised_push(moved, np.zeros(2))[:2], -1.0, 1.0)
         return action
 
     def _new_intent(self, observation: Observation) -> None:

@@ -6,7 +6,6 @@ Data flows one way: poses in the simulator, a depth image, segmented points, an 
 from __future__ import annotations
 
 import colorsys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count, cycle
@@ -99,8 +98,6 @@ class Scene:
         self.places: Sequence[Place] = ()  # of the objects in their order, which photographs show as well
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
-        # CPU time by purpose, in seconds.
-        self.seconds = dict.fromkeys(("physics", "rendering", "segmentation", "points"), 0.0)
 
     @property
     def camera(self) -> Camera:
@@ -145,16 +142,17 @@ class Scene:
         """
         if not 1 <= len(objects) <= self.slots:
             raise ValueError(f"a scene holds 1 to {self.slots} objects, not {len(objects)}")
-        began = time.process_time()
         self.world.reset()
         self.objects = list(objects)
-        self.bodies = [self._add(one, color) for one, color in zip(objects, cycle(COLORS), strict=False)]
+        self.bodies = [
+            self.world.add_object(self.object_set.asset(one.name), one, color)
+            for one, color in zip(objects, cycle(COLORS), strict=False)
+        ]
         self.robot = self._make_robot(self.world)
         settle(self.world, self.robot, self.bodies, limit=720)
         self.sensor.reset(named_stream(point_generator, SENSOR))
         self._latest_clouds = LatestClouds(point_generator, self.slots)
-        self.seconds["physics"] += time.process_time() - began
-        return self._observe(first=True)
+        return self._observe(self._find_objects)
 
     def push(self, action: NDArray[np.floating]) -> PushReport:
         """Execute one normalised push [4] and wait until the objects rest.
@@ -165,7 +163,6 @@ class Scene:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is four finite numbers (x, y, dx, dy), not {action.tolist()}")
-        began = time.process_time()
         before = self.ground_truth()
         start, end = push_endpoints(action)
         steps = count()
@@ -179,7 +176,6 @@ class Scene:
         after = self.ground_truth()
         moved = np.linalg.norm(after.positions - before.positions, axis=-1)
         turn = Rotation.from_quat(after.orientations) * Rotation.from_quat(before.orientations).inv()
-        self.seconds["physics"] += time.process_time() - began
         return PushReport(
             unsafe=ended == "unsafe",
             ineffective=bool((moved < MOVED).all() and (turn.magnitude() < TURNED).all()),
@@ -201,25 +197,27 @@ class Scene:
         Raises:
             RuntimeError: the robot stands in the camera's view.
         """
-        return self._observe(first=False)
+        return self._observe(self.segmenter.follow)
 
-    def _observe(self, *, first: bool) -> Observation:
-        began = time.process_time()
+    def _observe(self, segment: Callable[[DepthImage], list[Pixels]]) -> Observation:
         if not self.robot.clear_of_view(self.camera):
             raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
         image = self.capture()
-        rendered = time.process_time()
-        if first:
-            found = self.segmenter.start(image, self.point_at_target(image))
-            self._put_in_order(found)
-        else:
-            found = self.segmenter.follow(image)
-        segmented = time.process_time()
-        observation = self._latest_clouds.update(image, found)
-        self.seconds["rendering"] += rendered - began
-        self.seconds["segmentation"] += segmented - rendered
-        self.seconds["points"] += time.process_time() - segmented
-        return observation
+        return self._latest_clouds.update(image, segment(image))
+
+    def _find_objects(self, image: DepthImage) -> list[Pixels]:
+        """Begin an episode of the segmentation, and order the bodies as it orders the objects, for reports."""
+        found = self.segmenter.start(image, self.point_at_target(image))
+        named: list[int] = []
+        for pixels in found[: len(self.bodies)]:
+            body = int(np.bincount(self._body_image[pixels] + 1, minlength=1).argmax()) - 1
+            named.append(body if body in self.bodies and body not in named else -1)
+        left = iter([body for body in self.bodies if body not in named])
+        named += [-1] * (len(self.bodies) - len(named))
+        ordered = [next(left) if body < 0 else body for body in named]
+        self.objects = [self.objects[self.bodies.index(body)] for body in ordered]
+        self.bodies = ordered
+        return found
 
     def capture(self) -> DepthImage:
         """Take a depth image without updating the observation's clouds; `true_masks` then refers to this image."""
@@ -239,19 +237,6 @@ class Scene:
         nearest = int(((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin())
         return int(rows[nearest]), int(columns[nearest])
 
-    def _put_in_order(self, found: list[Pixels]) -> None:
-        """Order the bodies like the segmentation's objects, so that reports can refer to both."""
-        named: list[int] = []
-        for pixels in found[: len(self.bodies)]:
-            counts = np.bincount(self._body_image[pixels] + 1, minlength=1)
-            body = int(counts.argmax()) - 1
-            named.append(body if body in self.bodies and body not in named else -1)
-        left = iter([body for body in self.bodies if body not in named])
-        named += [-1] * (len(self.bodies) - len(named))
-        ordered = [next(left) if body < 0 else body for body in named]
-        self.objects = [self.objects[self.bodies.index(body)] for body in ordered]
-        self.bodies = ordered
-
     def photograph(self, camera: Camera) -> NDArray[np.uint8]:
         """A colour image [height, width, 3] of the scene with the `markings` and `places` on the table, for people."""
         rendering = self.world.render(camera)
@@ -263,20 +248,6 @@ class Scene:
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""
         return self.world.poses(self.bodies)
-
-    def _add(self, one: ObjectParameters, color: Sequence[float]) -> int:
-        asset = self.object_set.asset(one.name)
-        return self.world.add_object(
-            asset.collision,
-            visual=asset.visual,
-            scale=one.scale,
-            mass=one.mass,
-            inertia=asset.inertia_of(one.mass, one.scale),
-            friction=one.friction,
-            position=one.position,
-            orientation=one.orientation,
-            color=color,
-        )
 
     def _any_fallen(self) -> bool:
         return bool((self.ground_truth().positions[:, 2] < FALLEN).any())

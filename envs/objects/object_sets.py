@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -93,15 +92,20 @@ class ScannedObjects:
     `python -m cavin_pyro.assets ycb --to DIR` makes such a folder of the YCB objects.
 
     Raises:
-        ValueError: no folder was named, or the folder or a file in it is missing or damaged: the message
-            says what is missing, where, and which command makes it.
+        ValueError: no folder was named, or a file in it is missing or damaged; the message says which command makes it.
     """
 
     def __init__(self, assets: str | Path | None) -> None:
         if assets is None:
             raise ValueError(f"these objects are scans, in no folder that was named: give env.assets=DIR; {_GET}")
         folder = assets_folder(assets) / SCANS
-        self._assets = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in _manifest(folder).items()}
+        try:
+            manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+            self._assets = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in manifest.items()}
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+            what = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else f"damaged: {error!r}"
+            get = _GET.replace("DIR", str(folder.parent))
+            raise ValueError(f"the objects in {folder} cannot be used ({what[:200]}); {get}") from error
         self.names = tuple(self._assets)
 
     def asset(self, name: str) -> ObjectAsset:
@@ -180,54 +184,21 @@ def _mesh_folder() -> Path:
     return process_folder("meshes")
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    get = _GET.replace("DIR", str(folder.parent))
-    try:
-        manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"no objects in {folder}: meta.json cannot be read ({error.strerror}); {get}") from error
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{folder / 'meta.json'} is damaged: it is not JSON; {get}") from error
-    if not isinstance(manifest, dict) or not manifest:
-        raise ValueError(f"{folder / 'meta.json'} is damaged: it names no object; {get}")
-    files = [(name, file) for name in manifest for file in (f"{name}.obj", f"{name}_vhacd.obj")]
-    missing = [file for name, file in files if plain_name(name) != name or not os.path.isfile(folder / file)]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ValueError(f"the objects in {folder} are incomplete: {missing[0]}{more} missing; {get}")
-    return manifest
-
-
-def _scan(folder: Path, name: str, values: Any) -> ObjectAsset:
-    try:
-        x, y, z = map(float, values["inertia_diag"])
-        mass = float(values["mass"])
-    except (KeyError, TypeError, ValueError, OverflowError):
-        mass = x = y = z = np.nan
-    if not all(0.0 < number < np.inf for number in (mass, x, y, z)):
-        raise ValueError(f"{folder / 'meta.json'} is damaged: {name} needs a mass and an inertia_diag of three numbers")
-    collision = folder / f"{name}_vhacd.obj"
-    return ObjectAsset(
-        name=f"{SCANS}/{name}",
-        mass=mass,
-        radius=_radius(collision),
-        collision=collision.absolute(),
-        visual=(folder / f"{name}.obj").absolute(),
-        inertia=(x, y, z),
-    )
-
-
-def _radius(mesh: Path) -> float:
-    """Metres from the origin to the farthest vertex.
+def _scan(folder: Path, name: str, values: dict[str, Any]) -> ObjectAsset:
+    """Read what a folder has of an object.
 
     Raises:
-        ValueError: there is no vertex, or one is no point within `FARTHEST`.
+        OSError, ValueError, TypeError, KeyError, OverflowError: something is missing or damaged.
     """
-    try:
-        lines = mesh.read_text(encoding="utf-8").splitlines()
-        vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float64)
-        if not (np.abs(vertices) < FARTHEST).all():  # also if one is no number
-            raise ValueError("no metres")
-        return float(np.linalg.norm(vertices.reshape(-1, 3), axis=1).max())
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{mesh} is damaged: its vertices cannot be read as points in metres") from error
+    collision, visual = folder / f"{name}_vhacd.obj", folder / f"{name}.obj"
+    x, y, z = map(float, values["inertia_diag"])
+    mass = float(values["mass"])
+    lines = collision.read_text(encoding="utf-8").splitlines()
+    vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float64).reshape(-1, 3)
+    visual.stat()
+    if plain_name(name) != name or not all(0.0 < number < np.inf for number in (mass, x, y, z)):
+        raise ValueError(f"{name} needs a mass and an inertia_diag of three numbers")
+    if not (len(vertices) and (np.abs(vertices) < FARTHEST).all()):  # also if one is no number
+        raise ValueError(f"the vertices of {collision.name} are no points in metres")
+    radius = float(np.linalg.norm(vertices, axis=1).max())
+    return ObjectAsset(f"{SCANS}/{name}", mass, radius, collision.absolute(), visual.absolute(), (x, y, z))

@@ -84,65 +84,57 @@ class LoadedArm:
             self.client.resetJointState(self.body, joint, angle)
 
 
-class Arm:
-    """An arm in a `PhysicsWorld`, standing still in its home pose.
-
-    Raises:
-        ValueError: as `LoadedArm`.
-    """
+class Arm(LoadedArm):
+    """An arm in a `PhysicsWorld`, standing still in its home pose."""
 
     def __init__(self, world: PhysicsWorld, description: ArmDescription) -> None:
-        self._loaded = LoadedArm(world.client, description)
-        self._client, self._table = world.client, world.table
-        self.body = self._loaded.body
-        self.stand = [self._loaded.links[name] for name in description.stand]  # links that are not rendered
+        super().__init__(world.client, description)
+        self._table = world.table
         for name in [*description.stand, *_without_picture(description.urdf)]:
-            self._client.changeVisualShape(self.body, self._loaded.links[name], rgbaColor=INVISIBLE)
-        for link in self._loaded.links.values():
-            mask = EVERYTHING if link == self._loaded.links[STICK] else STATIC_ONLY
-            self._client.setCollisionFilterGroupMask(self.body, link, 1, mask)
-        self._client.changeDynamics(
-            self.body, self._loaded.links[STICK], lateralFriction=TOOL_FRICTION, restitution=0.0
-        )
-        self._drive(list(self._loaded.held), list(self._loaded.held.values()), [0.0] * len(self._loaded.held))
-        self.command(self.angles(), np.zeros(len(self._loaded.joints)))
+            self.client.changeVisualShape(self.body, self.links[name], rgbaColor=INVISIBLE)
+        for link in self.links.values():
+            mask = EVERYTHING if link == self.links[STICK] else STATIC_ONLY
+            self.client.setCollisionFilterGroupMask(self.body, link, 1, mask)
+        self.client.changeDynamics(self.body, self.links[STICK], lateralFriction=TOOL_FRICTION, restitution=0.0)
+        self._drive(list(self.held), list(self.held.values()), [0.0] * len(self.held))
+        self.command(self.angles(), np.zeros(len(self.joints)))
 
     def command(self, angles: NDArray[np.float64], speeds: NDArray[np.float64]) -> None:
         """From now on, correct the joints to `angles` [J] radians while they turn at `speeds` [J] radians per second.
 
         Both gains are 1: an error vanishes after one step, like with a stiff controller.
         """
-        self._drive(self._loaded.joints, angles.tolist(), speeds.tolist())
+        self._drive(self.joints, angles.tolist(), speeds.tolist())
 
     def angles(self) -> NDArray[np.float64]:
         """Current joint angles: [J] radians."""
-        return np.array([one[0] for one in self._client.getJointStates(self.body, self._loaded.joints)])
+        return np.array([one[0] for one in self.client.getJointStates(self.body, self.joints)])
 
     def tip(self) -> NDArray[np.float64]:
         """Current position of the stick's tip: [3] metres."""
-        state = self._client.getLinkState(self.body, self._loaded.links[TIP], computeForwardKinematics=1)
+        state = self.client.getLinkState(self.body, self.links[TIP], computeForwardKinematics=1)
         return np.array(state[4])
 
     def touches_table(self) -> bool:
         """Whether any part of the arm touches the table, after the step just made."""
-        contacts = self._client.getContactPoints(self.body, self._table)
+        contacts = self.client.getContactPoints(self.body, self._table)
         return any(contact[8] <= TOUCHING for contact in contacts)
 
     def corners(self) -> NDArray[np.float64]:
         """Corners of axis-aligned boxes around the links, without the stand: [L, 8, 3] metres."""
-        links = [link for name, link in self._loaded.links.items() if name not in self._loaded.description.stand]
-        boxes = np.array([self._client.getAABB(self.body, link) for link in links])
+        links = [link for name, link in self.links.items() if name not in self.description.stand]
+        boxes = np.array([self.client.getAABB(self.body, link) for link in links])
         choice = np.array(list(product((0, 1), repeat=3)))
         return boxes[:, choice, np.arange(3)]
 
     def lift_out(self) -> None:
         """Set the joints to the home pose at once, ignoring collisions."""
-        self._loaded.put(self._loaded.home)
-        self.command(self._loaded.home, np.zeros_like(self._loaded.home))
+        self.put(self.home)
+        self.command(self.home, np.zeros_like(self.home))
 
     def _drive(self, joints: list[int], positions: list[float], speeds: list[float]) -> None:
         if joints:
-            self._client.setJointMotorControlArray(
+            self.client.setJointMotorControlArray(
                 self.body,
                 joints,
                 pybullet.POSITION_CONTROL,
@@ -173,27 +165,21 @@ class Forward(NamedTuple):
     jacobian: NDArray[np.float64]
 
 
-class Kinematics:
-    """An arm alone in a separate simulation.
-
-    Raises:
-        ValueError: as `envs.physics.arm.LoadedArm`.
-    """
+class Kinematics(LoadedArm):
+    """An arm alone in a separate simulation."""
 
     def __init__(self, description: ArmDescription) -> None:
-        self._client = connect()
-        self._arm = LoadedArm(self._client, description)
-        self._columns = [self._arm.movable.index(joint) for joint in self._arm.joints]
-        self._at = np.zeros(len(self._arm.movable))
-        for joint, value in self._arm.held.items():
-            self._at[self._arm.movable.index(joint)] = value
-        self.low, self.high, self.fastest = self._arm.low, self._arm.high, self._arm.fastest
+        super().__init__(connect(), description)
+        self._columns = [self.movable.index(joint) for joint in self.joints]
+        self._at = np.zeros(len(self.movable))
+        for joint, value in self.held.items():
+            self._at[self.movable.index(joint)] = value
 
     def __call__(self, angles: NDArray[np.float64]) -> Forward:
         """Forward kinematics of joint angles [J] radians."""
-        self._arm.put(angles)
+        self.put(angles)
         self._at[self._columns] = angles
-        link, body, client = self._arm.links[TIP], self._arm.body, self._client
+        link, body, client = self.links[TIP], self.body, self.client
         state = client.getLinkState(body, link, computeForwardKinematics=1)
         axis = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)[:, 2]
         still = [0.0] * len(self._at)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.objects.object_sets import ObjectAsset
+from envs.objects.sampling import ObjectParameters
 from envs.physics.bullet import BulletClient, connect, pybullet
 from envs.physics.visuals import Part, parts_of
 from envs.sensors.camera import FAR, NEAR, Camera
@@ -21,10 +22,7 @@ from envs.sensors.sensor import Rendering
 from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
 TIME_STEP = 1.0 / 240.0  # seconds
-# Per step. Measured over 240 pushes of the policy among 3 to 5 objects: 50 iterations leave 72 % of the
-# objects that move within 1 mm of where 20 leave them, 92 % within 3 mm and all within 12 mm, and take 1.3 to
-# 1.5 times as long; 200 iterations agree with 20 about as well (65 %, 88 %, 12 mm).
-SOLVER_ITERATIONS = 20
+SOLVER_ITERATIONS = 20  # per step; 50 leave all objects within 12 mm of it, and take 1.3 to 1.5 times as long
 GRAVITY = 9.81  # metres per second squared
 TABLE_FRICTION = 1.0  # Bullet multiplies both bodies' coefficients, so the object's own value is what counts
 TABLE_COLOR = (0.80, 0.77, 0.72)
@@ -89,50 +87,33 @@ class PhysicsWorld:
         )
         bullet.changeDynamics(self.table, -1, lateralFriction=TABLE_FRICTION)
 
-    def add_object(
-        self,
-        mesh: Path,
-        *,
-        visual: Path | None = None,
-        scale: float,
-        mass: float,
-        inertia: Sequence[float] | None = None,
-        friction: float,
-        position: Sequence[float],
-        orientation: Sequence[float],
-        color: Sequence[float],
-    ) -> int:
-        """Add a free body; every group of the mesh file becomes one convex part of its collision shape.
+    def add_object(self, asset: ObjectAsset, sampled: ObjectParameters, color: Sequence[float]) -> int:
+        """Add a free body; every group of its mesh file becomes one convex part of its collision shape.
 
         Args:
-            mesh: a Wavefront file, metres, origin at the centre of mass. scale: factor on its size.
-            visual: another mesh for the camera. mass: kilograms.
-            inertia: (x, y, z) kilograms times square metres about the mesh's axes; by default, its bounding box's.
-            friction: Coulomb coefficient against the table.
-            position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
             color: red, green, blue in [0, 1].
         """
-        bullet, size = self.client, [scale] * 3
+        bullet, size = self.client, [sampled.scale] * 3
+        shape = {"shapeType": pybullet.GEOM_MESH, "meshScale": size}
         body = bullet.createMultiBody(
-            baseMass=mass,
-            baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(mesh), meshScale=size),
-            baseVisualShapeIndex=bullet.createVisualShape(
-                pybullet.GEOM_MESH, fileName=str(visual or mesh), meshScale=size, rgbaColor=(*color, 1.0)
-            ),
-            basePosition=position,
-            baseOrientation=orientation,
+            baseMass=sampled.mass,
+            baseCollisionShapeIndex=bullet.createCollisionShape(fileName=str(asset.collision), **shape),
+            baseVisualShapeIndex=bullet.createVisualShape(fileName=str(asset.visual), rgbaColor=(*color, 1.0), **shape),
+            basePosition=sampled.position,
+            baseOrientation=sampled.orientation,
         )
         bullet.changeDynamics(
             body,
             -1,
-            lateralFriction=friction,
+            lateralFriction=sampled.friction,
             rollingFriction=ROLLING_FRICTION,
             spinningFriction=SPINNING_FRICTION,
             angularDamping=ANGULAR_DAMPING,
             restitution=0.0,
         )
+        inertia = asset.inertia_of(sampled.mass, sampled.scale)
         if inertia is not None:
-            bullet.changeDynamics(body, -1, localInertiaDiagonal=tuple(inertia))
+            bullet.changeDynamics(body, -1, localInertiaDiagonal=inertia)
         self.objects.append(int(body))
         return int(body)
 

@@ -13,8 +13,7 @@ from envs.robots.robot import STICK_LENGTH, STICK_RADIUS
 
 POSTURE = (0.0, 0.3, 0.0, -1.8, 0.0, 2.2, 0.78)  # radians
 HOME = (1.51, 0.0, -0.03, -1.92, 0.02, 1.79, 0.63)  # radians; turned to the left, beside the table
-# Close to the table: the Panda's arm is shorter than the Sawyer's. Even so it reaches 120 of 132 places on a grid
-# over the reachable box; the two far corners are too far away.
+# Close to the table, for the Panda's arm is shorter than the Sawyer's; the two far corners are still too far away.
 BASE = (0.10, 0.0, 0.0)  # metres
 _LINK = """<link name="{name}">
   <inertial><origin xyz="0 0 {middle}"/><mass value="{mass}"/>

@@ -12,15 +12,7 @@ from envs.physics import ArmDescription
 URDF = Path("sawyer", "sawyer_stick.urdf")  # inside the folder of assets
 HOW_TO_GET = "get it with `python -m cavin_pyro.assets sawyer --to DIR`, then give env.assets=DIR"
 POSTURE = (0.0, -0.6, 0.0, 1.2, 0.0, 1.0, 1.5)  # radians; the elbow up, the hand above the table's middle
-HOME = (
-    0.46,
-    -1.64,
-    -0.16,
-    1.28,
-    0.08,
-    0.81,
-    1.95,
-)  # radians; the hand up and left, out of view
+HOME = (0.46, -1.64, -0.16, 1.28, 0.08, 0.81, 1.95)  # radians; the hand up and left, out of view
 STAND = (
     *("pedestal", "pedestal_feet", "controller_box", "right_arm_base_link"),
     *("torso", "right_l0", "head", "screen", "head_camera"),

@@ -27,7 +27,7 @@ class StickRobot:
         self._tip = np.array(RETRACTED) - (0.0, 0.0, _MIDDLE)
 
     def fits(self, place: Point) -> bool:
-        self._put(place, np.zeros(3))
+        self._put(place, np.zeros(3))  # not `occupied`: Bullet's later contacts depend on where the tool has been
         return not any(self._world.overlaps(self._tool, body) for body in self._world.objects)
 
     def reaches(self, start: Point, end: Point) -> bool:

@@ -30,13 +30,4 @@ def segmenter_of(segmentation: str | SegmenterFactory, true_masks: TrueMasks, sl
     return SEGMENTERS[segmentation](true_masks, slots)
 
 
-__all__ = [
-    "SEGMENTERS",
-    "ClusterSegmenter",
-    "MaskSegmenter",
-    "Pixels",
-    "Segmenter",
-    "SegmenterFactory",
-    "TrueMasks",
-    "segmenter_of",
-]
+__all__ = ["SEGMENTERS", "ClusterSegmenter", "MaskSegmenter", "Pixels", "Segmenter", "SegmenterFactory", "segmenter_of"]

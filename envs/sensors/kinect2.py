@@ -84,8 +84,8 @@ class Kinect2:
         self.actual = self.viewpoint.sample(self.nominal, generator)
         self.believed = self.calibration.sample(self.actual, generator)
         # The table does not move, so one image of it serves an episode.
-        self._table = _table_depth(self.actual)
-        self._table_noise = axial_noise(self._table, _table_incidence(self.actual))
+        self._table, incidence = _bare_table(self.actual)
+        self._table_noise = axial_noise(self._table, incidence)
 
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         """Take an image."""
@@ -135,26 +135,18 @@ def axial_noise(depth: NDArray[np.floating], incidence: NDArray[np.floating]) ->
     return (1e-3 * millimetres).astype(np.float32)
 
 
-def _all_rays(camera: Camera) -> NDArray[np.float64]:
-    rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
-    return camera.rays(rows, columns)
-
-
-def _table_depth(camera: Camera) -> Image:
-    """Depth [height, width] of the bare table, `NOTHING` beside it."""
-    directions = _all_rays(camera) @ camera.axes
+def _bare_table(camera: Camera) -> tuple[Image, Image]:
+    """Of the bare table, [height, width]: depth, `NOTHING` beside it, and angle between ray and normal, radians."""
+    rays = camera.rays(*np.indices((camera.height, camera.width)).reshape(2, -1))
+    directions = rays @ camera.axes
     with np.errstate(divide="ignore"):
         depth = -camera.position[2] / directions[:, 2]
     x, y = (camera.position[axis] + depth * directions[:, axis] for axis in (0, 1))
     on_table = (x >= TABLE_LOW[0]) & (x <= TABLE_HIGH[0]) & (y >= TABLE_LOW[1]) & (y <= TABLE_HIGH[1]) & (depth > 0)
-    return np.where(on_table, depth, NOTHING).astype(np.float32).reshape(camera.height, camera.width)
-
-
-def _table_incidence(camera: Camera) -> Image:
-    """Angle [height, width], radians, between the rays and the table's normal."""
-    rays = _all_rays(camera)
     cosine = -(rays @ camera.axes[:, 2]) / np.linalg.norm(rays, axis=-1)
-    return np.arccos(np.clip(cosine, 0.0, 1.0)).astype(np.float32).reshape(camera.height, camera.width)
+    images = np.where(on_table, depth, NOTHING), np.arccos(np.clip(cosine, 0.0, 1.0))
+    depths, angles = (image.astype(np.float32).reshape(camera.height, camera.width) for image in images)
+    return depths, angles
 
 
 def _surroundings(

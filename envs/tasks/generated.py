@@ -77,21 +77,8 @@ class GeneratedLayouts:
         return by_shape[shape][int(generator.integers(len(by_shape[shape])))]
 
 
-def reachable_tiles() -> tuple[Tile, ...]:
-    """The tiles that layouts use: the tool reaches beyond their centres on every side."""
-    return _tiles_with_room(ROOM)
-
-
-def starting_tiles() -> tuple[Tile, ...]:
-    """The tiles on which the target may start: the tool gets behind it on every side.
-
-    At the border of the tool's reach, pushes move objects outwards only, and no planner brings them back.
-    """
-    return _tiles_with_room(ROOM_AT_START)
-
-
-def _tiles_with_room(room: float) -> tuple[Tile, ...]:
-    """The tiles beyond whose centres the tool's reach extends by `room` metres on every side."""
+def reachable_tiles(room: float = ROOM) -> tuple[Tile, ...]:
+    """The tiles that layouts use: the tool reaches `room` metres beyond their centres on every side."""
     rows, columns = (
         [
             number
@@ -101,6 +88,14 @@ def _tiles_with_room(room: float) -> tuple[Tile, ...]:
         for axis in (0, 1)
     )
     return tuple((i, j) for i in rows for j in columns)
+
+
+def starting_tiles() -> tuple[Tile, ...]:
+    """The tiles on which the target may start: the tool gets behind it on every side.
+
+    At the border of the tool's reach, pushes move objects outwards only, and no planner brings them back.
+    """
+    return reachable_tiles(ROOM_AT_START)
 
 
 def neighbours(tile: Tile) -> tuple[Tile, ...]:

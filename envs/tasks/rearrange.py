@@ -89,15 +89,12 @@ class Rearrange(Task):
             return self
         if self._shown is not None:
             _check_count(f"goal {self.goal}", len(self._shown.centers), objects)
-            return self._with_places(assign(observation, self._shown))
+            # Not by `replace`: nobody else may give places beside a file.
+            episode = copy.copy(self)
+            object.__setattr__(episode, "places", _places(assign(observation, self._shown)))
+            vars(episode).pop("_padded", None)  # those of no places
+            return episode
         return replace(self, places=sample_places(self.region, objects, self.clearance, generator))
-
-    def _with_places(self, places: Sequence[Place]) -> Rearrange:
-        """This task in an episode, with the places of its file, which nobody else may give beside it."""
-        episode = copy.copy(self)
-        object.__setattr__(episode, "places", _places(places))
-        vars(episode).pop("_padded", None)  # those of no places
-        return episode
 
     def to(self, device: torch.device) -> Rearrange:
         """As of `Task`, the places included."""
@@ -136,17 +133,16 @@ def _places(given: Any) -> tuple[Place, ...]:
     Raises:
         ValueError: they are no points on the table, or too many.
     """
-    if not isinstance(given, list | tuple):
-        raise ValueError(f"places must be a list of points such as [[0.5, 0.1], [0.4, -0.2]], not {given!r}")
-    if len(given) > MAXIMUM_OBJECTS:
-        raise ValueError(f"places must be at most {MAXIMUM_OBJECTS} points, not {len(given)}")
-    for point in given:
-        pair = isinstance(point, list | tuple) and len(point) == 2
-        if not (pair and all(type(value) in (int, float) for value in point)):
-            raise ValueError(f"places: a point is two numbers in metres such as [0.5, 0.1], not {point!r}")
+    try:
+        points = np.array(given, dtype=np.float64).reshape(len(given), 2)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"places must be points in metres such as [[0.5, 0.1], [0.4, -0.2]], not {given!r}") from error
+    if len(points) > MAXIMUM_OBJECTS:
+        raise ValueError(f"places must be at most {MAXIMUM_OBJECTS} points, not {len(points)}")
+    for point in points.tolist():
         if not all(low < value < high for low, value, high in zip(TABLE_LOW, point, TABLE_HIGH, strict=True)):
-            raise ValueError(f"places: {list(point)} is off the table, from {list(TABLE_LOW)} to {list(TABLE_HIGH)}")
-    return tuple((float(x), float(y)) for x, y in given)
+            raise ValueError(f"places: {point} is off the table, from {list(TABLE_LOW)} to {list(TABLE_HIGH)}")
+    return tuple((x, y) for x, y in points.tolist())
 
 
 def _check_count(what: str, places: int, objects: int) -> None:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.tasks.task import Step, Task, off_table
-from envs.tasks.tiles import DistanceField, grid
+from envs.tasks.task import Step, Task
+from envs.tasks.tiles import DistanceField, grid, table_distance
 from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 REWARD_NAMES = ("dense", "sparse")
@@ -62,7 +62,8 @@ class DistanceToGoal:
         self._own_goals = None if reward.task.goal_is_shared else reward.task
         if self._own_goals is not None:
             return
-        outcome = _alone(reward, grid())
+        alone = torch.cat([grid(), torch.zeros_like(grid()[..., :1])], -1).unsqueeze(-2)  # one object at rest
+        outcome = reward(alone, alone, torch.ones_like(alone[..., 0], dtype=torch.bool))
         self._field = DistanceField(~outcome.failure, outcome.success).to(reward.device)
 
     def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
@@ -136,7 +137,7 @@ class TaskReward:
 
     def _judge(self, states: Tensor, mask: Tensor, fallen: bool) -> Outcome:
         step = Step(states[..., :2], mask.unsqueeze(-2), self.margin)
-        fall = step.any_enters(off_table)
+        fall = step.any_enters(lambda points: -table_distance(points))
         if fallen:
             fall = torch.ones_like(fall)
         violated = self.task.violation if self.criterion == "strict" else self.task.published_violation
@@ -163,9 +164,3 @@ class TaskReward:
     def maximum_return(self) -> float:
         """Upper bound on the return of any episode; infinite where progress counts."""
         return math.inf if self.dense else self.task.maximum_return
-
-
-def _alone(reward: TaskReward, points: Tensor) -> Outcome:
-    """The outcome for a single object, the target, that rests at points [..., 2] metres: [...]."""
-    centers = torch.cat([points, torch.zeros_like(points[..., :1])], -1).unsqueeze(-2)
-    return reward(centers, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))

@@ -21,7 +21,7 @@ from torch import Tensor
 from envs.markings import Place, TileGroup
 from envs.observation import Observation
 from envs.tasks.generated import GeneratedLayouts
-from envs.tasks.tiles import TileSet, box_distance, parse_tiles, table_distance
+from envs.tasks.tiles import TileSet, box_distance, parse_tiles
 from envs.workspace import REACH_HIGH, REACH_LOW, Tile
 
 STILL = 0.005  # metres; what moves by less is taken to stay where it is
@@ -79,7 +79,7 @@ class Step(NamedTuple):
         Args:
             arrived: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
         """
-        depths = torch.where(arrived(self.states), -torch.inf, _out_of_reach(self.states))
+        depths = torch.where(arrived(self.states), -torch.inf, -box_distance(self.states, REACH_LOW, REACH_HIGH))
         before, after = depths[..., :-1, :], depths[..., 1:, :]
         return ((after > -self.margin) & (after > before + STILL) & self.mask).any(dim=-1)
 
@@ -94,16 +94,6 @@ class Step(NamedTuple):
         depths = depth(states)  # once per state, although a state is after one push and before the next
         before, after = depths[..., :-1, :], depths[..., 1:, :]
         return (after > 0.0) | ((after > -self.margin) & (after > before))
-
-
-def off_table(points: Tensor) -> Tensor:
-    """Metres by which points [..., 2] lie off the table, negative on it: [...]."""
-    return -table_distance(points)
-
-
-def _out_of_reach(points: Tensor) -> Tensor:
-    """Metres by which points [..., 2] lie outside the box that the tool's tip reaches, negative within: [...]."""
-    return -box_distance(points, REACH_LOW, REACH_HIGH)
 
 
 GOAL_REWARD = 100.0
@@ -172,8 +162,6 @@ class Task(ABC):
                 raise ValueError(f"{name} needs at least one tile")
             object.__setattr__(self, name, TileSet(tiles))
         self.check()
-
-    # Methods that a task defines.
 
     def check(self) -> None:  # noqa: B027 (a task may have nothing to check)
         """Raise ValueError if tiles contradict one another; the message need not name the layout's file."""
@@ -255,8 +243,6 @@ class Task(ABC):
             ValueError: there is no such layout.
         """
         raise ValueError(f"task {cls.name} has no generated layouts: give another layout, or another task")
-
-    # Derived from them.
 
     @classmethod
     def layout_keys(cls) -> dict[str, bool]:

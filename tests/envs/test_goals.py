@@ -1,4 +1,4 @@
-"""Goals: from files or at random, and which place is whose."""
+"""Rearranging: goals from files or at random, which place is whose, and rewards."""
 
 from __future__ import annotations
 
@@ -7,17 +7,23 @@ import pickle
 from collections.abc import Callable
 from itertools import combinations, permutations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from safetensors.numpy import save
 
-from envs.goals import LARGEST, SHAPE_WEIGHT, Goal, assign, outlines, read_goal, sample_places, save_goal
+from envs.goals import LARGEST, SHAPE_WEIGHT, Goal, assign, read_goal, sample_places, save_goal
+from envs.layouts import parse_task
 from envs.observation import Observation
+from envs.pushing import PushingEnv
 from envs.scene import Scene
+from envs.tasks import Outcome, TaskReward
+from envs.tasks.rearrange import LEAST_TOLERANCE, TOLERANCE, Rearrange
 from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
 
 # Half length, half width and height in metres of a book, a can and a cube.
@@ -77,22 +83,16 @@ def test_objects_that_look_the_same_take_the_shortest_ways_in_total(
     assert np.linalg.norm(np.array(found) - np.array(starts), axis=-1).sum() <= min(ways) + SHAPE_WEIGHT * 1e-5
 
 
-def test_an_outline_is_of_height_length_and_width() -> None:
-    (found,) = outlines(cloud(BOOK, (0.5, 0.2), 0.7)[None])
-    expected = [BOOK[2], BOOK[0] / np.sqrt(3), BOOK[1] / np.sqrt(3)]  # a uniform block's standard deviations
-    assert found == pytest.approx(expected, abs=5e-3)
-
-
-PLACES = ((0.45, -0.20), (0.60, 0.25), (0.70, -0.05))
+SHOWN = ((0.45, -0.20), (0.60, 0.25), (0.70, -0.05))
 FLAT = np.ones((212, 256))  # metres: an empty table
 CLOUDS = np.full((2, POINTS_PER_OBJECT, 3), 0.5, np.float32)
 
 
 @pytest.fixture
 def shown(scene: Scene, put: Callable) -> Scene:
-    """Three objects at `PLACES`."""
+    """Three objects at `SHOWN`."""
     names = ("sugar_box", "rubiks_cube", "potted_meat_can")
-    objects = [put(name, x, y) for name, (x, y) in zip(names, PLACES, strict=True)]
+    objects = [put(name, x, y) for name, (x, y) in zip(names, SHOWN, strict=True)]
     scene.reset(objects, np.random.default_rng(0))
     return scene
 
@@ -165,3 +165,87 @@ def test_places_lie_on_the_tiles_and_apart(seed: int, count: int) -> None:
 def test_places_for_which_there_is_no_room_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^no room for 3 places at least 0\.5 m apart in the region: add tiles"):
         sample_places([(1, 2)], 3, 0.5, np.random.default_rng(0))
+
+
+LAYOUT = {"region": [(1, 3)], "target_start": [(1, 1)], "obstacle_start": [(1, 5)]}
+PLACES = ((0.5, 0.1), (0.4, -0.2))
+TASK = Rearrange(places=PLACES, **LAYOUT)
+MASK = torch.tensor([True, True])
+
+offsets = st.floats(0.0, 0.08)
+
+
+def states(*points: tuple[float, float]) -> torch.Tensor:
+    return torch.tensor([[*point, 0.03] for point in points], dtype=torch.float64)
+
+
+def away(place: tuple[float, float], distance: float, angle: float) -> tuple[float, float]:
+    return place[0] + distance * np.cos(angle), place[1] + distance * np.sin(angle)
+
+
+def rearrange(*points: tuple[float, float], task: Rearrange = TASK, **options: Any) -> Outcome:
+    after = states(*points)
+    return TaskReward(task, **options)(states(*[(0.6, 0.3)] * len(points)), after, torch.ones(len(points)) > 0)
+
+
+@settings(deadline=None, max_examples=30)
+@given(offsets, offsets, angles, angles)
+def test_it_succeeds_when_every_object_is_within_the_tolerance(one: float, other: float, a: float, b: float) -> None:
+    points = away(PLACES[0], one, a), away(PLACES[1], other, b)
+    if min(abs(one - TOLERANCE), abs(other - TOLERANCE)) > 1e-9:
+        assert bool(rearrange(*points).success) == (one < TOLERANCE and other < TOLERANCE)
+    assert bool(rearrange(*points, margin=0.0).success) >= bool(rearrange(*points, margin=0.01).success)
+
+
+def test_a_margin_asks_planners_for_more_but_never_for_the_impossible() -> None:
+    assert rearrange(away(PLACES[0], 0.019, 1.0), PLACES[1], margin=0.01).success
+    assert not rearrange(away(PLACES[0], 0.021, 1.0), PLACES[1], margin=0.01).success
+    for margin in (0.02, 0.05):
+        assert rearrange(away(PLACES[0], 0.9 * LEAST_TOLERANCE, 1.0), PLACES[1], margin=margin).success
+        assert not rearrange(away(PLACES[0], 1.1 * LEAST_TOLERANCE, 1.0), PLACES[1], margin=margin).success
+
+
+def test_dense_progress_is_the_way_that_objects_came_closer_to_their_places() -> None:
+    before, after = states((0.5, 0.3), (0.4, -0.5)), states((0.5, 0.2), (0.4, -0.55))
+    outcome = TaskReward(TASK, reward="dense")(before, after, MASK)
+    assert outcome.terms["progress"].item() == pytest.approx(0.1 - 0.05, abs=1e-6)
+
+
+def test_every_seed_has_places_of_its_own_and_always_the_same() -> None:
+    env = PushingEnv(task="rearrange", reward="dense")
+    found = [env.reset(seed=seed)[1]["task"] for seed in (1, 2, 1)]
+    assert found[0] == found[2] != found[1]
+    assert all(len(task.places) == 3 for task in found)
+    assert env.task == found[2] and env.reward.task == found[2] and env.reward.dense
+    env.close()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".safetensors"])
+def test_the_places_of_a_file_are_those_of_its_objects(suffix: str, tmp_path: Path) -> None:
+    env = PushingEnv(task="rearrange")
+    env.reset(seed=4)
+    for push in ((0.1, 0.2, 0.9, -0.4), (-0.2, -0.5, 0.2, 0.9)):
+        env.step(np.array(push, dtype=np.float32))
+    save_goal(tmp_path / f"goal{suffix}", env.scene)
+    shown = env.scene.observe().centers[:3]
+    told = PushingEnv(task="rearrange", tiles={"goal": str(tmp_path / f"goal{suffix}")})
+    _, info = told.reset(seed=4)  # the same objects, as they stood before the pushes
+    for one in (env, told):
+        one.close()
+    np.testing.assert_allclose(info["task"].places, shown[:, :2], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"places": [3]}, r"places must be points in metres such as \[\[0\.5, 0\.1\], \[0\.4, -0\.2\]\], not \[3\]$"),
+        ({"places": [[0.1, 0.1]]}, r"places: \[0\.1, 0\.1\] is off the table, from \[0\.22, -0\.61\] to"),
+        ({"places": [[0.5, 0.1]] * 11}, r"places must be at most 10 points, not 11$"),
+        ({"goal": [[1, 2]]}, r"goal must be the path of a file, not \[\[1, 2\]\]$"),
+        ({"goal": "a.png", "places": [(0.5, 0.1)]}, r"goal a\.png and places both say .*: give one of them$"),
+        ({"clearance": -1}, r"clearance must be at least 0 metres, not -1$"),
+    ],
+)
+def test_what_is_no_rearrangement_is_refused_in_one_line(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=rf"^layout: {message}"):
+        parse_task("rearrange", {**{name: list(tiles) for name, tiles in LAYOUT.items()}, **change})

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from envs.objects.sampling import Area, ObjectRanges
 from envs.observation import Observation
-from envs.policy import NEAR, NOISE, SPREAD, START_CLEARANCE, HeuristicPushingPolicy
+from envs.policy import NEAR, START_CLEARANCE, HeuristicPushingPolicy
 from envs.robots import STICK_RADIUS
 from envs.scene import Scene
 from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
@@ -35,7 +35,7 @@ def blobs(seed: int, count: int = 3) -> Observation:
     return Observation(clouds, clouds.mean(axis=1), mask, mask)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=20)
 @given(seed=SEEDS, count=st.integers(1, OBJECT_SLOTS))
 def test_pushes_start_clear_of_every_object(seed: int, count: int) -> None:
     observed = blobs(seed, count)
@@ -48,19 +48,7 @@ def test_pushes_start_clear_of_every_object(seed: int, count: int) -> None:
         assert np.linalg.norm(observed.clouds[:count, ::4, :2] - start, axis=-1).min() >= STICK_RADIUS
 
 
-@settings(deadline=None, max_examples=30)
-@given(SEEDS)
-def test_pushes_point_within_45_degrees_of_the_held_angle_but_for_noise(seed: int) -> None:
-    assert np.degrees(SPREAD) == pytest.approx(45) and NOISE == 0.3
-    policy = HeuristicPushingPolicy(np.random.default_rng(seed))
-    for _ in range(6):
-        action = policy.act(blobs(seed))
-        cone = policy.intent.angle + np.linspace(-SPREAD, SPREAD, 2001)
-        directions = np.stack([np.cos(cone), np.sin(cone)], axis=1)
-        assert np.abs(action[2:] - directions).max(axis=1).min() <= NOISE + 0.001
-
-
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=20)
 @given(SEEDS)
 def test_pushes_bring_the_tool_near_their_target(seed: int) -> None:
     policy = HeuristicPushingPolicy(np.random.default_rng(seed))
@@ -83,21 +71,6 @@ def test_target_and_angle_are_kept_for_the_length_of_an_intent(length: int) -> N
     assert all(len(run) == 1 for run in runs)
     assert len(set.union(*runs)) == 6
     assert len({target for target, _ in intents}) > 1
-
-
-def test_a_share_of_the_pushes_starts_elsewhere_with_the_same_motion() -> None:
-    shifts = []
-    for seed in range(100):
-        plain, perturbed = (
-            HeuristicPushingPolicy(np.random.default_rng(seed), perturbation_rate=share).act(blobs(seed, 2))
-            for share in (0.0, 0.4)
-        )
-        np.testing.assert_array_equal(perturbed[2:], plain[2:])
-        assert (np.abs(perturbed) <= 1).all()
-        shifts.append(push_endpoints(perturbed)[0] - push_endpoints(plain)[0])
-    moved = [shift for shift in shifts if np.abs(shift).max() > 1e-9]
-    assert 25 < len(moved) < 55
-    assert 0.02 < np.std(moved) < 0.06
 
 
 def test_most_pushes_move_something_and_few_are_unsafe() -> None:

@@ -5,19 +5,17 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-import yaml
 from gymnasium.utils.env_checker import check_env
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from envs.layouts import layout_numbers, load_task
+from envs.layouts import layout_numbers
 from envs.objects.sampling import ObjectParameters, ObjectRanges
 from envs.observation import Observation
 from envs.policy import HeuristicPushingPolicy
@@ -185,27 +183,6 @@ def test_the_same_seed_and_actions_give_the_same_episode(make: Make) -> None:
         first, second = one.step(action), other.step(action)
         assert_equal(first[0], second[0])
         assert first[1:] == second[1:]
-
-
-def test_resets_without_a_seed_go_on_to_new_scenes_in_a_repeatable_order(make: Make) -> None:
-    env = make(objects=2)
-    runs = []
-    for _ in range(2):
-        env.reset(seed=3)
-        runs.append([env.reset()[0] for _ in range(2)])
-    assert_equal(runs[0][0], runs[1][0])
-    assert_equal(runs[0][1], runs[1][1])
-    assert not np.array_equal(runs[0][0]["centers"], runs[0][1]["centers"])
-
-
-def test_a_layout_may_be_a_number_or_a_file_or_belong_to_a_task_that_has_been_built(make: Make, tmp_path: Path) -> None:
-    path = tmp_path / "unseen.yaml"
-    path.write_text(yaml.safe_dump(TILES))
-    given = ({"task": BRIDGE}, {"layout": path}, {"layout": str(path)}, {"task": Crossing, "layout": path})
-    assert [make(**options).task for options in given] == [BRIDGE] * 4
-    assert make(task="insertion", layout=2).task == load_task("insertion", 2)
-    changed = make(task="insertion", layout=2, tiles={"goal": [[3, 3]]}).task
-    assert changed.goal.tiles == ((3, 3),) and changed.region == load_task("insertion", 2).region
 
 
 @pytest.mark.parametrize(

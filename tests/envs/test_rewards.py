@@ -1,4 +1,4 @@
-"""Rewards as the paper's appendix "Task Details" defines them, and those of gathering."""
+"""Rewards as the paper's appendix "Task Details" defines them, those of gathering, and the remaining distance."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from envs.tasks import Outcome, Task, TaskReward
+from envs.layouts import load_task, parse_task
+from envs.tasks import TASKS, Outcome, Task, TaskReward
 from envs.tasks.clearing import Clearing
 from envs.tasks.crossing import Crossing
 from envs.tasks.gathering import Gathering
 from envs.tasks.insertion import Insertion
-from envs.workspace import tile_center
+from envs.tasks.tiles import SPACING
+from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, tile_center
 
 # A square of four tiles in the table's middle, x 0.37 to 0.67 and y -0.11 to 0.19.
 SQUARE = ((1, 3), (1, 4), (2, 3), (2, 4))
@@ -131,14 +133,6 @@ def test_clearing_pulls_objects_to_the_nearest_of_all_four_edges(near: Point, ou
         assert towards.terms["progress"].item() == pytest.approx(0.02)
         assert away.terms["progress"].item() == pytest.approx(-0.02)
         assert away.reward.item() == pytest.approx(-1.02)
-
-
-@pytest.mark.parametrize("task", [INSERTION, CROSSING])
-def test_a_margin_leaves_the_goal_as_it_is(task: Task) -> None:
-    just_in = tile(2, task.goal.tiles[0][1] + 0.45)
-    before = [tile(2, task.goal.tiles[0][1] + 0.8), ASIDE]
-    assert judge(task, before, [just_in, ASIDE]).success
-    assert judge(task, before, [just_in, ASIDE], margin=0.02).success
 
 
 def test_a_margin_widens_the_region_to_clear() -> None:
@@ -277,3 +271,76 @@ def test_gathering_pulls_every_object_to_the_region() -> None:
     assert outcome.reward.item() == pytest.approx(-1 + 0.38)  # not every object is inside
     with pytest.raises(ValueError, match=r"^target_start tile \[1, 3\] is in the region to gather in$"):
         Gathering(**{**vars(GATHERING), "target_start": [(1, 3)]})
+
+
+UPPER = [(1, column) for column in range(1, 6)]
+U = [*UPPER, (2, 5), *[(3, column) for column in range(1, 6)]]
+ERROR = 0.035  # metres, of the grid round two corners
+
+
+def crossing(region: list[Tile], goal: Tile) -> TaskReward:
+    start = next(tile for tile in region if tile != goal)
+    return TaskReward(
+        parse_task("crossing", {"region": region, "goal": [goal], "target_start": [start], "obstacle_start": [start]})
+    )
+
+
+def left(reward: TaskReward, *places: tuple[float, float]) -> float:
+    """Metres from the centres of objects in the middle of these tiles, or between them."""
+    centers = torch.tensor([[*tile_center(place), 0.03] for place in places], dtype=torch.float32)
+    return float(reward.distance_to_goal(centers, torch.ones(len(places), dtype=torch.bool)))
+
+
+def test_the_distance_follows_a_bridge_round_its_bend() -> None:
+    reward = crossing(U, (3, 1))
+    half, side = TILE_SIDE / 2, TILE_SIDE
+    below = [((3, 5), 3.5 * side), ((3, 3), 1.5 * side), ((3, 2), half), ((3, 1), 0.0)]  # straight to the goal's border
+    for tile, metres in below:
+        assert left(reward, tile) == pytest.approx(metres, abs=1e-6)
+    # From the upper arm: to the first inner corner, one side down to the second, three sides along the lower arm.
+    for column in (1, 2, 3, 4):
+        to_corner = math.hypot(half, (4.5 - column) * side)
+        assert left(reward, (1, column)) == pytest.approx(to_corner + side + 3 * side, abs=ERROR)
+    # The straight path from the start is two tiles long.
+    assert left(reward, (1, 1)) > 1.1 > 3 * side > 2 * side
+
+
+def test_to_clear_is_the_distance_out_of_the_region_of_all_objects_together() -> None:
+    tiles = [[row, column] for row in (1, 2, 3) for column in (2, 3, 4)]
+    task = parse_task("clearing", {"region": tiles, "target_start": tiles, "obstacle_start": tiles})
+    for margin in (0.0, 0.02):
+        reward = TaskReward(task, margin=margin)
+        out = 1.5 * TILE_SIDE + margin
+        assert left(reward, (2, 3)) == pytest.approx(out, abs=SPACING)
+        assert left(reward, (2, 3), (2, 2), (0, 0)) == pytest.approx(out + TILE_SIDE / 2 + margin, abs=2 * SPACING)
+    centers = torch.tensor([[*tile_center((2, 3)), 0.03]] * 2)
+    assert reward.distance_to_goal(centers, torch.tensor([True, False])) == pytest.approx(
+        out, abs=SPACING
+    )  # without padding
+
+
+def test_to_insert_is_the_distance_through_the_mouth_of_the_slot() -> None:
+    reward = TaskReward(load_task("insertion", 0))  # the slot (2, 1) is open towards (2, 2)
+    assert left(reward, (2, 3)) == pytest.approx(1.5 * TILE_SIDE, abs=SPACING)
+    assert left(reward, (4, 2)) == pytest.approx(math.hypot(1.5 * TILE_SIDE, TILE_SIDE / 2), abs=ERROR)
+
+
+def test_where_each_object_has_its_own_place_it_is_the_distance_to_that() -> None:
+    tiles = {"region": [[2, 3]], "target_start": [[2, 3]], "obstacle_start": [[2, 3]]}
+    task = parse_task("rearrange", {**tiles, "places": [tile_center((1, 1)), tile_center((3, 5))]})
+    assert left(TaskReward(task), (1, 1), (3, 4)) == pytest.approx(TILE_SIDE)
+    assert left(TaskReward(task), (3, 5), (1, 1)) == pytest.approx(2 * TILE_SIDE * math.hypot(2, 4))
+
+
+@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.goal_is_shared])
+def test_the_distance_is_zero_where_the_task_is_solved_and_nowhere_longer_than_it_says(name: str) -> None:
+    reward = TaskReward(load_task(name, 0), margin=0.02)
+    torch.manual_seed(0)
+    low, high = torch.tensor(TABLE_LOW), torch.tensor(TABLE_HIGH)
+    planar = low + (high - low) * torch.rand(4000, 1, 2)
+    centers, mask = torch.cat([planar, torch.zeros(4000, 1, 1)], -1), torch.ones(4000, 1, dtype=torch.bool)
+    distances = reward.distance_to_goal(centers, mask)
+    solved = reward(centers, centers, mask).success
+    assert solved.any() and distances[solved].max() <= SPACING
+    assert distances[~solved].mean() > SPACING
+    assert (distances >= 0).all() and (distances <= reward.distance_to_goal.longest(mask)).all()

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.robots import STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, push
+from envs.robots import TIP_HEIGHT, push
 from envs.robots.arm import inverse_kinematics
 from envs.robots.robot import ABOVE_HEIGHT
 from envs.robots.sawyer import sawyer
@@ -110,19 +110,6 @@ def test_a_push_onto_an_object_is_unsafe_under_every_robot(
     report = scene.push(push(0.55, 0.01, 0.1, 0.0))
     assert report.unsafe and report.ineffective and report.stopped == ""
     np.testing.assert_array_equal(scene.ground_truth().positions, before.positions)
-
-
-def test_whether_the_tool_fits_is_the_same_for_a_shape_and_for_the_stick_itself(
-    scene_of: Callable, put: Callable
-) -> None:
-    scene = scene_of("stick")
-    scene.reset([put("mug", 0.5, 0.0), put("banana", 0.6, 0.1)], np.random.default_rng(0))
-    places = np.random.default_rng(0).uniform((0.42, -0.08), (0.68, 0.2), size=(500, 2))
-    fits = [scene.robot.fits(np.append(place, TIP_HEIGHT)) for place in places]
-    scene.robot.leave()
-    size = {"radius": STICK_RADIUS, "length": STICK_LENGTH}
-    assert fits == [not scene.world.occupied((*place, TIP_HEIGHT), **size) for place in places]
-    assert 0.1 < np.mean(fits) < 0.9
 
 
 def test_a_push_out_of_reach_is_not_begun(scene_of: Callable, put: Callable, push: Callable) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -14,20 +14,13 @@ from hypothesis import strategies as st
 from envs.objects.sampling import ObjectParameters
 from envs.pushing import PushingEnv
 from envs.scene import Scene
-from envs.segmentation import SEGMENTERS, ClusterSegmenter, MaskSegmenter
+from envs.segmentation import ClusterSegmenter, MaskSegmenter
 from envs.segmentation.height_map import fit_table, split_at_necks
-from envs.segmentation.registration import Pose, explain, shape_of
-from envs.sensors import CAMERAS, DepthImage
+from envs.segmentation.registration import explain, shape_of
+from envs.sensors import DepthImage
 from envs.sensors.camera import Camera
 
 CAMERA = Camera(256, 212, rotation=(0.02, -0.02, 0.01))
-
-
-@pytest.fixture(scope="module")
-def seen_by_kinect() -> Iterator[Scene]:
-    scene = Scene(camera="kinect2", segmentation="clusters")
-    yield scene
-    scene.close()
 
 
 def table(camera: Camera = CAMERA, *boxes: tuple[float, float, float, float], height: float = 0.05) -> DepthImage:
@@ -166,7 +159,7 @@ def boxes_on_map(*boxes: tuple[float, float, float, float, float, float]) -> lis
 SIDES = ((6.0, 9.0, 0.045), (5.0, 5.0, 0.07), (4.0, 10.0, 0.02))  # cells, metres
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=4)
 @given(st.floats(-0.3, 0.3), st.integers(-6, 6), st.integers(-6, 6), st.permutations(range(3)))
 def test_cells_go_to_the_shape_that_they_come_from(turn: float, down: int, right: int, order: list[int]) -> None:
     before = [one[0] for one in (boxes_on_map((20 * n + 20, 40, 0.0, *sides)) for n, sides in enumerate(SIDES))]
@@ -183,25 +176,8 @@ def test_cells_go_to_the_shape_that_they_come_from(turn: float, down: int, right
         assert (owners[after[n] > 0] == n).mean() > 0.85
 
 
-def test_a_shape_that_is_not_on_the_map_is_not_laid_there() -> None:
-    maps = boxes_on_map((20, 40, 0.0, *SIDES[0]), (45, 40, 0.0, *SIDES[1]))
-    shapes = [shape_of(one > 0, one) for one in maps]
-    assert set(explain(maps[0], shapes, ()).poses) == {0}
-    assert set(explain(maps[0] + maps[1], shapes, ()).poses) == {0, 1}
-
-
-@settings(deadline=None, max_examples=20)
-@given(st.floats(-3.1, 3.1), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
-def test_a_shape_covers_as_many_cells_wherever_it_is_placed(turn: float, row: float, column: float) -> None:
-    (one,) = boxes_on_map((40, 40, 0.0, *SIDES[0]))
-    shape = shape_of(one > 0, one)
-    cells, heights = shape.covered_cells(Pose(row, column, turn))
-    assert len(np.unique(cells, axis=0)) == len(cells) == pytest.approx(shape.area, rel=0.1)
-    np.testing.assert_allclose(cells.mean(axis=0), (row, column), atol=1.0)
-    assert set(heights) == {np.float32(SIDES[0][2])}
-
-
-def test_clusters_agree_with_the_mask_on_what_the_kinect_sees(seen_by_kinect: Scene, put: Callable) -> None:
+def test_clusters_agree_with_the_mask_on_what_the_kinect_sees(put: Callable) -> None:
+    seen_by_kinect = Scene(camera="kinect2", segmentation="clusters")
     names = ("mug", "sugar_box", "banana", "gelatin_box")
     objects: list[ObjectParameters] = [put(name, 0.45 + 0.1 * n, -0.35 + 0.22 * n) for n, name in enumerate(names)]
     observed = seen_by_kinect.reset(objects, np.random.default_rng(0))
@@ -211,12 +187,11 @@ def test_clusters_agree_with_the_mask_on_what_the_kinect_sees(seen_by_kinect: Sc
     expected = by_mask.reset(seen_by_kinect.objects, np.random.default_rng(0))
     np.testing.assert_allclose(observed.centers[:4], expected.centers[:4], atol=0.012)
     assert [one.name for one in seen_by_kinect.objects] == [one.name for one in by_mask.objects]
-    by_mask.close()
+    for one in (by_mask, seen_by_kinect):
+        one.close()
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("segmentation", SEGMENTERS)
-def test_gymnasium_finds_nothing_wrong_with_any_camera_and_segmentation(camera: str, segmentation: str) -> None:
-    env = PushingEnv(objects=2, camera=camera, segmentation=segmentation)
+def test_gymnasium_finds_nothing_wrong_with_a_kinect_and_clusters() -> None:
+    env = PushingEnv(objects=2, camera="kinect2", segmentation="clusters")
     check_env(env, skip_render_check=True)
     env.close()

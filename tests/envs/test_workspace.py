@@ -63,12 +63,6 @@ def test_a_normalised_push_starts_and_moves_as_asked(start: tuple, motion: tuple
     np.testing.assert_allclose(ended, np.clip(wanted + moved, low, high), atol=1e-12)
 
 
-@pytest.mark.parametrize("i", range(5))
-@pytest.mark.parametrize("j", range(7))
-def test_tile_centres_are_those_of_the_published_grid(i: int, j: int) -> None:
-    np.testing.assert_allclose(tile_center((i, j)), (0.295 + 0.15 * i, -0.485 + 0.15 * j), atol=1e-12)
-
-
 TILES = st.sets(st.tuples(st.integers(0, 4), st.integers(0, 6)), min_size=1, max_size=20)
 X, Y = st.floats(TABLE_LOW[0], TABLE_HIGH[0]), st.floats(TABLE_LOW[1], TABLE_HIGH[1])
 CELL = 0.01  # metres; a fifteenth of a tile's side
@@ -106,16 +100,6 @@ def test_rounding_leaves_no_gap_between_neighbours(dtype: torch.dtype) -> None:
                 point[axis] = border + offset
                 assert union.contains(point)
                 assert union.signed_distance(point) < -0.1
-
-
-def test_borders_belong_to_the_union_and_have_no_distance() -> None:
-    union = TileSet([(2, 3)])
-    x, y = tile_center((2, 3))
-    border = torch.tensor([[x + 0.075, y], [x, y - 0.075], [x - 0.075, y + 0.075]], dtype=torch.float64)
-    inwards = torch.tensor([x, y], dtype=torch.float64) - border
-    assert union.contains(border + 1e-9 * inwards).all()
-    assert not union.contains(border - 1e-9 * inwards).any()
-    torch.testing.assert_close(union.signed_distance(border), torch.zeros(3, dtype=torch.float64))
 
 
 @settings(deadline=None)

@@ -60,7 +60,7 @@ BAD_OPTIONS = [
     ),
     ("plan", "env.objects=toys", "unknown env.objects 'toys': choose from builtin, ycb, mixed, random"),
     ("plan", "env.objects=ycb", "give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to DIR"),
-    ("collect", "env.objects=mixed env.assets=nowhere", "no objects in nowhere/ycb: meta.json cannot be read"),
+    ("collect", "env.objects=mixed env.assets=nowhere", "the objects in nowhere/ycb cannot be used"),
     ("plan", "env/ranges=wild", "unknown env/ranges 'wild': choose from paper, published"),
     ("plan", "env.ranges.target=[fork]", "unknown object 'fork' in env.ranges.target: choose from sugar_box"),
     ("plan", "env.ranges.names=mug", "env.ranges.names must be a list, not mug"),
