@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import shlex
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
@@ -30,7 +29,6 @@ from cavin_pyro.storage.run_directory import write_config
 
 ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
-SIGNALLED = [128 + number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]  # exit status of a command
 RESULTS = {"collect": "statistics.png", "pretrain": "reconstructions.png", "train": "training.png"}  # written last
 
 
@@ -161,7 +159,7 @@ def run_stage(stage: Stage) -> Path:
         with open(log, "a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
             import_module(f"cavin_pyro.{stage.command}").main()
     except SystemExit as end:
-        if end.code in SIGNALLED:
+        if end.code in (129, 130, 143):  # SIGHUP, SIGINT, SIGTERM
             raise KeyboardInterrupt from end
         last = log.read_text(encoding="utf-8").strip().splitlines()[-1].removeprefix("error: ")
         line = shlex.join(["python", "-m", f"cavin_pyro.{stage.command}", *sys.argv[1:]])

@@ -15,7 +15,6 @@ from cavin_pyro.reproduction.statistics import paired_tests, rates
 from cavin_pyro.reproduction.table import CELL, CRITERIA
 from cavin_pyro.storage.files import atomic_write, write_json
 
-PAGE, STATISTICS = "results.md", "statistics.json"
 HEAD = """# The paper's experiments
 
 {episodes} episodes, scenes {first} to {last}, {trainings} training seed(s) of each method, objects told apart in the
@@ -38,7 +37,7 @@ def write_results(home: Path, table: pd.DataFrame, command: str) -> list[Path]:
         command: the line that makes them anew, for the page.
     """
     measured, compared = rates(table), paired_tests(table)
-    write_json(home / STATISTICS, {"rates": measured.to_dict("records"), "tests": compared.to_dict("records")})
+    write_json(home / "statistics.json", {"rates": measured.to_dict("records"), "tests": compared.to_dict("records")})
     seeds, trainings = table["seed"], table["training_seed"].nunique()
     counts = {"episodes": len(table), "trainings": trainings, "first": seeds.min(), "last": seeds.max()}
     lines, pictures = [HEAD.format(**counts, command=command)], []
@@ -50,9 +49,9 @@ def write_results(home: Path, table: pd.DataFrame, command: str) -> list[Path]:
             lines += [*markdown(_cells(measured, compared, planner, criterion)), ""]
             if found := claims(measured, compared, planner=planner, criterion=criterion):
                 lines += ["The paper's claims:", "", *markdown(pd.DataFrame(found)), "", ABOUT_CLAIMS]
-    with atomic_write(home / PAGE) as temporary:
+    with atomic_write(home / "results.md") as temporary:
         temporary.write_text("\n".join(lines), encoding="utf-8")
-    return [home / PAGE, home / STATISTICS, *pictures]
+    return [home / "results.md", home / "statistics.json", *pictures]
 
 
 def markdown(table: pd.DataFrame) -> list[str]:
@@ -65,8 +64,8 @@ def _cells(measured: pd.DataFrame, compared: pd.DataFrame, planner: str, criteri
     """A row for each task, reward and number of objects, the top row of the figure first; a column for each method."""
     joined = measured.merge(compared[[*CELL, "criterion", "p_holm"]], how="left")
     own = joined[(joined["planner"] == planner) & (joined["criterion"] == criterion)]
-    place = ["task", "reward", "objects"]
-    cells = own.assign(entry=own.apply(_entry, axis=1)).pivot(index=place, columns="method", values="entry")
+    entries = own.assign(entry=own.apply(_entry, axis=1))
+    cells = entries.pivot(index=["task", "reward", "objects"], columns="method", values="entry")
     methods = {name: method.label for name, method in METHODS.items() if name in cells}
     cells = cells[list(methods)].rename(columns=methods).fillna("").reset_index()
     return cells.sort_values("objects", key=lambda counts: counts != TOP_ROW_OBJECTS, kind="stable")

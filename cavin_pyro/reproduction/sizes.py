@@ -20,7 +20,7 @@ class Size:
             seeds; each of them gets scenes of its own, which are the same for all methods.
         first_scene: seed of the first scene; no other run uses these scenes. The training seed at place i has those
             from first_scene + 1000 i on.
-        collection, pretraining, training, planning: further overrides of `collect`, `pretrain`, `train` and `evaluate`.
+        collection, pretraining, training, planning: overrides of `collect`, `pretrain`, `train` and `evaluate`.
     """
 
     transitions: int
@@ -57,8 +57,7 @@ QUICK_TRAINING = (
 )
 
 SIZES: dict[str, Size] = {
-    # For tests: every stage once, in a minute.
-    "minimal": Size(
+    "minimal": Size(  # for tests: every stage once, in a minute
         transitions=100,
         training_seeds=(0,),
         episodes=1,
@@ -71,8 +70,7 @@ SIZES: dict[str, Size] = {
         training=TINY_TRAINING,
         planning=("planner.samples=8", "planner.horizon=6", "maximum_steps=2"),
     ),
-    # To see that everything runs: minutes. Its success rates mean nothing.
-    "smoke": Size(
+    "smoke": Size(  # to see that everything runs, in minutes; its success rates mean nothing
         transitions=400,
         training_seeds=(0,),
         episodes=2,
@@ -92,8 +90,7 @@ SIZES: dict[str, Size] = {
         pretraining=("clouds=20000", "steps=2000"),
         training=(*QUICK_TRAINING, "trainer.steps=4000"),
     ),
-    # What two cores do in half a day, with trainings long enough to compare the methods.
-    "medium": Size(
+    "medium": Size(  # half a day on two cores, with trainings long enough to compare the methods
         transitions=200_000,
         training_seeds=(0, 1, 2),
         episodes=60,

@@ -19,15 +19,14 @@ from tqdm import tqdm
 
 def progress_bar(label: str, *, total: int, initial: int = 0, unit: str = "step") -> tqdm[Any]:
     """A bar on the terminal; one line every half minute where the output is a file."""
-    terminal = sys.stderr.isatty()
+    interval = 0.2 if sys.stderr.isatty() else 30.0  # seconds
     return tqdm(
         desc=label,
         total=total,
         initial=min(initial, total),
         unit=f" {unit}s",
-        dynamic_ncols=terminal,
-        mininterval=0.2 if terminal else 30.0,
-        maxinterval=10.0 if terminal else 60.0,
+        mininterval=interval,
+        maxinterval=max(10.0, 2 * interval),
     )
 
 

@@ -14,9 +14,6 @@ from typing import Any
 
 from cavin_pyro import __version__
 from cavin_pyro.config.application import PACKAGES
-from cavin_pyro.storage.files import read_json, write_json
-
-PROVENANCE = "provenance.json"  # a run's records, in its folder
 
 
 def provenance() -> dict[str, Any]:
@@ -30,16 +27,6 @@ def provenance() -> dict[str, Any]:
         "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
         "machine": f"{platform.system()} {platform.machine()}",
     }
-
-
-def append_provenance(path: Path, extends: Path | None = None) -> None:
-    """Add a record of this run to those of the runs that it goes on from: a JSON list.
-
-    extends: such a list of a run in another folder, which begins the list of a run that has none yet.
-    """
-    begun = path if path.exists() or extends is None else extends
-    earlier = read_json(begun) if begun.exists() else []
-    write_json(path, [*(earlier if isinstance(earlier, list) else [earlier]), provenance()])
 
 
 def program_fingerprint() -> str:

@@ -131,7 +131,7 @@ def test_a_stored_configuration_that_could_do_harm_is_refused_before_anything_is
         load_checkpoint(rewritten(config))
 
 
-def a_nan(tensors: dict[str, Tensor]) -> None:
+def with_nan(tensors: dict[str, Tensor]) -> None:
     tensors[sorted(tensors)[0]].view(-1)[0] = torch.nan
 
 
@@ -158,7 +158,7 @@ def test_changed_weights_are_refused(small: SimpleNamespace, checkpoint_file: Pa
         with pytest.raises(UserError, match="its weights are not those that were saved"):
             load_checkpoint(path)
     with pytest.raises(UserError, match="holds values that are not finite"):
-        load_checkpoint(spoilt(checkpoint_file, tmp_path, a_nan, keep_digest=False))
+        load_checkpoint(spoilt(checkpoint_file, tmp_path, with_nan, keep_digest=False))
     path = spoilt(checkpoint_file, tmp_path, integers, keep_digest=False)
     with pytest.raises(UserError, match=r"model\.\S+ holds int32, not float32"):
         load_checkpoint(path).load_into("model", small.parts()["model"], path)

@@ -97,13 +97,6 @@ def test_training_resumes_with_the_same_data_in_any_folder(tmp_path: Path) -> No
     assert (tmp_path / "data.json").read_text() == noted
 
 
-@pytest.mark.parametrize("content", ["[1]", "5", '[{"transitions": 60}]'])
-def test_a_damaged_record_of_the_data_is_refused(content: str, tmp_path: Path) -> None:
-    (tmp_path / "data.json").write_text(content)
-    with pytest.raises(UserError, match="other data, something unreadable instead of 60 transitions"):
-        check_same_data(tmp_path, [{"transitions": 60, "fingerprint": "12ab"}])
-
-
 def test_provenance_names_command_versions_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/somewhere/cavin_pyro/plan.py", "task=crossing", "output=a b"])
     record = provenance()
