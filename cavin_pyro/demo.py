@@ -22,7 +22,7 @@ def main(config: DictConfig) -> None:
     with output_folder(config.output):
         for task in config.tasks:
             options = copy.deepcopy(config)
-            options.task = task
+            options.task, options.tiles = task, {}
             runner = make_runner(copy.deepcopy(options), render=True)
             with output_folder(f"{config.output}/{task}") as folder:
                 write_config(folder, options)

@@ -14,7 +14,7 @@ def main(config: DictConfig) -> None:
     import torch
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.config.parts import check_sizes, construct
+    from cavin_pyro.config.parts import check_sizes, construct, naming
     from cavin_pyro.data.features import sample_clouds
     from cavin_pyro.storage.checkpoint import save_checkpoint
     from cavin_pyro.storage.files import output_folder, write_json
@@ -29,7 +29,8 @@ def main(config: DictConfig) -> None:
     config.device = device.type
     torch.manual_seed(config.seed)
     with output_folder(config.output) as folder:
-        autoencoder = construct(config.autoencoder)
+        with naming("autoencoder", config.autoencoder):
+            autoencoder = construct(config.autoencoder)
         clouds = sample_clouds(
             data_folders(config.data),
             count=config.clouds,

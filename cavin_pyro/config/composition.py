@@ -5,29 +5,39 @@ from __future__ import annotations
 import difflib
 import functools
 import itertools
+import os
 import re
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import hydra
+import yaml
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException, ValidationError
 
-from cavin_pyro.config.commands import COMMANDS, UNREAD
-from cavin_pyro.config.constructors import check_parts, constructor_options
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.constructors import with_defaults
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.options import check_options, kind, shown, types
-from cavin_pyro.config.registration import register
-from cavin_pyro.config.rewriting import rewritten
+from cavin_pyro.config.options import check_options, options
 
-register()
+PRESETS = Path(__file__).parent / "presets"
+OUTPUT = {  # the folder of a run for which the user names none
+    "collect": "data/pushes",
+    "plan": "runs/plan/{task}-{reward}-{objects}-{planner}-{seed}",
+    "evaluate": "runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}",
+    "reproduce": "runs/reproduce/{scale}",
+}
+# Options that never decide which folder a run has: runs that differ only in these are the same run.
+SAME_RUN = {"output", "workers", "launcher", "address", "transitions", "repair", "sections", "video", "viewer"}
+SAME_RUN |= {"episodes", "compare", "merge"}
+USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=.*", re.DOTALL)
 
 
 def compose(name: str, *overrides: str) -> DictConfig:
@@ -36,95 +46,127 @@ def compose(name: str, *overrides: str) -> DictConfig:
     Raises:
         UserError: an invalid override.
     """
-    return completed(name, check_overrides(name, rewritten(overrides)))
+    return composed(name, overrides)[0]
 
 
-def completed(name: str, config: DictConfig) -> DictConfig:
-    """What `check_overrides` has composed, without Hydra's own section, resolved, and with an output folder.
-
-    Raises:
-        UserError: an option has no value.
-    """
-    from cavin_pyro.config.output import with_output
-
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    return with_output(name, resolved(own), config.hydra)
-
-
-def resolved(config: DictConfig) -> DictConfig:
-    """A configuration without interpolations and types, for other processes and files.
-
-    Raises:
-        UserError: an option has no value.
-    """
-    try:
-        # Plain, because Hydra's own interpolations mean nothing in a worker process.
-        plain = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    except OmegaConfBaseException as error:
-        raise UserError(f"an option has no value: {str(error).splitlines()[0]}") from error
-    assert isinstance(plain, DictConfig)
-    return plain
-
-
-def check_overrides(name: str, overrides: list[str], config_dir: str | None = None) -> DictConfig:
-    """Compose, and explain a wrong override in one line.
-
-    Args:
-        config_dir: a folder of further presets.
-
-    Returns:
-        The configuration with Hydra's own.
+def composed(name: str, overrides: Sequence[str], config_dir: str | None = None) -> tuple[DictConfig, dict[str, str]]:
+    """The configuration of a command, and the choice of each group of presets; `config_dir` has further presets.
 
     Raises:
         UserError: an unknown command, option or preset, an override that does not parse, or a value out of its range.
     """
     if name not in COMMANDS:
         raise UserError(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
-    if config_dir is not None:
-        overrides = [*overrides, search_path(str(Path(config_dir).resolve()))]
+    register(name)
+    words = rewritten(overrides)
+    more = [] if config_dir is None else [f"hydra.searchpath=['file://{Path(config_dir).resolve()}']"]
     with _hydra():
         try:
-            _check_additions(name, overrides)
-            _check_read(name, overrides)
-            _check_nulls(name, overrides)
-            config = hydra.compose(name, overrides=overrides, return_hydra_config=True)
-            plain: Any = OmegaConf.to_container(config, resolve=False)
-            check_parts({key: value for key, value in plain.items() if key != "hydra"})
-            check_options(COMMANDS[name], plain)
-        except MissingConfigException as error:
-            raise UserError(_explain_choice(error)) from error
-        except (HydraException, OmegaConfBaseException, ValueError) as error:
-            raise UserError(_explain_override(name, overrides, error)) from error
-    return config
+            return _composed(name, words, more)
+        except UserError:
+            raise
+        except Exception as error:
+            raise UserError(_explained(name, words, more)) from error
 
 
-def search_path(*folders: str) -> str:
-    """The override that lets presets lie in these folders as well."""
-    return f"hydra.searchpath=[{','.join(_in_quotes(f'file://{folder}') for folder in folders)}]"
+@functools.cache
+def register(name: str) -> None:
+    """Tell Hydra a command's options, and its presets with all the options of their classes.
+
+    A preset has `_target_`, the class, and its differences from the class's defaults, so no default is written twice.
+    """
+    store = ConfigStore.instance()
+    store.store(name, COMMANDS[name], provider="cavin_pyro")
+    for entry in COMMANDS[name]().defaults:
+        group = next(iter(entry)) if isinstance(entry, dict) else ""
+        files = (PRESETS / group).rglob("*.yaml") if group else [PRESETS / f"{entry}.yaml"] * (entry != "_self_")
+        for file in files:
+            text, folder = file.read_text(encoding="utf-8"), file.parent.relative_to(PRESETS).as_posix()
+            package = re.match(r"# @package (\S+)", text)
+            store.store(
+                file.stem,
+                with_defaults(yaml.load(text, yaml.CSafeLoader), group),
+                group=None if folder == "." else folder,
+                package=package and package[1],
+                provider="cavin_pyro",
+            )
+
+
+def finished(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
+    """What Hydra has composed, resolved, checked and with a folder for results, without Hydra's own section.
+
+    Raises:
+        UserError: an option without a value, or with one out of its range.
+    """
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    OmegaConf.resolve(own)  # checks the types of what interpolations stand for
+    # Plain, because Hydra's own interpolations mean nothing in a worker process.
+    plain: Any = OmegaConf.to_container(own, throw_on_missing=True)
+    check_options(COMMANDS[name], plain)
+    for group in (next(iter(entry)) for entry in COMMANDS[name]().defaults if isinstance(entry, dict)):
+        if not OmegaConf.select(own, group.replace("/", ".")):
+            raise UserError(f"{group} must be one of its presets, which --help lists")
+    if hydra_config.mode == RunMode.MULTIRUN:
+        plain["output"] = os.path.relpath(hydra_config.runtime.output_dir)
+    elif not plain["output"]:
+        plain["output"] = _default_output(name, plain, hydra_config)
+    return OmegaConf.create(plain)
 
 
 def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
     """The overrides of every run of a sweep (`-m`): all combinations of the values given."""
-    parsed = OverridesParser.create().parse_overrides(_parsable(overrides))
     choices = [
         [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
         if one.is_sweep_override()
         else [one.input_line or ""]
-        for one in parsed
+        for one in map(_parsed, overrides)
     ]
-    bad = [[word] for word in overrides if not _parsable([word])]
-    yield from (list(one) for one in itertools.product(*choices, *bad))
+    yield from map(list, itertools.product(*choices))
 
 
-def preset_defaults(name: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    """The configuration with the presets that the overrides choose and nothing else, and the usual presets by group."""
-    with _hydra():
-        return _defaults(name, overrides), _usual_presets(name)
+def of_sweep(overrides: Sequence[str]) -> list[str]:
+    """What Hydra is told about the folders of a sweep's runs: each is named by the options that differ."""
+    parsed = [_parsed(word) for word in overrides]
+    fixed = ",".join(f"'{one.key_or_group}'" for one in parsed if not one.is_sweep_override())
+    folder = [f"hydra.sweep.dir={one.value()}" for one in parsed if one.key_or_group == "output"]
+    return [f"hydra.job.config.override_dirname.exclude_keys=[{fixed}]", *folder]
+
+
+def rewritten(overrides: Sequence[str]) -> list[str]:
+    """The overrides in Hydra's form: `planner.optimizer=cem` as `planner/optimizer=cem`, which brings cem's options."""
+    words = []
+    for word in sections_of_classes(overrides):
+        key, _, value = word.partition("=")
+        group = key.replace(".", "/")
+        by_name = "." in key and (PRESETS / group).is_dir() and re.fullmatch(r"(?!null$)[A-Za-z_][\w.,]*", value)
+        words.append(f"{group}={value}" if by_name else word)
+    return words
+
+
+def sections_of_classes(overrides: Sequence[str]) -> list[str]:
+    """`env.camera._target_=my_lab.Mine +env.camera.noise=1` as `env.camera={_target_: my_lab.Mine, noise: 1}`.
+
+    Parts of the world that are ours have a name and no section, which a class of the user's and its arguments need.
+    Classes with commas between them are a sweep.
+    """
+    words = list(overrides)
+    for part in dict.fromkeys(one[1] for word in overrides if (one := USER_CLASS.fullmatch(word))):
+        option = re.compile(rf"\+{{0,2}}{re.escape(part)}\.([\w.]+)=(.*)", re.DOTALL)
+        of_part = {word: (one[1], one[2]) for word in words if (one := option.fullmatch(word))}
+        values = dict(of_part.values())
+        sections = (
+            ", ".join(f"{name}: {value}" for name, value in {**values, "_target_": target}.items())
+            for target in values["_target_"].split(",")
+        )
+        place = words.index(next(iter(of_part)))
+        words[place] = f"{part}=" + ",".join(f"{{{section}}}" for section in sections)
+        words = [word for word in words if word not in of_part]
+    return words
 
 
 @contextmanager
 def _hydra() -> Iterator[None]:
-    """Hydra ready for composition, within a command as well as without one."""
+    """Hydra ready for composition, within a sweep as well as without one."""
     running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
     try:
         with hydra.initialize(version_base="1.3", config_path=None):
@@ -133,164 +175,79 @@ def _hydra() -> Iterator[None]:
         GlobalHydra.instance().hydra = running
 
 
-def _defaults(name: str, overrides: Sequence[str]) -> DictConfig:
-    """The configuration with the presets that the user chose and no other overrides."""
-    groups = _usual_presets(name)
-    chosen = [word for word in overrides if word.partition("=")[0] in groups]
-    folders = [word for word in overrides if word.startswith("hydra.searchpath")]  # of users, who may change them
-    return hydra.compose(name, overrides=chosen + folders) if folders else _presets(name, tuple(chosen))
+def _composed(name: str, words: Sequence[str], more: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    config = hydra.compose(name, overrides=[*words, *more], return_hydra_config=True)
+    for one in map(_parsed, words):
+        section = one.key_or_group.rpartition(".")[0]
+        if one.is_delete() and not section.startswith("hydra"):
+            raise UserError(f"{one.input_line}: an option cannot be removed; give it a value, {one.key_or_group}=value")
+        if one.is_add() or one.is_force_add():  # arguments of a part, which its class checks
+            part: Any = OmegaConf.select(config, section) if section else None
+            known = {option.name for option in options(COMMANDS[name])}
+            if one.key_or_group not in known and not (OmegaConf.is_dict(part) and "_target_" in part):
+                raise UserError(_unknown(name, one.key_or_group, config))
+    choices = {str(group): choice for group, choice in config.hydra.runtime.choices.items()}
+    return finished(name, config, config.hydra), choices
 
 
-@functools.cache  # a composition takes a twentieth of a second
-def _presets(name: str, chosen: tuple[str, ...]) -> DictConfig:
-    """The configuration with some of our presets, to be read only."""
-    return hydra.compose(name, overrides=[*chosen])
+def _default_output(name: str, config: dict[str, Any], hydra_config: Any) -> str:
+    """A folder that says how a run differs from the usual one: "runs/train-model=flat,guide=flat"."""
+    pattern = OUTPUT.get(name, f"runs/{name}")
+    told = {*SAME_RUN, *re.findall(r"{(\w+)}", pattern)}
+    overrides = [word.lstrip("+") for word in hydra_config.overrides.task]
+    others = ",".join(sorted(word.replace("/", "-") for word in overrides if word.partition("=")[0] not in told))
+    return pattern.format(**{**config, **hydra_config.runtime.choices}) + ("-" if others else "") + others
 
 
-@functools.cache  # a composition takes a tenth of a second
-def _usual_presets(name: str) -> dict[str, str]:
-    """The preset of each group that a command takes when the user names none."""
-    choices = hydra.compose(name, return_hydra_config=True).hydra.runtime.choices
-    return {str(group): str(choice) for group, choice in choices.items()}
-
-
-def _check_additions(name: str, overrides: list[str]) -> None:
-    """Refuse `~option`, and `+option` unless it belongs to a part, whose class checks it later."""
-    changes = [one for one in _parsed(overrides) if one.type is not OverrideType.CHANGE]
-    if not changes:
-        return
-    known = _defaults(name, overrides)
-    for one in changes:
-        key = one.key_or_group
-        if key.startswith("hydra"):
-            continue
-        if one.type is OverrideType.DEL:
-            raise UserError(f"{key} cannot be removed: give it a value as {key}=value")
-        parent: Any = OmegaConf.select(known, key.rpartition(".")[0]) if "." in key else None
-        if not (OmegaConf.is_dict(parent) and "_target_" in parent) and OmegaConf.select(known, key) is None:
-            raise UserError(_unknown(key, known))
-
-
-def _check_read(name: str, overrides: list[str]) -> None:
-    """Refuse options that only other commands read."""
-    for one in _parsed(overrides):
-        option = re.split(r"[./@]", one.key_or_group)[0]
-        if option in UNREAD.get(name, {}):
-            readers = (other for other, schema in COMMANDS.items() if option in types(schema) and other != name)
-            raise UserError(f"{one.key_or_group} is an option of {' and '.join(readers)}: {UNREAD[name][option]}")
-
-
-def _check_nulls(name: str, overrides: list[str]) -> None:
-    """Refuse `None`, a name like any other to Hydra, for options that may be null."""
-    written = [one.key_or_group for one in _parsed(overrides) if (one.input_line or "").endswith("=None")]
-    if not written:
-        return
-    known = _defaults(name, overrides)
-    for key in written:
-        section, _, last = key.rpartition(".")
-        part: Any = OmegaConf.select(known, section) if section else None
-        target = part.get("_target_") if OmegaConf.is_dict(part) else None
-        own = constructor_options(target).get(last) if target else None
-        annotation = own.annotation if own else types(COMMANDS[name]).get(key)
-        if type(None) in get_args(annotation):
-            raise UserError(f"{key} may be null, which the command line does not write None: write {key}=null")
-
-
-def _explain_choice(error: MissingConfigException) -> str:
-    group, _, choice = (error.missing_cfg_file or "").rpartition("/")
-    options = ", ".join(error.options or ()) or "none"
-    own = f"; a class of your own is {group.replace('/', '.')}._target_={choice}" if "." in choice else ""
-    return f"unknown {group or 'configuration'} {choice!r}: choose from {options}{own}"
-
-
-def _explain_override(name: str, overrides: list[str], error: Exception) -> str:
-    try:
-        known = _defaults(name, overrides)
-    except (HydraException, OmegaConfBaseException, ValueError):
-        known = hydra.compose(name)
-    for override in _parsed(overrides):
-        key = override.key_or_group
-        if (
-            override.package
-            or key.startswith("hydra")
-            or override.type is not OverrideType.CHANGE
-            or set("@/") & set(key)
-        ):
-            continue
-        parent, _, last = key.rpartition(".")
-        if not last.startswith("_") and last not in _names(known, parent):
-            own = [one for one in _parsed(overrides) if one.key_or_group == f"{parent}._target_"]
-            hint = f"; for an argument of {own[0].value()} write +{override.input_line}" if own else ""
-            return _unknown(key, known) + hint
-    cause = error.__cause__ or error
-    if isinstance(cause, ValidationError) and cause.full_key:
-        option = re.sub(r"\[.*", "", str(cause.full_key))
-        wanted = kind(types(COMMANDS[name]).get(option))
-        values = [one.value() for one in _parsed(overrides) if one.key_or_group == option]
-        if wanted and values:
-            return f"{option} must be {wanted}, not {shown(values[-1])}"
-    if isinstance(error, OverrideParseException) and (quoted := _quoted(error.override)):
-        return f"{error.override} holds a character that needs quotes: write {quoted}"
-    first = str(error).splitlines()[0].rstrip(".").removeprefix("LexerNoViableAltException: ")
-    several = re.match(r"Ambiguous value for argument '(.+)'$", first)
-    if several:
-        return f"several values need -m: python -m cavin_pyro.{name} -m {several[1]}"
-    group = re.match(r"Could not override '(\w+)/(\w+)'. No match in the defaults list", first)
-    if group:
-        return f"unknown override '{group[1]}.{group[2]}': the chosen {group[1]} has no {group[2]}"
-    return f"{first}: write overrides as name=value"
-
-
-_ENTRY = r"[^][{},:\"']*[^][{},:\"'\x00-\x7F][^][{},:\"']*"  # of a list, with a character that is not ASCII
-
-
-def _in_quotes(value: str | re.Match[str]) -> str:
-    text = value if isinstance(value, str) else value[0]
-    return '"' + text.replace('"', '\\"') + '"'
-
-
-def _quoted(override: str) -> str | None:
-    """An override that does not parse, for the shell and with its value in quotes; None if that does not help.
-
-    Unquoted values may hold ASCII letters, digits, spaces and some signs (Hydra's grammar).
-    """
-    key, equals, value = override.partition("=")
-    if not equals:
-        return None
-    if value.startswith(("[", "{", "'", '"')):
-        quoted = f"{key}={re.sub(_ENTRY, _in_quotes, value)}"
-    else:
-        quoted = f"{key}={_in_quotes(value)}"
-    return shlex.quote(quoted) if _parsable([quoted]) else None
-
-
-def _unknown(key: str, known: DictConfig) -> str:
-    parent, _, last = key.rpartition(".")
-    close = difflib.get_close_matches(last, _names(known, parent), n=1, cutoff=0.7)
-    while parent and not _names(known, parent):
-        parent = parent.rpartition(".")[0]
-    valid = f"valid{' under ' if parent else ''}{parent} are {', '.join(_names(known, parent))}"
-    others = [name for name, schema in COMMANDS.items() if key in types(schema)]
-    elsewhere = f"it is an option of {', '.join(others)}; " if others else ""
-    return f"unknown override {key!r}: {elsewhere}{f'did you mean {close[0]}? ' if close else ''}{valid}"
-
-
-def _parsed(overrides: Sequence[str]) -> list[Override]:
-    return OverridesParser.create().parse_overrides(_parsable(overrides))
-
-
-def _parsable(overrides: Sequence[str]) -> list[str]:
-    kept = []
-    for word in overrides:
+def _explained(name: str, words: Sequence[str], more: Sequence[str]) -> str:
+    """One line about the first override with which the composition fails; those that choose presets come first."""
+    words = sorted(words, key=lambda word: not (PRESETS / word.partition("=")[0]).is_dir())
+    known: Any = _composed(name, [], more)[0]
+    for count, word in enumerate(words, start=1):
         try:
-            OverridesParser.create().parse_override(word)
-        except HydraException:
-            continue
-        kept.append(word)
-    return kept
+            known, _ = _composed(name, words[:count], more)
+        except UserError as error:
+            return str(error)
+        except Exception as error:
+            return _reason(name, word, error, known)
+    raise AssertionError(words)
 
 
-def _names(known: DictConfig, section: str) -> list[str]:
-    """The options of a section, none if there is no such section."""
-    found: Any = OmegaConf.select(known, section) if section else known
-    return sorted(map(str, found)) if OmegaConf.is_dict(found) else []
+def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
+    key = word.partition("=")[0].lstrip("+")
+    if isinstance(error, MissingConfigException):
+        group, _, choice = (error.missing_cfg_file or "").rpartition("/")
+        own = f"; a class of your own is {key.replace('/', '.')}._target_={choice}" if "." in choice else ""
+        return f"unknown {group} {choice!r}: choose from {', '.join(error.options or ())}{own}"
+    if "/" not in key and not key.startswith("hydra") and OmegaConf.select(known, key, default=error) is error:
+        return _unknown(name, key, known)
+    first = str(error.__cause__ or error).splitlines()[0]
+    if first.startswith("Ambiguous value"):
+        first += f"; several values need -m: python -m cavin_pyro.{name} -m {word}"
+    return f"{word}: {first}"
+
+
+def _unknown(name: str, key: str, known: DictConfig) -> str:
+    """What an option that a command does not have may have meant."""
+    section, _, last = key.rpartition(".")
+    while section and not OmegaConf.is_dict(OmegaConf.select(known, section)):
+        section = section.rpartition(".")[0]
+    names = sorted({*map(str, OmegaConf.select(known, section) if section else known)} - {last, "hydra"})
+    close = difflib.get_close_matches(last, names, n=1, cutoff=0.7)
+    others = [one for one in COMMANDS if one != name and key in {option.name for option in options(COMMANDS[one])}]
+    return (
+        f"unknown option {key!r}: "
+        + (f"it is an option of {', '.join(others)}; " if others else "")
+        + (f"did you mean {close[0]}? " if close else "")
+        + f"valid{' under ' if section else ''}{section} are {', '.join(names)}"
+    )
+
+
+def _parsed(word: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException as error:
+        first = str(error).splitlines()[0].removeprefix("LexerNoViableAltException: ")
+        raise UserError(
+            f"{word}: {first}; write name=value, and a value with special characters as 'name=\"value\"'"
+        ) from error

@@ -29,17 +29,12 @@ def user_input() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise UserError(" ".join(str(error).split())) from error
+        raise UserError(one_line(error)) from error
 
 
-def at_least(name: str, value: float, minimum: float) -> None:
-    """Check a number from the command line.
-
-    Raises:
-        UserError: the number is not a number or smaller than the minimum.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value >= minimum:
-        raise UserError(f"{name} must be at least {minimum:g}, not {value}")
+def one_line(error: BaseException) -> str:
+    """What an exception says, in one line; its class if it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:

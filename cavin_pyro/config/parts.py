@@ -5,24 +5,22 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib import resources
 from typing import Any
 
-import hydra
 import yaml
-from hydra.errors import HydraException, InstantiationException
-from hydra.utils import instantiate
+from hydra.errors import InstantiationException
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from pyro.infer.autoguide import AutoGuide, AutoMessenger
 
-from cavin_pyro.config.constructors import OWN_PACKAGES
-from cavin_pyro.config.errors import UserError, at_least
+from cavin_pyro.config.composition import PRESETS
+from cavin_pyro.config.errors import UserError, one_line
 from guides.guide import Guide
 from models.model import Model
 
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "models.priors.standard.StandardPrior"
-LARGEST_SIZE = 10**6  # a layer of more would fill the memory, or take minutes to begin
+LARGEST_SIZE = 10**6  # more would fill the memory until the system kills the process, or take minutes to begin
 FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
 PAPER_DYNAMICS = {"_target_": "models.networks.dynamics.Dynamics"}
 
@@ -31,65 +29,55 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
     """Build the part that a configuration names.
 
     Raises:
-        UserError: there is no such class, it takes no such argument, or it refuses a value.
+        UserError: whatever its class raises, in one line: there is no such class, it takes no such argument, or it
+            refuses a value.
     """
     if not config.get("_target_"):
         raise UserError(f"a part has no _target_, the class to build it from: {dict(config)}")
     try:
         # In two steps, because Hydra would turn keywords that are dataclasses into configuration.
         return instantiate(config, _partial_=True, _convert_="all")(*arguments, **keywords)
-    except ValueError as error:
-        raise UserError(" ".join(str(error).split())) from error
-    except (InstantiationException, TypeError) as error:
-        cause = error.__cause__ or error
-        inner = re.search(r"full_key: ([\w.]+)$", str(error))  # Hydra's name of the part within this one
-        if isinstance(cause, ValueError) and inner:
-            with naming(inner[1], OmegaConf.select(OmegaConf.create(dict(config)), inner[1])):
-                raise UserError(" ".join(str(cause).split())) from error
-        raise UserError(f"{config.get('_target_')} cannot be built: {' '.join(str(cause).split())}") from error
-    except (MemoryError, OverflowError, RuntimeError) as error:  # of torch: a layer larger than the memory
-        if str(config["_target_"]).partition(".")[0] not in OWN_PACKAGES:
-            raise
-        raise UserError(f"{config['_target_']} cannot be built: {' '.join(str(error).split())}") from error
+    except UserError:
+        raise
+    except Exception as error:
+        cause, section, place = error, config, ""
+        if isinstance(error, InstantiationException):
+            cause = error.__cause__ or error  # type: ignore[assignment]
+            if inner := re.search(r"full_key: ([\w.]+)$", str(error)):  # Hydra's name of the part within this one
+                place, section = inner[1], OmegaConf.select(OmegaConf.create(dict(config)), inner[1])
+        said = "" if isinstance(cause, ValueError) else f"_target_={section.get('_target_')} cannot be built: "
+        with naming(place, section):
+            raise UserError(said + one_line(cause)) from error
 
 
 @contextmanager
 def naming(section: str, config: Config) -> Iterator[None]:
     """Let a `UserError` from building a part name its options as users type them: `planner.samples`, not `samples`."""
-    names = "|".join(re.escape(str(name)) for name in config if not str(name).startswith("_"))
+    names = "|".join(re.escape(str(name)) for name in config)
     mention = rf"^(unknown )?({names})(?=[ =.])|(?<![\w.])({names})(?==)"
     try:
         yield
     except UserError as error:
-        if not names:
+        if not names or not section:
             raise
         said = re.sub(mention, lambda one: f"{one[1] or ''}{section}.{one[2] or one[3]}", str(error))
         raise UserError(said) from error
 
 
-def check_sizes(section: str, config: Config) -> None:
-    """Check that every whole number of a section, apart from weights and margins, is at least 1 and no slip.
+def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
+    """Check that no whole number of a section or of those in it is too small or a slip, apart from weights and margins.
 
     Raises:
-        UserError: one is not.
-    """
-    for name, value in config.items():
-        if type(value) is int and not str(name).endswith(("_weight", "_margin")):
-            at_least(f"{section}.{name!s}", value, 1)
-    check_largest(section, config)
-
-
-def check_largest(section: str, config: Config) -> None:
-    """Check that no whole number of a section or of the sections in it is a slip, apart from weights.
-
-    Raises:
-        UserError: one is larger than `LARGEST_SIZE`.
+        UserError: one is smaller than the minimum, or larger than `LARGEST_SIZE`.
     """
     for name, value in config.items():
         if isinstance(value, Mapping | DictConfig):
-            check_largest(f"{section}.{name!s}", value)
-        elif type(value) is int and value > LARGEST_SIZE and not str(name).endswith("_weight"):
-            raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
+            check_sizes(f"{section}.{name!s}", value, minimum)
+        elif type(value) is int and not str(name).endswith(("_weight", "_margin")):
+            if value < minimum:
+                raise UserError(f"{section}.{name!s} must be at least {minimum:g}, not {value}")
+            if value > LARGEST_SIZE:
+                raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
 
 
 def build_model(config: Config) -> Model:
@@ -107,29 +95,31 @@ def build_model(config: Config) -> Model:
     try:
         prior = own_prior if own_prior.get("_target_") else config["prior"]
         check_sizes("prior", prior)
-        parts = {
-            name: construct(
-                prior,
-                dimension=sizes[f"{kind}_dimension"],
-                feature_dimension=sizes["feature_dimension"],
-                effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
-            )
-            for name, kind in (("effect_prior", "effect"), ("motion_prior", "motion"))
-            if f"{kind}_dimension" in sizes
-        }
+        with naming("model.prior" if prior is own_prior else "prior", prior):
+            parts = {
+                name: construct(
+                    prior,
+                    dimension=sizes[f"{kind}_dimension"],
+                    feature_dimension=sizes["feature_dimension"],
+                    effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
+                )
+                for name, kind in (("effect_prior", "effect"), ("motion_prior", "motion"))
+                if f"{kind}_dimension" in sizes
+            }
         section = config.get("dynamics") or PAPER_DYNAMICS
         check_sizes("dynamics", section)
         with naming("dynamics", section):
             dynamics = construct(section, feature_dimension=sizes["feature_dimension"], width=sizes["width"])
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
-    scales = construct(config.get("scales") or FIXED_SCALES)
+    scales = config.get("scales") or FIXED_SCALES
+    with naming("scales", scales):
+        built_scales = construct(scales)
     with naming("model", sizes):
-        model = construct(sizes, **parts, scales=scales, dynamics=dynamics)
+        model = construct(sizes, **parts, scales=built_scales, dynamics=dynamics)
     if not isinstance(model, Model):
         raise UserError(f"model {sizes['_target_']} is no model program: derive it from models.model.Model")
-    chosen = own_prior.get("_target_") or config["prior"]["_target_"]
-    if not parts and chosen != STANDARD_PRIOR:
+    if not parts and config["prior"]["_target_"] != STANDARD_PRIOR:
         raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
     return model
 
@@ -149,45 +139,29 @@ def build_guide(config: Config, model: Model) -> Guide:
     if isinstance(kind, type) and not issubclass(kind, Guide):
         raise UserError(f"guide {target} is no Pyro program: derive it from guides.guide.Guide")
     if kind is not None and model.name not in kind.fits:
-        choices = (
-            ", ".join(name for name, guide in _guide_presets().items() if model.name in guide.fits) or "none of ours"
-        )
+        choices = ", ".join(name for name, guide in _guides().items() if model.name in guide.fits) or "none of ours"
         raise UserError(
             f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(kind.fits) or 'none'}): "
             f"choose guide= from {choices}"
         )
-    return construct(config["guide"], model)
+    with naming("guide", config["guide"]):
+        return construct(config["guide"], model)
 
 
 def class_of(config: Config) -> Any:
     """The class of a part, None if there is no such class."""
     try:
-        return hydra.utils.get_class(config["_target_"])
-    except (KeyError, HydraException, ImportError, ValueError, TypeError, AttributeError):
-        return None  # `construct` has a better message
+        return get_class(config["_target_"])
+    except Exception:  # a user's module may raise anything; `construct` says it in one line
+        return None
 
 
 def amortized_guides(model_name: str) -> list[str]:
     """The choices of `guide=` that fit a model and infer any window."""
-    return [name for name, guide in _guide_presets().items() if model_name in guide.fits and guide.amortized]
+    return [name for name, guide in _guides().items() if model_name in guide.fits and guide.amortized]
 
 
-def preset_of(section: str, target: str) -> str:
-    """The choice of an option such as `dynamics=` that has this class; the class itself if none has."""
-    choices = {preset.get("_target_"): name for name, preset in _presets(section).items()}
-    return choices.get(target, target)
-
-
-def _guide_presets() -> dict[str, type[Guide]]:
+def _guides() -> dict[str, type[Guide]]:
     """The classes of `guide=`."""
-    return {name: class_of(preset) for name, preset in _presets("guide").items()}
-
-
-def _presets(section: str) -> dict[str, dict[str, Any]]:
-    """The presets of an option, by name."""
-    files = sorted((resources.files("cavin_pyro.config") / "presets" / section).iterdir(), key=lambda file: file.name)
-    return {
-        file.name.removesuffix(".yaml"): yaml.safe_load(file.read_text(encoding="utf-8"))
-        for file in files
-        if file.name.endswith(".yaml")
-    }
+    files = sorted((PRESETS / "guide").glob("*.yaml"))
+    return {file.stem: class_of(yaml.safe_load(file.read_text(encoding="utf-8"))) for file in files}

@@ -1,18 +1,23 @@
-"""The parts of the world from the options `env.*`."""
+"""The parts of the world from the options `task`, `tiles` and `env.*`: names of ours, or classes of the user's own."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-import hydra
-from hydra.errors import HydraException
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.own_parts import object_set_of, robot_of
+from cavin_pyro.config.errors import UserError, one_line, user_input
+from cavin_pyro.config.parts import construct, naming
 from envs.layouts import task_class
-from envs.objects.object_sets import chosen, plain_name
+from envs.objects.object_sets import ObjectSet, chosen, load_object_set, plain_name
 from envs.objects.sampling import ObjectRanges
+from envs.robots import Robot, RobotFactory, robot_factory
+from envs.segmentation import Segmenter, SegmenterFactory
+from envs.sensors import DepthSensor
 from envs.tasks import Task
 from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
 from planning import PushBox
@@ -23,6 +28,8 @@ LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes t
     "friction": (0.001, 10.0),
     "kilograms": (0.001, 1000.0),
 }
+Named = str | Mapping[str, Any] | DictConfig
+"""The value of an option: a name of ours, or a section with `_target_`, a class of the user's, and its options."""
 
 
 def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
@@ -31,29 +38,19 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
     Raises:
         UserError: there is no such class, or it is no task.
     """
-    fields: Any = OmegaConf.to_container(config.tiles)
+    tiles: Any = OmegaConf.to_container(config.tiles)
     if isinstance(config.task, str):
         with user_input():
-            return task_class(config.task), fields
+            return task_class(config.task), tiles
     section: Any = OmegaConf.to_container(config.task)
     target = section.pop("_target_", None)
     try:
-        kind = hydra.utils.get_class(target)
-    except (HydraException, ImportError, ValueError, TypeError) as error:
-        raise UserError(f"task._target_={target} cannot be imported: {' '.join(str(error).split())}") from error
+        kind = get_class(target)
+    except Exception as error:
+        raise UserError(f"task._target_={target} cannot be imported: {one_line(error)}") from error
     if not issubclass(kind, Task):
         raise UserError(f"task._target_={target} is no task: derive it from envs.tasks.Task")
-    return kind, fields | {name: value for name, value in section.items() if value is not None}
-
-
-def check_world(env: DictConfig) -> None:
-    """Check the names of the parts.
-
-    Raises:
-        UserError: an unknown part, with the valid ones, or missing files, with the command that gets them.
-    """
-    with user_input():
-        robot_of(env.robot, env.assets)
+    return kind, tiles | {name: value for name, value in section.items() if value is not None}
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:
@@ -64,37 +61,85 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
             `LIMITS`.
     """
     ranges: Any = OmegaConf.to_container(env.ranges)
-    with user_input():
-        objects = object_set_of(env.objects, env.assets)
+    objects = object_set_of(env.objects, env.assets)
     every = tuple(dict.fromkeys(map(plain_name, objects.names)))
-    for name in ("names", "target"):
-        if not isinstance(ranges[name], list | None):
-            raise UserError(f"env.ranges.{name} must be a list of objects, not {ranges[name]}")
-        if name == "names" and ranges[name] == []:
-            raise UserError(f"env.ranges.names must name an object, or be null for all: choose from {', '.join(every)}")
-        ranges[name] = tuple(ranges[name] or (every if name == "names" else ()))
+    if ranges["names"] == []:
+        raise UserError(f"env.ranges.names must name an object, or be null for all: choose from {', '.join(every)}")
+    for name, usual in (("names", every), ("target", ())):
+        ranges[name] = tuple(ranges[name] or usual)
         try:
             chosen(ranges[name], objects)
         except ValueError as error:
             raise UserError(str(error).replace(":", f" in env.ranges.{name}:", 1)) from error
-    for name in LIMITS:
-        ranges[name] = _pair(f"env.ranges.{name}", ranges[name]) if ranges[name] or name != "kilograms" else None
-    for name in ("clearance", "drop_height"):
-        if not isinstance(ranges[name], int | float) or not ranges[name] >= 0:
-            raise UserError(f"env.ranges.{name} must be at least 0 metres, not {ranges[name]}")
+    for name, (least, most) in LIMITS.items():
+        given = ranges[name]
+        if given is None:
+            continue
+        if len(given) != 2 or not least <= given[0] <= given[1] <= most:
+            raise UserError(f"env.ranges.{name} must be low, then high, between {least:g} and {most:g}, not {given}")
+        ranges[name] = tuple(given)
     return ObjectRanges(**ranges)
-
-
-def _pair(name: str, value: Any) -> tuple[float, float]:
-    numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value)
-    if not numbers or not 0 < value[0] <= value[1]:
-        raise UserError(f"{name} must be two positive numbers, low then high, not {value}")
-    least, most = LIMITS[name.rpartition(".")[2]]
-    if value[0] < least or value[1] > most:
-        raise UserError(f"{name} must be between {least:g} and {most:g}, not {value}")
-    return value[0], value[1]
 
 
 def push_box() -> PushBox:
     """The scale of normalised pushes, for planners that propose pushes near objects."""
     return PushBox(REACH_LOW, REACH_HIGH, MAXIMUM_MOTION)
+
+
+def plain(value: Named) -> str | dict[str, Any]:
+    """The value without the types of configurations, for files and other processes."""
+    section: Any = value if isinstance(value, str) else OmegaConf.to_container(OmegaConf.create(dict(value)))
+    return section if isinstance(section, str) else dict(section)
+
+
+def robot_of(value: Named, assets: str | Path | None = None) -> RobotFactory:
+    """The factory of the robot `env.robot`; a class of the user's gets the world (`envs.physics.PhysicsWorld`).
+
+    Raises:
+        UserError: unknown robot, or missing files; the message says how to get them.
+    """
+    with user_input():
+        return robot_factory(_checked(value, "robot", Robot), assets)
+
+
+def camera_of(value: Named) -> str | DepthSensor:
+    """The sensor `env.camera`, or its name.
+
+    Raises:
+        UserError: a class that cannot be built, or is no sensor.
+    """
+    made = _checked(value, "camera", DepthSensor)
+    return made if isinstance(made, str) else made()
+
+
+def segmentation_of(value: Named) -> str | SegmenterFactory:
+    """The factory of segmenters `env.segmentation`, or a name; a class of the user's gets M, the most objects."""
+    return _checked(value, "segmentation", Segmenter)
+
+
+def object_set_of(value: Named, assets: str | Path | None = None) -> ObjectSet:
+    """The object set `env.objects`.
+
+    Raises:
+        UserError: a class that cannot be built or is no object set, or missing files.
+    """
+    made = _checked(value, "objects", ObjectSet)
+    with user_input():
+        return load_object_set(made if isinstance(made, str) else made(), assets)
+
+
+def _checked(value: Named, part: str, protocol: type) -> Any:
+    """A name as it is; else a function that builds the class, and raises a `UserError` for what is no such part."""
+    return value if isinstance(value, str) else partial(_made, dict(value), f"env.{part}", protocol)
+
+
+def _made(section: Mapping[str, Any], name: str, protocol: type, *arguments: Any) -> Any:
+    with naming(name, section):
+        made = construct(section, *arguments)
+    wanted = [member for member in {**vars(protocol), **protocol.__annotations__} if not member.startswith("_")]
+    if lacking := [member for member in wanted if not hasattr(made, member)]:
+        raise UserError(
+            f"{name}._target_={section['_target_']} is no {protocol.__name__}: it lacks {', '.join(lacking)} "
+            f"({protocol.__module__}.{protocol.__name__})"
+        )
+    return made

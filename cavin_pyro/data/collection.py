@@ -18,8 +18,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptions
 from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.own_parts import camera_of, object_set_of, own_class, plain, segmentation_of
-from cavin_pyro.config.world import check_world, object_ranges
+from cavin_pyro.config.world import camera_of, object_ranges, object_set_of, plain, robot_of, segmentation_of
 from cavin_pyro.data.dataset import (
     ARRAYS,
     COUNTS,
@@ -71,11 +70,11 @@ def collecting_world(env: DictConfig) -> CollectionConfig:
     """The configuration of a collection in the world of `env.*`, with default options.
 
     Raises:
-        UserError: as `check_world` and `object_ranges`, or another robot than the stick.
+        UserError: as `robot_of` and `object_ranges`, or another robot than the stick.
     """
-    check_world(env)
+    robot_of(env.robot, env.assets)
     if env.robot != WorldConfig.robot:
-        robot = own_class(env.robot)
+        robot = env.robot if isinstance(env.robot, str) else env.robot.get("_target_")
         raise UserError(
             f"random pushes are made with env.robot=stick, not {robot}: its pushes are equivalent and faster"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -16,9 +17,8 @@ from cavin_pyro.config.commands.episodes import CHECKPOINTS
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input, whole_number
 from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
-from cavin_pyro.config.own_parts import camera_of, object_set_of, robot_of, segmentation_of
-from cavin_pyro.config.parts import check_largest, class_of, construct, naming
-from cavin_pyro.config.world import check_world, object_ranges, task_of
+from cavin_pyro.config.parts import check_sizes, class_of, construct, naming
+from cavin_pyro.config.world import camera_of, object_ranges, object_set_of, robot_of, segmentation_of, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.native_code import argument_compile, check_native_code, searches
 from cavin_pyro.evaluation.rollout import Episode, rollout
@@ -90,8 +90,8 @@ def check_options(config: DictConfig, device: torch.device) -> None:
     Raises:
         UserError: a number or name out of its range, or options that exclude each other.
     """
-    check_world(config.env)
-    check_largest("planner", config.planner)
+    robot_of(config.env.robot, config.env.assets)
+    check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
     check_native_code(config)
     if device.type != "cpu" and config.get("launcher") == "ray":
         raise UserError(

@@ -15,7 +15,7 @@ from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured, shown
-from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct
+from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, naming
 from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows
@@ -130,8 +130,7 @@ def build_objective(config: Config, model: Model) -> Objective:
     check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
     if "elbo" in section and section["elbo"] is None:
         raise UserError("objective.elbo must be a section, not null")
-    check_sizes("objective.elbo", section.get("elbo") or {})
-    with user_input():
+    with user_input(), naming("objective", section):
         objective = as_objective(construct(section))
         objective.check(model)
     return objective

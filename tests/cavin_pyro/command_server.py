@@ -31,11 +31,10 @@ from hydra.core.plugins import Plugins
 from matplotlib.figure import Figure
 from PIL import Image
 
-from cavin_pyro.config.composition import check_overrides
+from cavin_pyro.config.composition import compose
 
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
-    "cavin_pyro.config.output",
     "cavin_pyro.criticism.export",
     "cavin_pyro.criticism.graph",
     "cavin_pyro.criticism.loading",
@@ -53,7 +52,6 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.visualization.rendering",
     "cavin_pyro.visualization.training",
     "guides.cascaded",
-    "hydra._internal.logging_config",
     "imageio.plugins.ffmpeg",
     "models.cascaded",
     "pandas",  # by pyarrow, which writes tables
@@ -81,7 +79,7 @@ def main() -> None:
 def _warm_up() -> None:
     """Fill what libraries cache for the whole process: Hydra's plugins, `inspect`'s modules and Pillow's formats."""
     Plugins.instance()
-    check_overrides("evaluate", ["workers=1"])
+    compose("evaluate")
     Image.init()
 
 

@@ -19,9 +19,3 @@ COMMANDS: dict[str, type] = {
     "demo": DemoConfig,
     "reproduce": ReproduceConfig,
 }
-UNREAD = {  # options and presets that a command shares with others and does not read, and what to do instead
-    "demo": {
-        "task": "use tasks=[clearing]",
-        "tiles": "leave it out, or run that layout by python -m cavin_pyro.plan",
-    }
-}

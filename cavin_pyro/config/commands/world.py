@@ -18,30 +18,23 @@ COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of
 class RangesConfig:
     """Distributions of objects and their parameters (section `env.ranges`; presets `env/ranges=`)."""
 
-    names: list[str] | None = option(None, "objects to sample from; by default all of env.objects", group="objects")
-    target: list[str] | None = option(
-        None, "objects to sample the target from; by default those of names", group="objects"
+    names: list[str] | None = option(None, "objects to sample from; by default all of env.objects")
+    target: list[str] | None = option(None, "objects to sample the target from; by default those of names")
+    scale: list[float] = option(list(ObjectRanges.scale), "factor on each object's size: low, high")
+    mass: list[float] = option(list(ObjectRanges.mass), "factor on each object's own mass: low, high")
+    kilograms: list[float] | None = option(
+        None, "mass of every object in place of the factor: low, high", unit="kilograms"
     )
-    scale: Any = option(list(ObjectRanges.scale), "factor on each object's size: low, high", group="objects")
-    mass: Any = option(list(ObjectRanges.mass), "factor on each object's own mass: low, high", group="objects")
-    kilograms: Any = option(
-        None, "mass of every object in place of the factor: low, high", unit="kilograms", group="objects"
-    )
-    friction: Any = option(list(ObjectRanges.friction), "Coulomb coefficient of friction: low, high", group="objects")
+    friction: list[float] = option(list(ObjectRanges.friction), "Coulomb coefficient of friction: low, high")
     clearance: float = option(
-        ObjectRanges.clearance,
-        "least distance between the objects' centres at the start",
-        unit="metres",
-        minimum=0,
-        group="objects",
+        ObjectRanges.clearance, "least distance between the objects' centres at the start", unit="metres", minimum=0
     )
     drop_height: float = option(
         ObjectRanges.drop_height,
         "height above the table from which objects are dropped; 0 drops them from just above it",
         unit="metres",
         minimum=0,
-        group="objects",
-        limit=10,
+        maximum=10,
     )
 
 
@@ -49,28 +42,15 @@ class RangesConfig:
 class WorldConfig:
     """The section `env`."""
 
-    robot: Any = option(
-        ENVIRONMENT["robot"],
-        "robot that pushes",
-        choices="envs.robots.ROBOTS",
-        group="world",
-    )
-    objects: Any = option(
-        ENVIRONMENT["object_set"], "set of objects", choices="envs.objects.object_sets.OBJECT_SETS", group="world"
-    )
-    camera: Any = option(
-        ENVIRONMENT["camera"],
-        "depth camera",
-        choices="envs.sensors.CAMERAS",
-        group="world",
-    )
+    robot: Any = option(ENVIRONMENT["robot"], "robot that pushes", choices="envs.robots.ROBOTS")
+    objects: Any = option(ENVIRONMENT["object_set"], "set of objects", choices="envs.objects.object_sets.OBJECT_SETS")
+    camera: Any = option(ENVIRONMENT["camera"], "depth camera", choices="envs.sensors.CAMERAS")
     segmentation: Any = option(
         ENVIRONMENT["segmentation"],
         "segmentation of objects in a depth image",
         choices="envs.segmentation.SEGMENTERS",
-        group="world",
     )
-    assets: str | None = option(None, "folder of meshes, for object sets and robots that need one", group="world")
+    assets: str | None = option(None, "folder of meshes, for object sets and robots that need one")
     ranges: RangesConfig = field(default_factory=RangesConfig)
 
 

@@ -1,129 +1,126 @@
-"""Bad options on the command line, one case each: one clear line, exit status 2, and nothing written."""
+"""Bad input that is found as parts are built and files are read: one line, exit status 2, and nothing written."""
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
-from tests.cavin_pyro.commands.bad_files import BAD_FILES, COMMANDS, MORE_BAD_FILES
-from tests.cavin_pyro.commands.bad_material import make_material
-from tests.cavin_pyro.commands.bad_options import BAD_OPTIONS, MORE_BAD_OPTIONS
+from cavin_pyro.data.dataset import read_metadata, shard_path, write_metadata
 
-# @name is a file or folder that `make_material` makes.
-GOOD = {
+GOOD = {  # options that are valid and small; @name is a file or folder of `material`
     "collect": "transitions=2 steps=1 episodes_per_shard=1 workers=1",
     "pretrain": "data=@pushes steps=1 clouds=10 batch_size=2",
     "train": "data=@pushes pointnet=@checkpoint model.width=8 guide.width=8 trainer.steps=1 trainer.validate_every=1 "
     "trainer.batch_size=2 windows.minimum_move=0.001 windows.validation_fraction=0.4",
     "plan": "checkpoint=@checkpoint maximum_steps=1 video=false",
     "evaluate": "checkpoint=@checkpoint maximum_steps=1 episodes=1 workers=1",
-    "check": "checkpoint=@trained data=@pushes windows=2 sections=consistency sizes.consistency.scenes=1 "
-    "sizes.consistency.samples=2",
 }
-BAD, MORE = [*BAD_OPTIONS, *BAD_FILES], [*MORE_BAD_OPTIONS, *MORE_BAD_FILES]
-assert tuple(GOOD) == COMMANDS
-
-
-def form_of(said: str) -> str:
-    """A message without its names and numbers."""
-    return re.sub(r"'[^']*'|\S*[\d./=_@]\S*", "~", said)
-
-
-FIRST = {form_of(said): number for number, (_, _, said) in reversed([*enumerate(BAD)])}  # the first case of each form
-
-
-def name_of(command: str, overrides: str) -> str:
-    return f"{command} {overrides}"
-
-
-def id_of(command: str, overrides: str) -> str:
-    """The name as pytest has it."""
-    return name_of(command, overrides).encode("unicode_escape").decode()
+BAD = [  # (command, options added to the good ones, what the line must say)
+    ("plan", "planner.samples=0", "planner.samples must be at least 1, not 0"),
+    ("plan", "planner.horizon=10", "planner.horizon=10 is not divisible by the model's segment length T=3"),
+    ("plan", "planner.optimizer=cem planner.optimizer.iterations=0", "planner.optimizer.iterations must be at least"),
+    ("plan", "planner.robustness.rollouts=0", "rollouts must be"),
+    ("plan", "+planner.unknown=1", "planner._target_=planning.CavinPlanner cannot be built: "),
+    ("plan", "planner._target_=my_lab.Mine", "planner._target_=my_lab.Mine cannot be built: "),
+    ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine cannot be built: "),
+    ("evaluate", "env.camera._target_=builtins.dict", "env.camera._target_=builtins.dict is no DepthSensor: it lacks "),
+    ("plan", "pushes_per_plan=4", "pushes_per_plan must be a whole number from 1 to 3, not 4"),
+    ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, random, generated or the path of a YAML file"),
+    ("plan", "tiles.goal=[[9,9]]", "tile [9, 9] is off the table"),
+    ("plan", "env.robot=sawyer", "robot sawyer needs a folder"),
+    ("plan", "objects=5 env.ranges.clearance=1", "no room for 5 objects at least 1 m apart"),
+    ("plan", "checkpoint=@nothing", "no checkpoint at"),
+    ("plan", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),
+    ("plan", "checkpoint=@untrusted", "asks to run numpy.save, which is not part of this program"),
+    ("evaluate", "checkpoint=@flat", "FlatModel, which has no effect_prior"),
+    ("evaluate", "output=@used", "holds a run with"),
+    ("evaluate", "address=host:6379", "address=host:6379 is of launcher=ray"),
+    ("train", "model.width=0", "model.width must be at least 1, not 0"),
+    ("train", "model.width=1000000000", "model.width must be at most 1000000, not 1000000000"),
+    ("train", "scales.center=0", "scales.center must be positive, not 0"),
+    ("train", "guide=flat", "guide guides.flat.FlatGuide does not fit model CascadedModel"),
+    ("train", "data=3", "data must be a dataset folder from collect, or a list of them, not 3"),
+    ("train", "data=@nothing", "python -m cavin_pyro.collect"),
+    ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
+    ("pretrain", "data=@old_data", "has format version 0, this program reads 1: collect it again"),
+    ("pretrain", "autoencoder._target_=my_lab.Mine", "autoencoder._target_=my_lab.Mine cannot be built: "),
+    ("collect", "output=@pushes seed=4", "holds a dataset with"),
+    ("collect", "motions=3", "motions=3 is of policy=model: add that, or leave motions"),
+    *((command, "output=@checkpoint/below", "cannot be written (Not a directory)") for command in GOOD),
+]
 
 
 @pytest.fixture(scope="module")
 def material(
     tmp_path_factory: pytest.TempPathFactory, pushes: Path, checkpoint_file: Path, small: SimpleNamespace
 ) -> Path:
+    """Files and folders for the options above, most of them with something wrong."""
     folder = tmp_path_factory.mktemp("material")
-    make_material(folder, pushes, checkpoint_file, small)
+    good = Path(shutil.copy(checkpoint_file, folder / "checkpoint"))
+    (folder / "truncated").write_bytes(good.read_bytes()[: good.stat().st_size // 2])
+    with safe_open(good, framework="pt") as file:
+        header = {name: value for name, value in file.metadata().items() if name != "sha256"}
+    config = json.loads(header["config"])
+    config["model"]["scales"] = {"_target_": "numpy.save", "_args_": ["written.npy", 0]}
+    save_file(load_file(good), folder / "untrusted", metadata={**header, "config": json.dumps(config)})
+    small.save_baseline(folder / "flat", "flat")
+    data = shutil.copytree(pushes, folder / "pushes")
+    (folder / "old_data").mkdir()
+    write_metadata(folder / "old_data", {**read_metadata(data), "version": 0})
+    shard = shard_path(shutil.copytree(data, folder / "corrupt_data"), 1)
+    shard.write_bytes(shard.read_bytes()[:-2000])
+    (folder / "used").mkdir()
+    (folder / "used" / "config.yaml").write_text("seed: 17\n")
+    (folder / "used" / "results.json").write_text("{}")
     return folder
 
 
-def without_features(contents: dict[str, bytes]) -> dict[str, bytes]:
-    """Without what training may keep beside a dataset."""
-    return {name: content for name, content in contents.items() if "/features-" not in name}
-
-
 @pytest.fixture(scope="module")
-def answers(
-    shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
-) -> SimpleNamespace:
-    """How every case that is tested now ended, what it left in its folder, and what became of the material."""
-    before = without_features(shell.contents(material))
-    tested = {getattr(getattr(item, "callspec", None), "id", None) for item in request.session.items}
-    rows = [(command, "", "") for command in GOOD] + [row for row in BAD + MORE if id_of(*row[:2]) in tested]
-    cases = {}
-    for command, overrides, _ in rows:
+def answers(shell: SimpleNamespace, material: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """How every case ended, what it left in its folder, and what became of the material."""
+
+    def contents() -> dict[str, bytes]:  # without what training may keep beside a dataset
+        return {name: content for name, content in shell.contents(material).items() if "/features-" not in name}
+
+    before, cases = contents(), {}
+    for number, (command, overrides, _) in enumerate([*((name, "", "") for name in GOOD), *BAD]):
         line = f"output=out {GOOD[command]} {overrides}"
-        line = re.sub(r"@([\w.]+)", lambda name: str(material / name[1]), line)
-        cases[name_of(command, overrides)] = shell.Case(command, line.split())  # the last of several values counts
+        words = re.sub(r"@([\w.]+)", lambda name: str(material / name[1]), line).split()
+        cases[str(number)] = shell.Case(command, [*{word.partition("=")[0]: word for word in words}.values()])
     folder = tmp_path_factory.mktemp("answers")
-    ended = shell.run_in_turn(cases, folder)
-    left = {name: [path for path in (folder / name).rglob("*") if path.is_file()] for name in cases}
-    return SimpleNamespace(ended=ended, left=left, before=before, after=without_features(shell.contents(material)))
+    ended = list(shell.run_in_turn(cases, folder, pictures="blank").values())
+    left = [[path for path in (folder / name).rglob("*") if path.is_file()] for name in cases]
+    return SimpleNamespace(ended=ended, left=left, before=before, after=contents())
 
 
-@pytest.mark.parametrize("command", GOOD)
-def test_the_options_without_the_bad_ones_are_valid(command: str, answers: SimpleNamespace) -> None:
-    name = name_of(command, "")
-    assert answers.ended[name].status == 0, answers.ended[name].errors
-    assert answers.left[name]
+def test_the_options_without_the_bad_ones_are_valid(answers: SimpleNamespace) -> None:
+    for answer, left in zip(answers.ended[: len(GOOD)], answers.left, strict=False):
+        assert answer.status == 0 and left, answer.errors
 
 
-@pytest.mark.parametrize(
-    ("command", "overrides", "said"),
-    [
-        # Of messages that differ in names and numbers alone, `make test` sees one.
-        *(
-            pytest.param(*row, id=name_of(*row[:2]), marks=[] if FIRST[form_of(row[2])] == number else pytest.mark.soak)
-            for number, row in enumerate(BAD)
-        ),
-        *(pytest.param(*row, id=name_of(*row[:2]), marks=pytest.mark.soak) for row in MORE),
-    ],
-)
-def test_bad_input_ends_in_one_line_and_writes_nothing(
-    command: str, overrides: str, said: str, answers: SimpleNamespace
-) -> None:
-    answer = answers.ended[name_of(command, overrides)]
+@pytest.mark.parametrize("case", range(len(BAD)), ids=[f"{command} {overrides}" for command, overrides, _ in BAD])
+def test_bad_input_ends_in_one_line_and_writes_nothing(case: int, answers: SimpleNamespace) -> None:
+    answer = answers.ended[len(GOOD) + case]
     assert answer.status == 2, answer.errors
     (line,) = answer.complaints
-    assert line.startswith("error: ")
-    assert said in line
-    assert not answers.left[name_of(command, overrides)]
+    assert line.startswith("error: ") and BAD[case][2] in line
+    assert not answers.left[len(GOOD) + case]
 
 
 def test_bad_input_leaves_what_it_names_as_it_was(answers: SimpleNamespace) -> None:
-    assert len(answers.before) > 30
     assert answers.before == answers.after
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "plan task=juggling",
-        pytest.param("collect transitions", marks=pytest.mark.soak),
-        pytest.param("evaluate workers=0", marks=pytest.mark.soak),
-    ],
-)
-def test_bad_input_of_a_user_at_a_terminal(line: str, shell: SimpleNamespace, tmp_path: Path) -> None:
-    """The cases above share a process; these are on their own, as users are."""
-    answer = shell.run_as_users(*line.split(), folder=tmp_path)
-    assert answer.status == 2
-    assert answer.errors.startswith("error: ")
-    assert answer.errors.count("\n") == 1
-    assert answer.output == ""
+def test_bad_input_of_a_user_at_a_terminal(shell: SimpleNamespace, tmp_path: Path) -> None:
+    """The cases above share a process; this one is on its own, as users are."""
+    answer = shell.run_as_users("plan", "task=juggling", folder=tmp_path)
+    assert (answer.status, answer.output) == (2, "")
+    assert answer.errors.startswith("error: unknown task 'juggling': ") and answer.errors.count("\n") == 1
     assert not list(tmp_path.iterdir())

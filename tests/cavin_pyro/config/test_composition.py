@@ -1,56 +1,200 @@
-"""A composition leaves nothing behind for the next: presets are read once, and Hydra's store is not copied."""
+"""From overrides to a configuration, or to one line about the wrong one."""
 
 from __future__ import annotations
 
-import copy
+from itertools import zip_longest
+from pathlib import Path
 
 import pytest
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 
-from cavin_pyro.config.composition import check_overrides, compose
+from cavin_pyro.config.application import read_command_line
+from cavin_pyro.config.commands import COMMANDS
+from cavin_pyro.config.commands.episodes import CHECKPOINTS
+from cavin_pyro.config.composition import PRESETS, compose, composed, of_sweep, sections_of_classes, sweeps
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.help import EXAMPLES, FACTS_OF_PRESETS, WIDTH, help_page, presets
+from cavin_pyro.config.options import flat_options
+from cavin_pyro.storage import checkpoint
+from cavin_pyro.storage.checkpoint import find_checkpoint
 
-OVERRIDES = {
-    "plan": ("planner=paper", "task=rearrange", "planner.samples=8", "planner.optimizer=cem", "env.objects=mixed"),
-    "train": ("model=flat", "guide=flat", "prior=flow", "objective=iwae", "scales=learned", "model.width=8"),
+GROUPS = {  # and a command that has them
+    "train": ("model", "guide", "prior", "geometry", "dynamics", "scales", "objective"),
+    "plan": ("task", "planner", "env/ranges"),
+    "evaluate": ("planner/optimizer",),
 }
+# Several groups at once, since a composition takes a while.
+CHOICES = [
+    (command, [f"{group}={choice}" for group, choice in zip(groups, choices, strict=True) if choice])
+    for command, groups in GROUPS.items()
+    for choices in zip_longest(*map(presets, groups))
+]
 
 
-@pytest.mark.parametrize("command", OVERRIDES)
-def test_overrides_change_one_composition_only(command: str) -> None:
+@pytest.mark.parametrize(("command", "overrides"), CHOICES)
+def test_every_preset_is_composed_and_helps_with_every_option(command: str, overrides: list[str]) -> None:
+    config, choices = composed(command, overrides)
+    assert {f"{group}={choice}" for group, choice in choices.items()} >= {*overrides}
+    entries = [
+        line.split(maxsplit=1) for line in help_page(command, "", config, choices).splitlines() if line[2:3] > " "
+    ]
+    without_text = {entry[0].partition("=")[0] for entry in entries if len(entry) == 1 and "=" in entry[0]}
+    assert without_text <= {"planner.compile"}  # which `plan` sets for planner=random, too
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_lists_every_option_with_its_meaning_and_valid_examples(command: str) -> None:
+    config, choices = composed(command, [])
+    page = help_page(command, "What it does.", config, choices)
+    listed = {line.strip().partition("=")[0] for line in page.splitlines() if "=" in line and line[2:3] > " "}
+    hidden = {f"planner.{name}" for name in FACTS_OF_PRESETS} | {"model.prior._target_"}
+    assert {
+        name for name in flat_options(OmegaConf.to_container(config)) if not name.startswith("task.")
+    } - listed <= hidden
+    assert "None" not in page and max(map(len, page.splitlines())) <= WIDTH
+    for example in EXAMPLES[command]:
+        line = read_command_line(example.split())
+        for overrides in sweeps(line.overrides) if line.multirun else [line.overrides]:
+            compose(command, *overrides)
+
+
+def test_help_names_units_defaults_choices_and_arguments_of_a_users_class(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_help.py").write_text(
+        'class Wide:\n    """My layers.\n\n    Args:\n        width: width of my layers. depth: how many.\n    """\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    page = help_page("train", "", *composed("train", ["guide._target_=my_help.Wide"]))
+    lines = [" ".join(line.split()) for line in page.splitlines()]
+    assert "guide.width=64 width of my layers" in lines
+    page = " ".join(help_page("plan", "", *composed("plan", [])).split())
+    assert "env.ranges.clearance=0.15 least distance between the objects' centres at the start, in metres" in page
+    assert "reward=sparse reward of the task; one of dense, sparse" in page
+
+
+@pytest.mark.parametrize("command", ["plan", "train"])
+def test_a_composition_leaves_nothing_behind(command: str) -> None:
     before = compose(command)
-    changed = compose(command, *OVERRIDES[command])
+    changed = compose(command, *(["planner=paper", "planner.samples=8"] if command == "plan" else ["model=flat"]))
     assert changed != before
-    assert compose(command) == before
-    assert compose(command, *OVERRIDES[command]) == changed
-
-
-@pytest.mark.parametrize("command", OVERRIDES)
-def test_a_composed_configuration_may_be_changed(command: str) -> None:
-    expected = check_overrides(command, [])
-
-    def empty(config: DictConfig) -> None:
-        for key in list(config):
-            config._set_flag(["readonly", "struct"], [False, False])
-            del config[key]
-
-    spoilt = check_overrides(command, [])
-    for section in [spoilt[key] for key in spoilt if isinstance(spoilt._get_node(key), DictConfig)]:
-        if not section._is_none():
-            empty(section)
-    assert check_overrides(command, []) == expected
-
-
-def test_a_refused_override_leaves_the_next_composition_alone() -> None:
-    before = compose("plan")
     with pytest.raises(UserError):
-        compose("plan", "planner.samples=none")
-    assert compose("plan") == before
+        compose(command, "seed=none")
+    changed.clear()
+    assert compose(command) == before
 
 
-def test_the_store_stands_for_its_copy_and_its_schemas_are_copied() -> None:
-    store = ConfigStore.instance()
-    assert copy.deepcopy(store) is store
-    one, other = store.load("plan.yaml"), store.load("plan.yaml")
-    assert one.node == other.node and one.node is not other.node
+BAD = [  # overrides of `plan` unless another command is named, and what the line must say
+    ("task=juggling", "unknown task 'juggling': choose from clearing, "),
+    ("planner.optimizer=best", "unknown planner/optimizer 'best': choose from cem, "),
+    ("planner.optimizer=my_lab.Mine", "a class of your own is planner.optimizer._target_=my_lab.Mine"),
+    ("train guide=nonsense", "unknown guide 'nonsense': choose from "),
+    ("reward=medium", "unknown reward 'medium': choose from dense, sparse"),
+    ("tsak=crossing", "unknown option 'tsak': did you mean task? valid are checkpoint, "),
+    ("planner.sampels=3", "unknown option 'planner.sampels': did you mean samples? valid under planner are "),
+    ("planner=random planner.samples=3", "unknown option 'planner.samples': valid under planner are "),
+    ("sum.what.else=3", "unknown option 'sum.what.else': valid are "),
+    ("check device=cuda", "unknown option 'device': it is an option of pretrain, "),
+    ("demo task=clearing", "unknown option 'task': did you mean tasks? "),
+    ("+unknown=1", "unknown option 'unknown': valid are "),
+    ("++env.ranges.clearnace=1", "unknown option 'env.ranges.clearnace': did you mean clearance? "),
+    ("~task", "~task: an option cannot be removed"),
+    ("seed", "seed: Error parsing override"),
+    ("seed=[1,", "seed=[1,: "),
+    ("seed=1,2", "seed=1,2: Ambiguous value for argument 'seed=1,2'; several values need -m: "),
+    ("reward=???", "reward=???: Missing mandatory value"),
+    ("reward=${nowhere}", "reward=${nowhere}: Interpolation key 'nowhere' not found"),
+    ("seed=1.5", "seed=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
+    ("planner.samples=many", "planner.samples=many: Value 'many' of type 'str' could not be converted to Integer"),
+    ("planner.samples=null", "planner.samples=null: field 'planner.samples' is not Optional"),
+    ("trust=os", "trust=os: Invalid value assigned: str is not a ListConfig, list or tuple"),
+    ("train guide=[]", "guide must be one of its presets"),
+    ("train prior=[[]]", "prior=[[]]: "),
+    ("seed=${oc.decode:'-1'}", "seed must be between 0 and 4294967295, not -1"),
+    ("margin=inf", "margin must be between 0 and 0.075 metres, not inf"),
+    ("evaluate workers=0", "workers must be between 1 and 1024, not 0"),
+    ("train trainer.learning_rate=0", "trainer.learning_rate must be a positive number, not 0"),
+    ("pln seed=0", "unknown command 'pln': choose from collect, "),
+]
+
+
+@pytest.mark.parametrize(("line", "said"), BAD)
+def test_a_wrong_override_is_named_in_one_line_with_what_would_be_right(line: str, said: str) -> None:
+    command, *overrides = line.split() if line.split()[0] in (*COMMANDS, "pln") else ["plan", *line.split()]
+    with pytest.raises(UserError) as refused:
+        compose(command, "video=false", *overrides) if command == "plan" else compose(command, *overrides)
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        ("", "contact"),
+        ("planner=paper", "cavin"),
+        ("planner=random", "cavin"),
+        ("planner=sectar planner.optimizer=cem", "sectar"),
+        ("planner=sectar checkpoint=runs/mine.safetensors", "runs/mine.safetensors"),
+    ],
+)
+def test_the_planner_brings_its_checkpoint(overrides: str, name: str) -> None:
+    assert compose("plan", *overrides.split()).checkpoint == name
+
+
+def test_checkpoints_have_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert find_checkpoint("kinect").is_file()
+    assert find_checkpoint("runs/a.safetensors") == Path("runs/a.safetensors")
+    with pytest.raises(UserError, match="^unknown checkpoint 'best': choose from cavin, "):
+        find_checkpoint("best")
+    monkeypatch.setattr(checkpoint, "shipped_folder", lambda: tmp_path)
+    for name, (model, guide) in CHECKPOINTS.items():
+        with pytest.raises(UserError, match=f"^there is no checkpoint {name} "):
+            find_checkpoint(name)
+        compose("train", f"model={model}", f"guide={guide}")  # as the line says
+
+
+def test_an_output_folder_says_how_a_run_differs() -> None:
+    lines = {
+        ("train",): "runs/train",
+        ("train", "model=flat", "guide=flat", "data=a/b"): "runs/train-data=a-b,guide=flat,model=flat",
+        ("train", "output=mine", "model=flat"): "mine",
+        ("collect", "transitions=7", "workers=3"): "data/pushes",
+        ("plan", "planner=paper", "seed=3"): "runs/plan/crossing-sparse-3-paper-3",
+        ("plan", "planner.optimizer=cem"): "runs/plan/crossing-sparse-3-cavin-0-planner-optimizer=cem",
+        ("reproduce", "scale=smoke"): "runs/reproduce/smoke",
+    }
+    assert {line: compose(*line).output for line in lines} == lines
+
+
+def test_a_sweep_has_a_run_for_each_combination_named_by_what_differs() -> None:
+    words = ["task=clearing,crossing", "seed=0,1", "objects=2", "output=here"]
+    runs = list(sweeps(words))
+    assert len(runs) == 4 and ["task=crossing", "seed=0", "objects=2", "output=here"] in runs
+    assert of_sweep(words) == [
+        "hydra.job.config.override_dirname.exclude_keys=['objects','output']",
+        "hydra.sweep.dir=here",
+    ]
+
+
+def test_a_class_of_the_users_takes_the_place_of_a_part() -> None:
+    words = ["env.camera._target_=my_lab.Mine", "seed=3", "+env.camera.noise=0.1", "env.objects._target_=my_lab.Others"]
+    config = compose("evaluate", *words, "planner._target_=my_lab.Plans", "+planner.depth=3")
+    assert config.env.camera == {"_target_": "my_lab.Mine", "noise": 0.1}
+    assert config.env.objects == {"_target_": "my_lab.Others"} and config.env.segmentation == "mask"
+    assert (config.planner._target_, config.planner.depth, config.planner.samples) == ("my_lab.Plans", 3, 1024)
+    swept = sections_of_classes(["env.robot.speed=2", "env.robot._target_=my_lab.One,my_lab.Other"])
+    assert swept == ["env.robot={speed: 2, _target_: my_lab.One},{speed: 2, _target_: my_lab.Other}"]
+
+
+def test_presets_of_the_users_own_lie_in_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "bücher (1)" / "planner"
+    folder.mkdir(parents=True)
+    (folder / "mine.yaml").write_text("_target_: planning.RandomPlanner\nmodel_free: true\n")
+    config, choices = composed("plan", ["planner=mine"], str(folder.parent))
+    assert choices["planner"] == "mine" and config.checkpoint == "cavin"
+    assert config.output == "runs/plan/crossing-sparse-3-mine-0"
+
+
+def test_every_group_of_presets_belongs_to_a_command() -> None:
+    groups = {file.parent.relative_to(PRESETS).as_posix() for file in PRESETS.rglob("*.yaml")} - {"."}
+    chosen = {group for name in COMMANDS for group in composed(name, [])[1]}
+    assert groups <= chosen

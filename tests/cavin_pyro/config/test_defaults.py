@@ -12,10 +12,9 @@ import pytest
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
-from cavin_pyro.config import registration
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
-from cavin_pyro.config.composition import compose
+from cavin_pyro.config.composition import PRESETS, compose
 from cavin_pyro.config.constructors import constructor_options
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured, options
@@ -24,7 +23,6 @@ from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from envs.pushing import PushingEnv
 from planning import CavinPlanner
 
-PRESETS = Path(registration.__file__).parent / "presets"
 PAPER = {  # Algorithm 1 as it is printed
     "planner.motion_horizon": "full_horizon",
     "planner.warm_start": False,
@@ -109,13 +107,13 @@ def test_every_option_says_what_it_means(command: str) -> None:
     declared = {one.name: one for one in options(COMMANDS[command])}
     assert declared.keys() >= ({"output"} if command == "reproduce" else {"output", "seed"})  # a scale names its seeds
     for one in declared.values():
-        assert one.about.help and one.about.group
+        assert one.about.help
 
 
 def test_a_stored_section_is_checked_as_a_commands_is() -> None:
     assert configured(WindowConfig, {"maximum_step": 0.3, "of_old": 1}, "windows") == WindowConfig(maximum_step=0.3)
     for values, said in (
-        ({"maximum_step": "far"}, "windows.maximum_step is of another type"),
+        ({"maximum_step": "far"}, "windows.maximum_step: Value 'far'"),
         ({"maximum_step": -1}, "windows.maximum_step must be a positive number, not -1"),
     ):
         with pytest.raises(UserError, match=f"^{said}"):
