@@ -4,12 +4,10 @@ import math
 import subprocess
 import sys
 
-import pyro
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from pyro import poutine
 from pyro.distributions import Normal
 from torch import Tensor
 from torch.autograd.functional import jacobian
@@ -35,7 +33,7 @@ def standard(*shape: int) -> Normal:
 
 
 @both_ways
-@pytest.mark.parametrize("dimension", [1, 2, 5])
+@pytest.mark.parametrize("dimension", [1, 5])
 def test_a_new_flow_is_the_identity(dimension: int, from_base: bool) -> None:
     flow = CodeFlow(dimension, 3, width=8, from_base=from_base).double()
     base, context = Normal(numbers(4, dimension), numbers(4, dimension).exp()).to_event(1), numbers(4, 3)
@@ -49,7 +47,7 @@ def test_a_new_flow_is_the_identity(dimension: int, from_base: bool) -> None:
 
 
 @both_ways
-@pytest.mark.parametrize("dimension", [1, 2, 5])
+@pytest.mark.parametrize("dimension", [1, 5])
 def test_the_density_follows_from_the_jacobian(dimension: int, from_base: bool) -> None:
     """A code is a function of its noise z = mean + epsilon, and log q(code) = log N(z) - log |d code / d z|."""
     flow = randomized(CodeFlow(dimension, 3, width=8, from_base=from_base))
@@ -116,42 +114,6 @@ def test_each_element_of_a_batch_has_its_own_context(batch: list[int], samples: 
     assert torch.allclose(one.log_prob(sampled[first]), scores[first])
     wider = distribution.expand((2, *batch))
     assert torch.allclose(wider.log_prob(sampled[(0,) * len(samples)])[1], scores[(0,) * len(samples)])
-
-
-def test_one_code_is_scored_under_many_contexts() -> None:
-    flow, code, contexts = randomized(CodeFlow(3, 2, width=8)), numbers(3), numbers(6, 4, 2)
-    scores = flow(standard(6, 4, 3), contexts).log_prob(code)
-    assert scores.shape == (6, 4)
-    assert torch.allclose(scores[5, 2], flow(standard(3), contexts[5, 2]).log_prob(code))
-
-
-def test_in_a_plate_with_particles_and_a_mask() -> None:
-    flow, mask = randomized(CodeFlow(3, 2, width=8, from_base=True)), torch.tensor([True, False, True, True])
-    distribution = flow(standard(4, 3), numbers(4, 2))
-
-    def program() -> None:
-        with pyro.plate("particles", 5, dim=-2), pyro.plate("windows", 4, dim=-1), poutine.mask(mask=mask):
-            pyro.sample("code", distribution)
-
-    traced = poutine.trace(program).get_trace()
-    traced.compute_log_prob()
-    site = traced.nodes["code"]
-    assert site["value"].shape == (5, 4, 3)
-    assert torch.allclose(site["log_prob"], distribution.log_prob(site["value"].clone()) * mask)
-
-
-@both_ways
-def test_samples_depend_on_the_global_seed_alone(from_base: bool) -> None:
-    distribution = randomized(CodeFlow(3, 2, width=8, from_base=from_base))(standard(4, 3), numbers(4, 2))
-    repeats = []
-    for seed in (1, 1, 2):
-        torch.manual_seed(seed)
-        repeats.append(distribution.sample())
-    torch.manual_seed(1)
-    assert torch.allclose(distribution.rsample(), repeats[0])
-    assert torch.equal(repeats[0], repeats[1])
-    assert not torch.equal(repeats[0], repeats[2])
-    assert not repeats[0].requires_grad
 
 
 def test_arguments_of_distributions_are_checked_as_before() -> None:

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.networks.outline import (
-    HARMONICS,
     OUTLINE_UNIT,
     OUTLINES,
     PER_OUTLINE,
@@ -72,19 +71,6 @@ def test_an_outline_reaches_in_four_directions_as_far_as_its_points(angle: float
         assert reach.item() == pytest.approx((ellipse[:, :2] @ torch.tensor(direction)).max().item(), abs=1e-3)
 
 
-def test_multiples_of_an_angle_are_those_of_trigonometry() -> None:
-    angles = 6.3 * torch.rand(5, dtype=torch.float64)
-    orders = torch.arange(1, HARMONICS + 1).unsqueeze(-1)
-    cosines, sines = multiples(angles.cos(), angles.sin())
-    assert torch.allclose(cosines, (orders * angles).cos())
-    assert torch.allclose(sines, (orders * angles).sin())
-
-
-def test_a_turned_outline_differs_from_one_that_is_not() -> None:
-    here, there = (outline_values(Outline()(box(0.10, 0.04) @ rotation(angle).T)) for angle in (0.0, 0.5))
-    assert (here - there).abs().max() > 0.1
-
-
 def test_features_are_unit_vectors_whatever_the_order_of_the_points() -> None:
     clouds = 0.04 * torch.randn(2, 3, 256, 3)
     features = Outline()(clouds)
@@ -109,8 +95,3 @@ def test_the_upper_outlines_tell_a_lying_can_from_a_box() -> None:
     can, block = (outline_values(Outline()(cloud)) for cloud in (can, block))
     assert torch.allclose(can[:PER_OUTLINE], block[:PER_OUTLINE], atol=1e-4)
     assert (can - block)[2 * PER_OUTLINE : SERIES].abs().max() > 0.1
-
-
-def test_another_number_of_features_is_refused() -> None:
-    with pytest.raises(ValueError, match="outlines have 64 numbers per object, not 32"):
-        Outline(32)
