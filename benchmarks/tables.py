@@ -100,17 +100,25 @@ def readme() -> str:
 
 
 def success(name: str = "success") -> str:
-    """One line per row and task: how episodes end, with their seeds and commit."""
+    """One line per row and rules: success, pushes and failures of each task, with their seeds and commit."""
+    rows = read(name)
+    tasks = list(groups(rows, "task"))
     lines = []
-    for (row, task, objects, rules), found in groups(read(name), "row", "task", "objects", "rules").items():
-        ends = Counter(one["outcome"] for one in found)
-        failures = [ends[end] for end in ("violation", "fall", "timeout")]
+    for (row, rules), found in groups(rows, "row", "rules").items():
+        by_task = groups(found, "task")
+        counts = ", ".join(sorted({str(len(of_task)) for of_task in by_task.values()}))
         commits = ", ".join(sorted({one["commit"] for one in found}))
-        lines.append(
-            [row, task, objects, rules, len(found), rate(found), *failures, pushes(found), seeds(found), commits]
-        )
-    head = ["row", "task", "objects", "rules", "episodes", "success", "violations", "falls", "out of time"]
-    return markdown([*head, "pushes, median (mean)", "seeds", "commit"], lines)
+        lines.append([row, rules, counts, *(_ends(by_task.get(task, [])) for task in tasks), seeds(found), commits])
+    return markdown(["row", "rules", "episodes", *(task for (task,) in tasks), "seeds", "commit"], lines)
+
+
+def _ends(rows: Sequence[Row]) -> str:
+    """Success with its interval; mean pushes; violations, falls and timeouts."""
+    if not rows:
+        return ""
+    ends = Counter(row["outcome"] for row in rows)
+    steps = statistics.mean(row["steps"] for row in rows if row["outcome"] == "success")
+    return f"{rate(rows)}; {steps:.1f}; {ends['violation']}, {ends['fall']}, {ends['timeout']}"
 
 
 def additions() -> str:
@@ -223,7 +231,6 @@ def accuracy() -> str:
     rows = read("accuracy")
     kinds: list[tuple[str, Callable[[Row], bool]]] = [
         ("all", lambda row: True),
-        ("alone on the table", lambda row: row["objects"] == 1),
         ("five objects", lambda row: row["objects"] == 5),
     ]
     who = list(dict.fromkeys(row["predictor"] for row in rows))
