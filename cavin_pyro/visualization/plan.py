@@ -104,15 +104,6 @@ def draw_paths(panel: Axes, paths: Mapping[int, Pixels]) -> None:
         panel.plot(path[:, 0], path[:, 1], **_REACHED, markevery=slice(1, None), path_effects=_HALO, zorder=6)
 
 
-def draw_tiles(panel: Axes, task: Task, view: View) -> None:
-    """Draw the task's region and goal."""
-    for group in task.tile_groups():
-        fill = to_rgba(group.color, group.opacity)
-        for tile in group.tiles:
-            corners = tile_corners(tile, view)
-            panel.add_patch(Polygon(corners, facecolor=fill, edgecolor=group.color, linewidth=1.4, zorder=1))
-
-
 def draw_objects(panel: Axes, centers: NDArray[np.float32], mask: NDArray[np.bool_], view: View) -> None:
     """Draw the centres [M, 3] metres of the objects in the mask [M], with a ring around the target."""
     pixels = view.project(centers[mask])
@@ -167,13 +158,6 @@ def _draw_pushes(panel: Axes, record: PlanRecord, view: View) -> None:
         panel.add_patch(arrow)
         x, y = start - 8 * (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)  # 8 pixels
         panel.text(x, y, str(number), ha="center", va="center", fontsize=8, path_effects=_HALO, zorder=7)
-
-
-def draw_clouds(panel: Axes, clouds: NDArray[np.float32], mask: NDArray[np.bool_], view: View) -> None:
-    """Draw the points [M, 256, 3] metres of the objects in the mask [M], each in its object's colour."""
-    for number in np.flatnonzero(mask):
-        pixels = view.project(clouds[number])
-        panel.scatter(pixels[:, 0], pixels[:, 1], s=1.5, color=COLORS[number], linewidths=0, zorder=1.5)
 
 
 def mark_axes(panel: Axes, view: View) -> None:
@@ -314,11 +298,17 @@ def _draw_ground(
         panel.imshow(photograph)  # which shows the tiles
     else:
         panel.fill([left, right, right, left], [top, top, bottom, bottom], color=TABLE_COLOR, zorder=0)
-        draw_tiles(panel, task, view)
+        for group in task.tile_groups():
+            fill = to_rgba(group.color, group.opacity)
+            for tile in group.tiles:
+                corners = tile_corners(tile, view)
+                panel.add_patch(Polygon(corners, facecolor=fill, edgecolor=group.color, linewidth=1.4, zorder=1))
     if camera is None:
         mark_axes(panel, view)
         if clouds is not None:
-            draw_clouds(panel, clouds, mask, view)
+            for number in np.flatnonzero(mask):
+                pixels = view.project(clouds[number])
+                panel.scatter(pixels[:, 0], pixels[:, 1], s=1.5, color=COLORS[number], linewidths=0, zorder=1.5)
     panel.set_xlim(left - MARGIN, right + MARGIN)
     panel.set_ylim(bottom + MARGIN, top - MARGIN)  # rows count downwards
     panel.set_aspect("equal")

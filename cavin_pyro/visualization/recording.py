@@ -38,6 +38,9 @@ from envs.scene import COLORS
 from envs.tasks import Task
 from envs.workspace import TILE_SIDE, tile_center
 
+TIMELINE = "video"  # seconds; the same moments as in `episode.mp4`
+POINT_RADIUS = 0.0015  # metres
+TILE_HEIGHT = 0.001  # metres above the table, or the two would flicker
 CANDIDATES = 1000  # points per plan
 PUSH_HEIGHT = 0.01  # metres above the table, about the tip's
 
@@ -57,51 +60,6 @@ def object_name(number: int) -> str:
 def vivid(color: Sequence[float]) -> list[int]:
     """Red, green, blue and perhaps opacity in [0, 1] -> whole numbers to 255."""
     return [round(255 * channel) for channel in color]
-
-
-def log_plan(stream: rr.RecordingStream, record: PlanRecord, task: Task) -> None:
-    """Log this plan in place of the last one, at the stream's current time."""
-    for entity in ("world/plan", "world/reached"):
-        stream.log(entity, rr.Clear(recursive=True))
-    returns = record.plan.candidate_returns[0].numpy()
-    scale = return_scale(returns)
-    if scale is not None:
-        points, values = candidate_subgoals(record, task, Space(), count=CANDIDATES)
-        colors = np.asarray(RETURNS(scale(values)))[:, :3]
-        dots = rr.Points3D(points, colors=(255 * colors).round().astype(np.uint8), radii=0.004)
-        stream.log("world/plan/candidates", dots)
-    for number, chain in subgoal_chains(record, Space()).items():
-        color = SUBGOAL_COLOR if number == 0 else OBSTACLE_COLOR
-        _log_paths(stream, "world/plan/subgoals", {number: chain}, color, radius=0.009)
-    _log_paths(stream, "world/plan/predicted", predicted_paths(record, Space()), PREDICTION_COLOR, radius=0.005)
-    ends = pushes(record, Space()) + np.array([0.0, 0.0, PUSH_HEIGHT])
-    arrows = rr.Arrows3D(
-        origins=ends[:, 0],
-        vectors=ends[:, 1] - ends[:, 0],
-        colors=vivid(to_rgb(PUSH_COLOR)),
-        radii=0.003,
-        labels=[str(number) for number in range(1, len(ends) + 1)],
-    )
-    stream.log("world/plan/pushes", arrows)
-    expected = float(record.plan.expected_return[0])
-    expectation = "" if np.isnan(expected) else f", expected return {expected:.0f}"
-    line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{record.prospect}"
-    stream.log("log", rr.TextLog(line))
-
-
-def _log_paths(
-    stream: rr.RecordingStream, entity: str, paths: Mapping[int, NDArray[np.float64]], color: str, *, radius: float
-) -> None:
-    """Lines with a ball at every point but the first, which is where the object is."""
-    for number, path in paths.items():
-        name = f"{entity}/{object_name(number)}"
-        stream.log(name, rr.LineStrips3D([path], colors=vivid(to_rgb(color)), radii=radius / 3))
-        stream.log(f"{name}/states", rr.Points3D(path[1:], colors=vivid(to_rgb(color)), radii=radius))
-
-
-TIMELINE = "video"  # seconds; the same moments as in `episode.mp4`
-POINT_RADIUS = 0.0015  # metres
-TILE_HEIGHT = 0.001  # metres above the table, or the two would flicker
 
 
 class EpisodeRecording(EpisodeCallback):
@@ -128,13 +86,13 @@ class EpisodeRecording(EpisodeCallback):
         if self._record is not None:
             self._reached.append(observation["centers"])
             paths = reached_paths(self._record, np.array(self._reached), Space())
-            _log_paths(self._stream, "world/reached", paths, REACHED_COLOR, radius=0.006)
+            self._log_paths("world/reached", paths, REACHED_COLOR, radius=0.006)
 
     def on_plan(self, record: PlanRecord) -> None:
         """Log the plan, and pause before it is executed."""
         self._record, self._reached = record, []
         self._stream.set_time(TIMELINE, duration=self._seconds)
-        log_plan(self._stream, record, self._task)
+        self._log_plan(record)
         self._log_photograph(record.photograph)
         self._seconds += PAUSE
 
@@ -150,6 +108,43 @@ class EpisodeRecording(EpisodeCallback):
         self._log_photograph(episode.photograph)
         level = rr.TextLogLevel.INFO if episode.outcome == "success" else rr.TextLogLevel.ERROR
         self._stream.log("log", rr.TextLog(f"{episode.outcome} after {len(episode.transitions)} pushes", level=level))
+
+    def _log_plan(self, record: PlanRecord) -> None:
+        """Log this plan in place of the last one."""
+        stream = self._stream
+        for entity in ("world/plan", "world/reached"):
+            stream.log(entity, rr.Clear(recursive=True))
+        returns = record.plan.candidate_returns[0].numpy()
+        scale = return_scale(returns)
+        if scale is not None:
+            points, values = candidate_subgoals(record, self._task, Space(), count=CANDIDATES)
+            colors = np.asarray(RETURNS(scale(values)))[:, :3]
+            dots = rr.Points3D(points, colors=(255 * colors).round().astype(np.uint8), radii=0.004)
+            stream.log("world/plan/candidates", dots)
+        for number, chain in subgoal_chains(record, Space()).items():
+            color = SUBGOAL_COLOR if number == 0 else OBSTACLE_COLOR
+            self._log_paths("world/plan/subgoals", {number: chain}, color, radius=0.009)
+        self._log_paths("world/plan/predicted", predicted_paths(record, Space()), PREDICTION_COLOR, radius=0.005)
+        ends = pushes(record, Space()) + np.array([0.0, 0.0, PUSH_HEIGHT])
+        arrows = rr.Arrows3D(
+            origins=ends[:, 0],
+            vectors=ends[:, 1] - ends[:, 0],
+            colors=vivid(to_rgb(PUSH_COLOR)),
+            radii=0.003,
+            labels=[str(number) for number in range(1, len(ends) + 1)],
+        )
+        stream.log("world/plan/pushes", arrows)
+        expected = float(record.plan.expected_return[0])
+        expectation = "" if np.isnan(expected) else f", expected return {expected:.0f}"
+        line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{record.prospect}"
+        stream.log("log", rr.TextLog(line))
+
+    def _log_paths(self, entity: str, paths: Mapping[int, NDArray[np.float64]], color: str, *, radius: float) -> None:
+        """Lines with a ball at every point but the first, which is where the object is."""
+        for number, path in paths.items():
+            name = f"{entity}/{object_name(number)}"
+            self._stream.log(name, rr.LineStrips3D([path], colors=vivid(to_rgb(color)), radii=radius / 3))
+            self._stream.log(f"{name}/states", rr.Points3D(path[1:], colors=vivid(to_rgb(color)), radii=radius))
 
     def _log_photograph(self, photograph: NDArray[np.uint8] | None) -> None:
         if photograph is not None:

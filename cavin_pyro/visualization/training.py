@@ -22,7 +22,7 @@ DOTS_PER_INCH = 120
 COLORS = {"training": "#0072B2", "validation": "#D55E00"}
 OBSERVED, RECONSTRUCTED = "#9A9A9A", "#E69F00"  # points of a cloud, and of its reconstruction
 RUN_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
-RUN_COLUMNS = 3
+COLUMNS = 3  # of panels
 
 
 def save_figure(path: Path, figure: Figure) -> None:
@@ -44,18 +44,9 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
     if not rows:
         raise ValueError("there is no row of metrics to draw: train first")
     terms = [key for key in rows[0] if key.startswith("validation_") and key != "validation_loss"]
-    small = -(-len(terms) // 2)  # columns of small panels, in two rows
-    figure = Figure(figsize=(5.0 + 2.9 * small, 4.2), dpi=DOTS_PER_INCH, layout="constrained")
-    grid = figure.add_gridspec(2, 1 + small, width_ratios=[1.7, *[1.0] * small])
-    loss = figure.add_subplot(grid[:, 0])
-    _draw_curves(loss, {name: (COLORS[name], _curve(rows, f"{name}_loss")) for name in COLORS}, "loss")
-    loss.legend(fontsize=9, frameon=False)
-    loss.set_xlabel("training step", fontsize=9)
-    for number, term in enumerate(terms):
-        row, column = divmod(number, small)
-        panel = figure.add_subplot(grid[row, 1 + column])
-        _draw_curves(panel, {"validation": (COLORS["validation"], _curve(rows, term))}, term)
-    save_figure(path, figure)
+    panels = {"loss": {name: (color, _curve(rows, f"{name}_loss")) for name, color in COLORS.items()}}
+    panels |= {term: {"validation": (COLORS["validation"], _curve(rows, term))} for term in terms}
+    save_figure(path, _draw_panels(panels))
 
 
 @torch.inference_mode()
@@ -107,15 +98,24 @@ def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:
         raise ValueError(f"give 1 to {len(RUN_COLORS)} runs, each with a validation: {len(runs)} given")
     # Runs of different models do not have the same terms.
     keys = list(dict.fromkeys(key for rows in runs.values() for key in rows[0] if key.startswith("validation_")))
-    rows_of_panels = -(-len(keys) // RUN_COLUMNS)
-    figure = Figure(figsize=(10.0, 0.6 + 2.1 * rows_of_panels), layout="constrained")
-    axes = figure.subplots(rows_of_panels, RUN_COLUMNS, squeeze=False)
-    for panel, key in zip(axes.flat, keys, strict=False):
-        colored = zip(RUN_COLORS, runs.items(), strict=False)
-        _draw_curves(panel, {name: (color, _curve(rows, key)) for color, (name, rows) in colored}, key)
-    for panel in axes.flat[len(keys) :]:
+    colored = list(zip(RUN_COLORS, runs.items(), strict=False))
+    return _draw_panels({key: {name: (color, _curve(rows, key)) for color, (name, rows) in colored} for key in keys})
+
+
+Curves = Mapping[str, tuple[str, NDArray[np.float64]]]
+"""Of a panel, by names for the legend: colour, and steps and values [n, 2]."""
+
+
+def _draw_panels(panels: Mapping[str, Curves]) -> Figure:
+    """A panel for each column of metrics."""
+    lines = -(-len(panels) // COLUMNS)
+    figure = Figure(figsize=(10.0, 0.6 + 2.1 * lines), dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(lines, COLUMNS, squeeze=False)
+    for panel, (column, curves) in zip(axes.flat, panels.items(), strict=False):
+        _draw_curves(panel, curves, column)
+    for panel in axes.flat[len(panels) :]:
         panel.set_axis_off()
-    for panel in axes.flat[: len(keys)][-RUN_COLUMNS:]:  # the lowest of each column
+    for panel in axes.flat[: len(panels)][-COLUMNS:]:  # the lowest of each column
         panel.set_xlabel("training step", fontsize=9)
     handles = axes[0, 0].get_lines()
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=10, frameon=False)
@@ -129,8 +129,7 @@ def _curve(rows: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
     return curve[np.isfinite(curve).all(axis=1)]
 
 
-def _draw_curves(panel: Axes, curves: Mapping[str, tuple[str, NDArray[np.float64]]], title: str) -> None:
-    """Draw curves [n, 2] in their colours, by names for the legend; the title is a column of metrics."""
+def _draw_curves(panel: Axes, curves: Curves, column: str) -> None:
     for name, (color, curve) in curves.items():
         panel.plot(*curve.T, color=color, linewidth=1.4, marker="o" if len(curve) == 1 else None, label=name)
     values = np.concatenate([curve[:, 1] for _, curve in curves.values()])
@@ -141,7 +140,7 @@ def _draw_curves(panel: Axes, curves: Mapping[str, tuple[str, NDArray[np.float64
     elif len(values) and np.ptp(values) > 4 * np.ptp(later) > 0:
         margin = 0.1 * np.ptp(later)
         panel.set_ylim(later.min() - margin, later.max() + margin)
-    panel.set_title(title.removeprefix("validation_").replace("_", " "), fontsize=10)
+    panel.set_title(column.removeprefix("validation_").replace("_", " "), fontsize=10)
     panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.grid(color="#DDDDDD", linewidth=0.6)

@@ -30,18 +30,16 @@ NO_PIXELS: Pixels = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
 class ClusterSegmenter:
-    """Finds objects by clustering the points above the table, at most `slots` of them."""
+    """Finds objects by clustering the points above the table, at most `slots` of them.
+
+    Both methods raise ValueError if the image shows no table.
+    """
 
     def __init__(self, slots: int = OBJECT_SLOTS) -> None:
         self._slots = slots
         self._tracks: list[Track | None] = []
 
     def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
-        """Find the objects of a new episode; the target is the one at the pixel that a person has confirmed.
-
-        Raises:
-            ValueError: the image shows no table.
-        """
         heights = map_heights(image)
         regions = find_objects(heights)
         first = _confirmed(regions, image, target)
@@ -51,11 +49,6 @@ class ClusterSegmenter:
         return pixels_of(kept, heights)
 
     def follow(self, image: DepthImage) -> list[Pixels]:
-        """Find the same objects again.
-
-        Raises:
-            ValueError: the image shows no table.
-        """
         heights = map_heights(image)
         found = follow_tracks(self._tracks, heights)
         for number, track in enumerate(found):

@@ -1,4 +1,10 @@
-"""Shapes of objects from above, taken when they stood alone, to place on later maps."""
+"""Registration of objects in contact, by their shapes from above, taken when they stood alone.
+
+Analysis by synthesis: place the shapes on the height map so that together they explain it at the lowest cost, without
+overlaps. The search places one shape after the other where it lowers the cost most, in several orders; then it removes
+and places each one again until the cost stops falling (block coordinate descent, each step a search over all poses),
+and exchanges pairs of similar shapes. All costs are in cells.
+"""
 
 from __future__ import annotations
 

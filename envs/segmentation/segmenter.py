@@ -50,11 +50,9 @@ class MaskSegmenter:
         self._true_masks = true_masks
 
     def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
-        """Begin an episode; the simulator knows which object is the target."""
         return self.follow(image)
 
     def follow(self, image: DepthImage) -> list[Pixels]:
-        """Pixels of each object, in the simulator's order."""
         measured = image.depth > 0.0
         found = []
         for mask in self._true_masks():

@@ -1,4 +1,9 @@
-"""Matching of moved objects with pieces of the map, and with parts of a piece of several objects."""
+"""Tracking of objects from one height map to the next.
+
+An unchanged region is the same object. The remaining regions are matched with the objects that moved: pieces of the
+map, or parts of a piece of several objects. An object that touches nothing gets a new shape, for later images in which
+it is in contact.
+"""
 
 from __future__ import annotations
 

@@ -79,7 +79,6 @@ class Kinect2:
     calibration: Perturbation = CALIBRATION
 
     def reset(self, generator: np.random.Generator) -> None:
-        """Begin an episode with the camera elsewhere."""
         self._generator = generator
         self.actual = self.viewpoint.sample(self.nominal, generator)
         self.believed = self.calibration.sample(self.actual, generator)
@@ -88,7 +87,6 @@ class Kinect2:
         self._table_noise = axial_noise(self._table, incidence)
 
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
-        """Take an image."""
         rendering = render(self.actual, table=False)
         drawn = (rendering.bodies >= 0) & (rendering.depth < self._table)
         depth = np.where(drawn, rendering.depth, self._table).astype(np.float32)

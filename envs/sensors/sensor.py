@@ -76,10 +76,9 @@ class IdealSensor:
         self.nominal = camera or Camera()
 
     def reset(self, generator: np.random.Generator) -> None:
-        """Nothing is random here."""
+        """Nothing is random."""
 
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
-        """Take an image."""
         rendering = render(self.nominal)
         return DepthImage(rendering.depth, self.nominal), rendering.bodies
 

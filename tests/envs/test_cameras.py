@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from envs.scene import Scene
 from envs.sensors import CAMERAS, IdealSensor, Kinect2, sensor_of
-from envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera, sample_cloud
-from envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation, axial_noise
+from envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
+from envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation
 
 
 def test_the_images_up_is_x_and_its_left_is_y() -> None:
@@ -30,17 +30,6 @@ def test_points_of_boxes_lie_neither_too_far_to_a_side_nor_too_far_ahead(scene: 
         observed = scene.reset([put("gelatin_box", x, y)], np.random.default_rng(number))
         errors.append(observed.centers[0, :2] - scene.ground_truth().positions[0, :2])
     np.testing.assert_allclose(np.mean(errors, axis=0), 0.0, atol=0.001)
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
-def test_a_cloud_repeats_points_only_where_there_are_too_few(present: int, count: int, seed: int) -> None:
-    points = np.arange(3.0 * present).reshape(present, 3)
-    cloud = sample_cloud(points, count, np.random.default_rng(seed))
-    assert cloud.shape == (count, 3)
-    assert {tuple(point) for point in cloud} <= {tuple(point) for point in points}
-    if present >= count:
-        assert len({tuple(point) for point in cloud}) == count
 
 
 coordinate = st.floats(-1.0, 1.0)
@@ -77,14 +66,6 @@ def test_the_renderer_draws_what_the_geometry_says_of_a_turned_and_shifted_camer
     top = points[points[:, 2] > 2 * truth[2] - 0.001]
     assert len(top) > 0.7 * len(points)  # the rest is a side of the cube
     np.testing.assert_allclose(top.mean(axis=0), (truth[0], truth[1], 2 * truth[2]), atol=0.002)
-
-
-def test_noise_grows_with_distance_and_with_the_angle_of_the_surface() -> None:
-    """Source: Fankhauser et al. 2015; 1.3 mm at one metre from straight above."""
-    head_on = axial_noise(np.array([1.0, 2.0, 4.0]), np.zeros(3))
-    np.testing.assert_allclose(head_on, [0.0013, 0.0017, 0.0043], rtol=1e-5)
-    slanted = axial_noise(np.ones(4), np.radians([0.0, 30.0, 60.0, 75.0]))
-    assert (np.diff(slanted) > 0).all()
 
 
 def test_the_kinect_measures_a_bare_table_as_its_noise_model_says(scene: Scene, put: Callable) -> None:

@@ -140,13 +140,6 @@ def test_what_is_no_goal_is_refused_in_one_line(name: str, content: bytes, messa
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_file_is_refused(shown: Scene, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"cannot be read: No such file or directory$"):
-        read_goal(tmp_path / "goal.png")
-    with pytest.raises(ValueError, match=r"^a goal must end in \.png or \.safetensors, not '\.pkl'$"):
-        save_goal(tmp_path / "goal.pkl", shown)
-
-
 REGION = [(1, 2), (1, 3), (2, 3), (3, 5)]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -242,14 +240,6 @@ def test_any_four_numbers_are_carried_out_in_the_reach_or_refused(crowded: Pushi
     assert np.linalg.norm((after - before)[on_table], axis=-1).max(initial=0.0) < 0.3  # the tool goes 0.14 m at most
     if terminated:
         env.reset()
-
-
-def test_an_environment_is_neither_copied_nor_pickled() -> None:
-    env = PushingEnv(task="clearing", objects=1)
-    for act in (copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="a simulation cannot be copied: make a second environment and reset it"):
-            act(env)
-    env.close()
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])

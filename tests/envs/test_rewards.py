@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from envs.layouts import load_task, parse_task
-from envs.tasks import TASKS, Outcome, Task, TaskReward
+from envs.tasks import Outcome, Task, TaskReward
 from envs.tasks.clearing import Clearing
 from envs.tasks.crossing import Crossing
 from envs.tasks.gathering import Gathering
 from envs.tasks.insertion import Insertion
 from envs.tasks.tiles import SPACING
-from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, tile_center
+from envs.workspace import TILE_SIDE, Tile, tile_center
 
 # A square of four tiles in the table's middle, x 0.37 to 0.67 and y -0.11 to 0.19.
 SQUARE = ((1, 3), (1, 4), (2, 3), (2, 4))
@@ -323,24 +323,3 @@ def test_to_insert_is_the_distance_through_the_mouth_of_the_slot() -> None:
     reward = TaskReward(load_task("insertion", 0))  # the slot (2, 1) is open towards (2, 2)
     assert left(reward, (2, 3)) == pytest.approx(1.5 * TILE_SIDE, abs=SPACING)
     assert left(reward, (4, 2)) == pytest.approx(math.hypot(1.5 * TILE_SIDE, TILE_SIDE / 2), abs=ERROR)
-
-
-def test_where_each_object_has_its_own_place_it_is_the_distance_to_that() -> None:
-    tiles = {"region": [[2, 3]], "target_start": [[2, 3]], "obstacle_start": [[2, 3]]}
-    task = parse_task("rearrange", {**tiles, "places": [tile_center((1, 1)), tile_center((3, 5))]})
-    assert left(TaskReward(task), (1, 1), (3, 4)) == pytest.approx(TILE_SIDE)
-    assert left(TaskReward(task), (3, 5), (1, 1)) == pytest.approx(2 * TILE_SIDE * math.hypot(2, 4))
-
-
-@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.goal_is_shared])
-def test_the_distance_is_zero_where_the_task_is_solved_and_nowhere_longer_than_it_says(name: str) -> None:
-    reward = TaskReward(load_task(name, 0), margin=0.02)
-    torch.manual_seed(0)
-    low, high = torch.tensor(TABLE_LOW), torch.tensor(TABLE_HIGH)
-    planar = low + (high - low) * torch.rand(4000, 1, 2)
-    centers, mask = torch.cat([planar, torch.zeros(4000, 1, 1)], -1), torch.ones(4000, 1, dtype=torch.bool)
-    distances = reward.distance_to_goal(centers, mask)
-    solved = reward(centers, centers, mask).success
-    assert solved.any() and distances[solved].max() <= SPACING
-    assert distances[~solved].mean() > SPACING
-    assert (distances >= 0).all() and (distances <= reward.distance_to_goal.longest(mask)).all()

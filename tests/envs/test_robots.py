@@ -89,17 +89,6 @@ def test_an_arm_touches_nothing_on_its_way_between_retracted_and_above(
     np.testing.assert_allclose(after.orientations, before.orientations, atol=1e-4)
 
 
-def test_observing_with_the_arm_in_view_raises(scene_of: Callable, put: Callable) -> None:
-    scene = scene_of("panda")
-    scene.reset([put("rubiks_cube", 0.55, 0.0)], np.random.default_rng(0))
-    scene.robot.move(np.array([0.5, 0.2, ABOVE_HEIGHT]))
-    assert not scene.robot.clear_of_view(scene.camera)
-    with pytest.raises(RuntimeError, match=r"^the robot stands in the camera's view"):
-        scene.observe()
-    scene.robot.leave()
-    assert scene.observe().visible[0]
-
-
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_a_push_onto_an_object_is_unsafe_under_every_robot(
     scene_of: Callable, put: Callable, push: Callable, name: str

@@ -142,12 +142,6 @@ def test_equal_seeds_and_actions_give_equal_states_whatever_came_before(scene: S
     fresh.close()
 
 
-def test_a_world_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    world = PhysicsWorld()
-    world.close()
-    assert capfd.readouterr() == ("", "")
-
-
 def test_restored_bodies_are_where_they_were_and_the_same_push_ends_alike(scene: Scene, put: Callable) -> None:
     scene.reset([put("rubiks_cube", 0.5, 0.0), put("rubiks_cube", 0.6, 0.0)], np.random.default_rng(0))
     before, push, ends = scene.ground_truth(), normalised_push(np.array([0.42, 0.0]), np.array([0.1, 0.0])), []
@@ -169,19 +163,6 @@ def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scen
     assert not observed.clouds[2:].any() and not observed.centers[2:].any()
     poses = scene.ground_truth().positions
     np.testing.assert_allclose(observed.centers[:2, :2], poses[:, :2], atol=0.02)  # half of an object is hidden
-
-
-def test_a_centre_is_the_mean_of_all_visible_points_so_objects_that_lie_still_are_seen_so(
-    scene: Scene, put: Callable
-) -> None:
-    observed = scene.reset([put("mug", 0.5, 0.2), put("sugar_box", 0.6, -0.2)], np.random.default_rng(0))
-    image = scene.capture()
-    for center, mask in zip(observed.centers, scene.true_masks(), strict=False):
-        points = image.camera.points(image.depth, *np.nonzero(mask))
-        np.testing.assert_allclose(center, points.mean(0), atol=1e-6)
-    again = scene.observe()
-    assert np.array_equal(again.centers, observed.centers)
-    assert not np.array_equal(again.clouds, observed.clouds)  # which are other samples
 
 
 def in_world(part: Part, world: PhysicsWorld) -> np.ndarray:
@@ -246,17 +227,3 @@ def test_exactly_the_tiles_of_the_layout_are_painted(task: str, scene: Scene, pu
             red, green, blue = (int(value) for value in painted[where])
             assert (red > green > 2 * blue) == ((i, j) in goal)  # gold
     assert GOAL_MARKING.color not in {group.color for group in layout.tile_groups() if group.name != "goal"}
-
-
-def test_objects_hide_tiles(scene: Scene, put: Callable) -> None:
-    x, y = tile_center((2, 2))
-    scene.markings = ()
-    scene.reset([put("rubiks_cube", x, y)], np.random.default_rng(0))
-    plain = scene.photograph(PICTURE)
-    scene.markings = load_task("crossing", 0).tile_groups()
-    painted = scene.photograph(PICTURE)
-    on_top, beside = pixel(x, y, 0.057), pixel(x + 0.06, y + 0.06)
-    np.testing.assert_array_equal(painted[on_top], plain[on_top])
-    assert (painted[beside] != plain[beside]).any()
-    body = scene.world.render(PICTURE).bodies == scene.bodies[0]
-    np.testing.assert_array_equal(painted[body], plain[body])

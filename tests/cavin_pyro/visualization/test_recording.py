@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyro
 import pytest
-from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.plan import main
 from cavin_pyro.visualization.rendering import check_viewer
-from cavin_pyro.visualization.video import FRAMES_PER_SECOND, PAUSE
 
 PUSHES = 4  # at most
-FRAMES = 8  # per push that is carried out
-TRANSLATION, POINTS = "Transform3D:translation", "Points3D:positions"
 
 
 @pytest.fixture(scope="module")
@@ -44,30 +37,6 @@ def folder(rerun: Any, checkpoint_file: Path, tmp_path_factory: pytest.TempPathF
     return output
 
 
-@pytest.fixture(scope="module")
-def changing(rerun: Any, folder: Path) -> Callable[[str, str], dict[float, NDArray[np.float64]]]:
-    """The values of a component by their time in seconds."""
-    recording = rerun.dataframe.load_recording(folder / "episode.rrd")
-
-    def read(entity: str, component: str) -> dict[float, NDArray[np.float64]]:
-        table = recording.view(index="video", contents=f"/{entity}").select().read_all()
-        seconds = table.column("video").cast("int64").to_pylist()
-        values = table.column(f"/{entity}:{component}").to_pylist()
-        return {
-            round(1e-9 * second, 6): np.array(value)
-            for second, value in zip(seconds, values, strict=True)
-            if value is not None
-        }
-
-    return read
-
-
-@pytest.fixture(scope="module")
-def steps(folder: Path) -> list[dict[str, str]]:
-    with open(folder / "steps.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_recording_holds_the_world_the_observations_and_the_plans(rerun: Any, folder: Path) -> None:
     recording = rerun.dataframe.load_recording(folder / "episode.rrd")
     found = {(column.entity_path, column.component) for column in recording.schema().component_columns()}
@@ -82,22 +51,6 @@ def test_a_recording_holds_the_world_the_observations_and_the_plans(rerun: Any, 
     assert any(path.startswith("/world/plan/subgoals/") for path, _ in found)
     assert {("/world/tiles/goal", "LineStrips3D:strips"), ("/camera", "EncodedImage:blob")} < found
     assert not [path for path in folder.iterdir() if "partial" in path.name]
-
-
-def test_physics_is_recorded_at_the_videos_moments(changing: Callable, steps: list[dict[str, str]]) -> None:
-    poses = changing("world/robot/body_3/base", TRANSLATION)  # after the table and two objects
-    carried_out = sum(not int(step["unsafe"]) for step in steps)
-    decided = sum(bool(step["planning_ms"]) for step in steps)
-    assert carried_out > 0
-    last = max(changing("world/observed/centers", "Points3D:positions"))
-    assert last == pytest.approx(PAUSE * decided + FRAMES * carried_out / FRAMES_PER_SECOND)
-    low = [pose for pose in poses.values() if pose[0, 2] < 0.2]  # on the table
-    assert FRAMES * carried_out - carried_out <= len(low) <= FRAMES * carried_out
-    # Objects lie where they are seen: above the table, and the cloud is theirs.
-    target, seen = (
-        changing(*of) for of in (("world/objects/target", TRANSLATION), ("world/observed/points/target", POINTS))
-    )
-    assert np.linalg.norm(target[0.0][0, :2] - seen[0.0][:, :2].mean(axis=0)) < 0.05
 
 
 def test_no_viewer_is_the_default_and_an_unknown_one_is_refused() -> None:
