@@ -74,13 +74,23 @@ def run_as_users(command: str, *overrides: str, folder: Path) -> Answer:
     return Answer(process.returncode, output, errors)
 
 
-def run_command(command: str, *overrides: str, folder: Path, file_limit: int | None = None) -> Answer:
+def run_command(
+    command: str,
+    *overrides: str,
+    folder: Path,
+    file_limit: int | None = None,
+    kill_at: tuple[str, int] | None = None,
+    pictures: str = "drawn",
+) -> Answer:
     """Run a command in a process of its own, from the folder, without waiting for its imports (command_server.py).
 
     Args:
         file_limit: bytes beyond which a file cannot grow.
+        kill_at: a file, and how many lines it has when the command is killed.
+        pictures: are `drawn` or left `blank`.
     """
     job = {"command": command, "overrides": overrides, "file_limit": file_limit}
+    job |= {"kill_at": kill_at, "pictures": pictures}
     status, output, errors = _forked(job, folder)
     return Answer(status, output, errors)
 

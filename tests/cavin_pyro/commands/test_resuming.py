@@ -1,134 +1,114 @@
-"""Training and evaluating, killed for good at moments that nobody chose, and begun again."""
+"""Each command that resumes, killed in the middle and begun again: the results are those of an unbroken run."""
 
 from __future__ import annotations
 
 import csv
 import json
-import random
-import signal
-import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
-import torch
-from omegaconf import DictConfig
 from safetensors.torch import load_file
 
-from cavin_pyro.evaluation.evaluation import evaluate
-from cavin_pyro.storage.checkpoint import load_checkpoint
+TRAINING = (
+    "data=pushes pointnet=checkpoint.safetensors model.width=8 guide.width=8 trainer.steps=40 trainer.batch_size=8 "
+    "trainer.validate_every=4 trainer.schedule=cosine windows.minimum_move=0.001 windows.validation_fraction=0.4"
+)
+EPISODES = "checkpoint=checkpoint.safetensors task=insertion objects=2 maximum_steps=2 planner.samples=8 seed=100"
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return [
-            {name: value for name, value in row.items() if "per_second" not in name} for row in csv.DictReader(file)
-        ]
+class Resuming(NamedTuple):
+    """A command that is killed when `file` of its output has so many lines; 0: as soon as it is there."""
+
+    options: str
+    file: str
+    lines: int
+    results: tuple[str, ...]  # files that are those of an unbroken run, without times
+    kept: str = ""  # file that is not made again
 
 
-def kill_after(shell: SimpleNamespace, command: str, overrides: list[str], folder: Path, reached: Any) -> None:
-    """Begin a command and kill it at a random moment soon after something was reached."""
-    process = shell.start_command(command, *overrides, folder=folder, quiet=True)
-    while process.poll() is None and not reached():
-        time.sleep(0.002)
-    time.sleep(random.uniform(0.0, 0.1))
-    process.kill()
-    assert process.wait() == -signal.SIGKILL  # it had neither failed nor ended before
+COMMANDS = {
+    "collect": Resuming(
+        "transitions=16 steps=2 episodes_per_shard=2 seed=5 workers=1",
+        *("episodes-00001.h5", 0),
+        ("episodes-*.h5", "metadata.json", "statistics.json"),
+        "episodes-00000.h5",
+    ),
+    "pretrain": Resuming(
+        "data=pushes steps=100 clouds=40 batch_size=8", "resume.safetensors", 0, ("pointnet.safetensors",)
+    ),
+    "train": Resuming(TRAINING, "metrics.csv", 4, ("metrics.csv", "checkpoint.safetensors", "resume.safetensors")),
+    "evaluate": Resuming(f"{EPISODES} episodes=6 workers=1", "episodes.jsonl", 2, ("episodes.jsonl",)),
+    "check": Resuming(
+        "checkpoint=trained.safetensors data=pushes sections=[elbo,predictive]",
+        *("sections/elbo.json", 0),
+        ("sections/*.json",),
+        "sections/elbo.json",
+    ),
+}
 
 
-@pytest.mark.soak
-def test_training_killed_twice_equals_an_unbroken_run(
-    shell: SimpleNamespace, own_pushes: Path, checkpoint_file: Path, tmp_path: Path
-) -> None:
-    overrides = [
-        *("data=pushes", f"pointnet={checkpoint_file}", "model.width=8", "guide.width=8", "seed=2"),
-        *("trainer.steps=96", "trainer.validate_every=8", "trainer.batch_size=8", "trainer.learning_rate=0.003"),
-        *("trainer.schedule=cosine", "trainer.patience=1000"),
-        *("windows.minimum_move=0.005", "windows.validation_fraction=0.3"),
-    ]
-    metrics = tmp_path / "broken" / "metrics.csv"
-
-    def validations() -> int:
-        return len(metrics.read_text().splitlines()) - 1 if metrics.exists() else 0
-
-    for count in (1, 4):
-        kill_after(shell, "train", [*overrides, "output=broken"], tmp_path, lambda count=count: validations() >= count)
-        assert validations() < 12
-    for output in ("broken", "whole"):
-        answer = shell.run_command("train", *overrides, f"output={output}", folder=tmp_path)
-        assert answer.status == 0, answer.errors
-    broken, whole = tmp_path / "broken", tmp_path / "whole"
-    assert len(read_csv(whole / "metrics.csv")) == 12
-    assert read_csv(broken / "metrics.csv") == read_csv(whole / "metrics.csv")
-    for name in ("checkpoint.safetensors", "resume.safetensors"):
-        ours, theirs = load_file(broken / name), load_file(whole / name)
-        assert ours.keys() == theirs.keys()
-        assert all(torch.equal(ours[key], theirs[key]) for key in theirs), name
-    step = load_checkpoint(whole / "checkpoint.safetensors").provenance["step"]
-    assert load_checkpoint(broken / "checkpoint.safetensors").provenance["step"] == step > 8
-    assert not list(broken.glob(".*"))  # nothing half-written remains
-
-
-def rows_of(path: Path) -> list[dict[str, Any]]:
-    whole = path.read_text().splitlines(keepends=True)
-    return [json.loads(line) for line in whole if line.endswith("\n")]
-
-
-def without_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [{name: value for name, value in row.items() if name != "planning_ms"} for row in rows]
-
-
-@pytest.mark.soak
-def test_an_evaluation_killed_and_begun_again_repeats_no_episode(
-    shell: SimpleNamespace, configure: Callable[..., DictConfig], checkpoint_file: Path, tmp_path: Path
-) -> None:
-    overrides = [
-        *("task=insertion", "reward=dense", f"checkpoint={checkpoint_file}", "objects=2", "maximum_steps=4"),
-        *("planner.samples=16", "planner.horizon=6", "episodes=12", "seed=100"),
-    ]
-    path = tmp_path / "broken" / "episodes.jsonl"
-    kill_after(
-        shell,
-        "evaluate",
-        [*overrides, "workers=2", "output=broken"],
-        tmp_path,
-        lambda: path.exists() and len(rows_of(path)) >= 3,
-    )
-    before = rows_of(path)
-    assert 3 <= len(before) < 12
-    answer = shell.run_command("evaluate", *overrides, "workers=1", "output=broken", folder=tmp_path)
+@pytest.fixture(scope="module")
+def material(
+    tmp_path_factory: pytest.TempPathFactory, pushes: Path, checkpoint_file: Path, shell: SimpleNamespace
+) -> Path:
+    """A folder with what the commands need."""
+    folder = tmp_path_factory.mktemp("resuming")
+    (folder / "pushes").symlink_to(pushes)
+    (folder / "checkpoint.safetensors").symlink_to(checkpoint_file)
+    options = TRAINING.replace("trainer.steps=40", "trainer.steps=4").split()
+    answer = shell.run_command("train", *options, "output=trained", folder=folder, pictures="blank")
     assert answer.status == 0, answer.errors
-    after = rows_of(path)
-    assert after[: len(before)] == before  # with the times of the first run
-    assert sorted(row["seed"] for row in after) == list(range(100, 112))
-    results = json.loads((tmp_path / "broken" / "results.json").read_text())
-    assert results["per_episode"] == sorted(after, key=lambda row: row["seed"])
-    (tmp_path / "whole").mkdir()
-    whole = evaluate(configure(*overrides), tmp_path / "whole")  # by a single process
-    assert without_times(results["per_episode"]) == without_times(whole)
-    assert len({row["return"] for row in after}) > 1  # the episodes are not all alike
+    (folder / "trained.safetensors").symlink_to(folder / "trained" / "checkpoint.safetensors")
+    return folder
 
 
-def test_a_loss_that_is_not_finite_ends_training_in_one_line(
-    shell: SimpleNamespace, own_pushes: Path, checkpoint_file: Path, tmp_path: Path
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_that_was_killed_resumes_to_the_results_of_an_unbroken_run(
+    name: str, material: Path, shell: SimpleNamespace
 ) -> None:
-    overrides = [
-        *(
-            "trainer.learning_rate=1e30",
-            f"data={own_pushes}",
-            f"pointnet={checkpoint_file}",
-            "model.width=8",
-            "guide.width=8",
-            "output=run",
-        ),
-        *("trainer.steps=20", "trainer.validate_every=1", "trainer.batch_size=4", "windows.negative_fraction=1"),
-        *("windows.minimum_move=0.005", "windows.validation_fraction=0.3"),
-    ]
-    answer = shell.run_command("train", *overrides, folder=tmp_path)
+    options, file, lines, results, kept = COMMANDS[name]
+    broken, whole = material / f"{name}-broken", material / f"{name}-whole"
+    run = {"folder": material, "pictures": "blank"}
+    words = [*options.split(), f"output={broken.name}"]
+    killed = shell.run_command(name, *words, kill_at=(f"{broken.name}/{file}", lines), **run)
+    assert killed.status == -9, killed.errors  # it had neither failed nor ended before
+    begun = (broken / file).read_bytes()
+    finished = {path: path.stat().st_mtime_ns for path in broken.glob(kept or "-")}
+    for folder in (broken, whole):
+        answer = shell.run_command(name, *options.split(), f"output={folder.name}", **run)
+        assert answer.status == 0, answer.errors
+    if lines:  # all but the last stay, with the times of the first run
+        assert (broken / file).read_bytes().startswith(b"\n".join(begun.split(b"\n")[: lines - 1]))
+    assert all(path.stat().st_mtime_ns == written for path, written in finished.items())
+    ours, theirs = (
+        {path.name: content(path) for one in results for path in made.glob(one)} for made in (broken, whole)
+    )
+    assert ours.keys() == theirs.keys() and len(ours) >= len(results)
+    assert not [file for file in ours if ours[file] != theirs[file]]
+    assert not [path for path in broken.rglob(".*") if path.is_file()]  # nothing half-written remains
+
+
+def content(path: Path) -> Any:
+    """What is in a file, without times."""
+    if path.suffix == ".safetensors":
+        return {key: value.tolist() for key, value in load_file(path).items()}
+    if path.suffix == ".csv":
+        with open(path, newline="") as file:
+            return [
+                {name: one for name, one in row.items() if "per_second" not in name} for row in csv.DictReader(file)
+            ]
+    if path.suffix == ".jsonl":
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        return [{name: one for name, one in row.items() if name != "planning_ms"} for row in rows]
+    return path.read_bytes()
+
+
+def test_a_loss_that_is_not_finite_ends_training_in_one_line(material: Path, shell: SimpleNamespace) -> None:
+    options = TRAINING.replace("trainer.schedule=cosine", "trainer.learning_rate=1e30 windows.negative_fraction=1")
+    answer = shell.run_command("train", *options.split(), "output=infinite", folder=material)
     assert answer.status == 2
     (line,) = answer.complaints
     assert line.startswith("error: training stopped after step ")
     assert "the term " in line and " is not finite; " in line
-    assert "Traceback" not in answer.errors
