@@ -18,14 +18,14 @@ def main(config: DictConfig) -> None:
     import pyro
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.criticism.recalibration.measurement import measure_guide, sentences
-    from cavin_pyro.criticism.recalibration.run import (
+    from cavin_pyro.criticism.guide import assess_guide
+    from cavin_pyro.criticism.recalibration import (
         calibrate_f,
         calibrate_guide,
         load_calibration,
+        print_change,
         write_calibrated,
     )
-    from cavin_pyro.criticism.recalibration.scales import scale_sentences
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
@@ -37,16 +37,18 @@ def main(config: DictConfig) -> None:
         loaded, context = load_calibration(config)
         write_config(folder, config)
         measured: dict[str, Any] = {}
+        sizes = {"windows": config.windows, "samples": config.samples}
         if "scales" in config.parts:
-            measured["scales"] = found = calibrate_f(context, config.windows)
-            print("\n".join(scale_sentences(found["before"], found["after"], found["factor"])))
+            factor, before, after = calibrate_f(context, **sizes)
+            measured["scales"] = {"factor": factor, "before": before.values, "after": after.values}
+            print(f"f's scales of centres are {factor:.3g} times what they were")
+            print_change(before, after)
         if "guide" in config.parts:
-            sizes = {name: config[name] for name in ("windows", "samples", "repeats")}
-            before = measure_guide(context, **sizes)
+            before = assess_guide(context, **sizes)
             losses = calibrate_guide(config, loaded, device)
-            after = measure_guide(context, **sizes)
-            measured |= {"before": before, "after": after, "losses": losses}
-            print("\n".join(sentences(before, after)))
+            after = assess_guide(context, **sizes)
+            measured |= {"before": before.values, "after": after.values, "losses": losses}
+            print_change(before, after)
         print(f"written: {write_calibrated(folder, config, loaded, measured)}")
 
 

@@ -15,13 +15,13 @@ def main(config: DictConfig) -> None:
     import pyro
 
     from cavin_pyro.config.parts import check_sizes
-    from cavin_pyro.criticism.checks.consistency import check_objects
-    from cavin_pyro.criticism.comparison.side_by_side import check_pair, write_pair
+    from cavin_pyro.criticism.comparison import check_pair, write_pair
     from cavin_pyro.criticism.export import check_export, write_samples
     from cavin_pyro.criticism.graph import program_graph
     from cavin_pyro.criticism.loading import load_context
     from cavin_pyro.criticism.report import write_report
     from cavin_pyro.criticism.sections import choose_sections, fingerprint_of, print_findings, run_sections
+    from cavin_pyro.criticism.subgoals import check_objects
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
@@ -29,8 +29,7 @@ def main(config: DictConfig) -> None:
     names = choose_sections(config.sections, config.sizes)
     pair, export = check_pair(config), check_export(config.export)
     check_sizes("sizes.export", config.sizes.export)
-    objects = config.sizes.consistency.objects
-    accept = partial(check_objects, objects=objects) if "consistency" in names else None
+    accept = partial(check_objects, objects=config.sizes.subgoals.objects) if "subgoals" in names else None
     with output_folder(config.output) as folder:
         if pair:
             parts = write_pair(config, names, folder, accept)

@@ -21,7 +21,7 @@ EXAMPLES = {
     "collect": ("transitions=100000 workers=2", "env.objects=random output=data/random", "transitions=200000"),
     "pretrain": ("data=data/pushes", "data=[data/pushes,data/random]", "held_out_objects=[mug,banana]"),
     "train": ("data=data/pushes", "model=flat guide=flat", "trainer.steps=200000 trainer.batches=bucketed"),
-    "check": ("checkpoint=cavin data=data/pushes", "a=cavin b=sectar", "sections=[prior,consistency]"),
+    "check": ("checkpoint=cavin data=data/pushes", "a=cavin b=sectar", "sections=[prior,subgoals]"),
     "calibrate": ("checkpoint=runs/train/checkpoint.safetensors data=data/pushes", "checkpoint=contact seed=1"),
     "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
     "evaluate": (

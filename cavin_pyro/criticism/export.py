@@ -1,4 +1,4 @@
-"""Samples of a model and its guide as ArviZ's DataTree, a netCDF file with a group for each kind of samples.
+"""Samples of a model and its guide for ArviZ: a netCDF file with a group for each kind of samples.
 
     posterior              codes of the guide: effect_code, motion_code
     prior                  the same codes from the prior at the first state
@@ -14,37 +14,31 @@ Dimensions: `chain` (one), `draw`, `window`, `object`, `push`, `axis`, `paramete
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from pyro.infer import Predictive
 from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.codes import log_weights
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.statistics.codes import log_weights
-from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.estimates import arviz
+from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.storage.files import atomic_write
 
-if TYPE_CHECKING:
-    from xarray import Dataset
-
-PACKAGES = ("xarray", "h5netcdf")  # the extra `export`
-SAMPLES = ("chain", "draw", "window")
-DIMENSIONS: dict[str, tuple[str, ...]] = {  # of each variable, after its samples
-    "effect_code": ("effect_dimension",),
-    "motion_code": ("motion_dimension",),
-    "subgoal_centers": ("object", "axis"),
-    "actions": ("push", "parameter"),
-    "next_centers": ("push", "object", "axis"),
-    "first_centers": ("object", "axis"),
-    "mask": ("object",),
-    "log_weight": (),
+DIMENSIONS = {  # of each variable, after chain and draw
+    "effect_code": ["window", "effect_dimension"],
+    "motion_code": ["window", "motion_dimension"],
+    "subgoal_centers": ["window", "object", "axis"],
+    "actions": ["window", "push", "parameter"],
+    "next_centers": ["window", "push", "object", "axis"],
+    "first_centers": ["window", "object", "axis"],
+    "mask": ["window", "object"],
+    "log_weight": ["window"],
 }
-NAMES = {"axis": ["x", "y", "z"], "parameter": ["x", "y", "dx", "dy"]}
 PREDICTED = ("subgoal_centers", "actions", "next_centers")
 UNITS = dict.fromkeys(("subgoal_centers", "next_centers", "first_centers"), "metres") | {
     "actions": "normalised",
@@ -56,21 +50,13 @@ def check_export(file: str | None) -> Path | None:
     """The option `export`, before anything is computed.
 
     Raises:
-        UserError: not a .nc file, a folder that cannot be made, or a package that is not installed.
+        UserError: not a .nc file, or a folder that cannot be made.
     """
     if file is None:
         return None
     path = Path(file)
     if path.suffix != ".nc" or path.is_dir():
         raise UserError(f"export={file} must name a netCDF file: give it the ending .nc")
-    try:
-        for package in PACKAGES:
-            importlib.import_module(package)
-    except ImportError as error:
-        raise UserError(
-            f"export= needs an optional part that is not installed ({error}): "
-            "python -m pip install --constraint constraints.txt '.[export]'"
-        ) from error
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -88,15 +74,25 @@ def write_samples(
         windows: held-out windows, at most.
         samples: samples of prior and guide for each window.
     """
-    from xarray import DataTree
-
-    told = {name: str(about[name]) for name in ("checkpoint", "weights", "model", "guide", "prior") if about.get(name)}
-    root = {**told, "seed": context.seed, "inference_library": "pyro", "creation_library": "cavin_pyro"}
     groups = sample_groups(context, windows=windows, samples=samples)
-    tree = DataTree.from_dict({name: dataset(values) for name, values in groups.items()})
-    tree.attrs.update(root)
+    told = {name: str(about[name]) for name in ("checkpoint", "weights", "model", "guide", "prior") if about.get(name)}
+    pushes = len(groups["observed_data"]["next_centers"][0])
+    data = arviz().from_dict(
+        **{group: {name: value.numpy() for name, value in values.items()} for group, values in groups.items()},
+        dims=DIMENSIONS,
+        coords={
+            "axis": ["x", "y", "z"],
+            "parameter": ["x", "y", "dx", "dy"],
+            "push": list(range(1, pushes + 1)),
+        },
+        attrs={**told, "seed": context.seed, "inference_library": "pyro", "creation_library": "cavin_pyro"},
+    )
+    for group in data.groups():
+        for name, unit in UNITS.items():
+            if name in data[group]:
+                data[group][name].attrs["units"] = unit
     with atomic_write(path) as temporary:
-        tree.to_netcdf(temporary, engine="h5netcdf")
+        data.to_netcdf(str(temporary))
 
 
 @torch.no_grad()
@@ -137,18 +133,3 @@ def predictions(values: Mapping[str, Tensor], mask: Tensor, steps: Tensor | None
 def without_padding(centers: Tensor, mask: Tensor) -> Tensor:
     """NaN in the place of padding: `centers: [..., M, 3]`, `mask: [..., M]`."""
     return centers.where(mask.unsqueeze(-1), float("nan"))
-
-
-def dataset(values: Mapping[str, Tensor]) -> Dataset:
-    """Variables with the names of their dimensions, coordinates and units."""
-    from xarray import Dataset
-
-    variables: dict[str, Any] = {}
-    sizes: dict[str, int] = {}
-    for name, value in values.items():
-        own = DIMENSIONS[name]
-        dims = (*SAMPLES[3 - (value.dim() - len(own)) :], *own)
-        variables[name] = (dims, value.cpu().numpy(), {"units": UNITS[name]} if name in UNITS else {})
-        sizes |= dict(zip(dims, value.shape, strict=True))
-    coords = {name: NAMES.get(name, [*range(name == "push", size + (name == "push"))]) for name, size in sizes.items()}
-    return Dataset(variables, coords=coords)

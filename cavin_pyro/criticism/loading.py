@@ -15,8 +15,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.training_data import compare_data
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
+from cavin_pyro.data.dataset import content_records, read_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
 from cavin_pyro.storage.digests import tensors_digest
@@ -136,6 +136,41 @@ def context_of(
         "run": provenance(),
     }
     return context, about
+
+
+def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
+    """Whether a checkpoint was trained on a dataset, by the fingerprints in its provenance.
+
+    Returns:
+        `folder`, `transitions`, `seed`, `fingerprint` (lists of a merged dataset); `same`: true or false, None where it
+        cannot be told; `verdict`.
+
+    Raises:
+        UserError: no dataset.
+    """
+    records, entries = content_records(folder), trained.get("data")
+    entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+    known = {entry.get("fingerprint") for entry in entries}
+    seen = [record["fingerprint"] in known for record in records]
+    if not known:
+        same, verdict = None, "the checkpoint does not say what it was trained on"
+    elif all(seen):
+        same, verdict = True, "the model was trained on these"
+    elif any(seen):
+        same, verdict = None, "the model was trained on some of these"
+    else:
+        same, verdict = False, "the model was trained on other data, on none of these episodes"
+    seeds = [record["configuration"].get("seed") for record in records]
+    fingerprints = [record["fingerprint"] for record in records]
+    merged = len(records) > 1
+    return {
+        "folder": str(folder),
+        "transitions": read_metadata(folder)["transitions"],
+        "seed": seeds if merged else seeds[0],
+        "fingerprint": fingerprints if merged else fingerprints[0],
+        "same": same,
+        "verdict": verdict,
+    }
 
 
 def load_programs(checkpoint: Checkpoint, where: str | Path) -> tuple[Model, Guide]:

@@ -7,7 +7,7 @@ Keys of report.json:
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `windows_digest` (hash
                 of which ones), `run` (of this check), `graph` of the program (see `cavin_pyro.criticism.graph`)
     sections    by name: `title`, `verdict` (`level`: good, inspect, bad, too few or none; `rule`; `advice`, what to do
-                next), `findings` (sentences) and `values`, which the section's function documents
+                next), `number` (`mean`, `low`, `high`) of what `measure` says, `findings` (sentences) and `values`
 
 Floats have six significant digits; non-finite numbers are null.
 """
@@ -31,39 +31,37 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from cavin_pyro.criticism.section import Section, Table
-from cavin_pyro.criticism.verdicts.glossary import glossary_of
 from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6
-DOTS_PER_INCH = 150  # of photographs
-LARGEST_DRAWING = 400_000  # bytes of SVG; larger drawings become pixels
 MISSING = "–"
+IN_JSON = ("title", "verdict", "measure", "number", "findings", "values")
 
 Part = dict[str, Any]
-"""A rendered section, JSON-ready: name, title, explanation, findings, verdict, values, tables, pictures."""
+"""A rendered section, JSON-ready: the fields of `Section`, with its figure as an image."""
 
 
 def render(section: Section) -> Part:
-    """Turn figures into images and numbers into plain ones, so that a section can be stored on disk."""
+    """Turn the figure into an image and numbers into plain ones, so that a section can be stored on disk."""
     return {
         "name": section.name,
         "title": section.title,
         "explanation": section.explanation,
+        "verdict": asdict(section.verdict),
+        "measure": section.measure,
+        "number": plain(section.number._asdict()) if section.number else None,
         "findings": list(section.findings),
-        "verdict": asdict(section.verdict) if section.verdict else None,
         "values": plain(section.values),
         "tables": [_table(table) for table in section.tables],
-        "pictures": [
-            {"name": picture.name, "caption": picture.caption, "image": image(picture.figure)}
-            for picture in section.pictures
-        ],
+        "image": image(section.figure) if section.figure else None,
+        "caption": section.caption,
     }
 
 
 def write_report(folder: Path, about: Mapping[str, Any], parts: Sequence[Part]) -> None:
     """Write both files, each atomically."""
     about = plain(about)
-    sections = {part["name"]: {key: part[key] for key in ("title", "verdict", "findings", "values")} for part in parts}
+    sections = {part["name"]: {key: part[key] for key in IN_JSON} for part in parts}
     write_json(folder / "report.json", {"about": about, "sections": sections})
     with atomic_write(folder / "report.html") as temporary:
         temporary.write_text(page(about, parts), encoding="utf-8")
@@ -78,9 +76,7 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
     details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
     # Old checkpoints may lack some of these.
     trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
-    return environment.from_string(source).render(
-        about=about, trained=trained, details=details, sections=parts, glossary=glossary_of(parts)
-    )
+    return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
 
 
 def plain(value: Any) -> Any:
@@ -103,20 +99,11 @@ def plain(value: Any) -> Any:
 
 
 def image(figure: Figure) -> str:
-    """A figure as a `data:` address: a drawing, or pixels where it holds photographs or very many points."""
-    if not any(axes.images for axes in figure.axes):
-        drawing = io.BytesIO()
-        with matplotlib.rc_context({"svg.hashsalt": "cavin_pyro"}):  # equal figures give equal bytes
-            figure.savefig(drawing, format="svg", metadata={"Date": None})
-        if drawing.tell() <= LARGEST_DRAWING:
-            return _address("svg+xml", drawing)
-    pixels = io.BytesIO()
-    figure.savefig(pixels, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
-    return _address("png", pixels)
-
-
-def _address(kind: str, content: io.BytesIO) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content.getvalue()).decode()}"
+    """A figure as a `data:` address of an SVG drawing; equal figures give equal bytes."""
+    drawing = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "cavin_pyro"}):
+        figure.savefig(drawing, format="svg", metadata={"Date": None})
+    return f"data:image/svg+xml;base64,{base64.b64encode(drawing.getvalue()).decode()}"
 
 
 def _table(table: Table) -> dict[str, Any]:

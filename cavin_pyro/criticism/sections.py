@@ -11,37 +11,26 @@ from omegaconf import ListConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import check_sizes
-from cavin_pyro.criticism.checks.aggregate import assess_aggregate
-from cavin_pyro.criticism.checks.amortization import assess_amortization
-from cavin_pyro.criticism.checks.calibration import assess_calibration
-from cavin_pyro.criticism.checks.codes import assess_codes
-from cavin_pyro.criticism.checks.consistency import assess_consistency
-from cavin_pyro.criticism.checks.elbo import assess_elbo
-from cavin_pyro.criticism.checks.growth import assess_growth
-from cavin_pyro.criticism.checks.guide_error import assess_guide_error
-from cavin_pyro.criticism.checks.predictive import assess_predictive
-from cavin_pyro.criticism.checks.prior import assess_prior
-from cavin_pyro.criticism.checks.simulation import assess_simulation
 from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.elbo import assess_elbo
+from cavin_pyro.criticism.guide import assess_guide
+from cavin_pyro.criticism.intervals import assess_intervals
+from cavin_pyro.criticism.predictive import assess_predictive
+from cavin_pyro.criticism.prior import assess_prior
 from cavin_pyro.criticism.report import Part, render
 from cavin_pyro.criticism.section import Section
+from cavin_pyro.criticism.subgoals import assess_subgoals
 from cavin_pyro.storage.files import clear_abandoned, read_json, write_json
 from cavin_pyro.storage.provenance import program_fingerprint
 
-# In the order of the report. Each takes the context and the options `sizes.<name>`; long ones show
-# their progress.
+# In the order of the report. Each takes the context and the options `sizes.<name>`.
 SECTIONS: dict[str, Callable[..., Section]] = {
     "elbo": assess_elbo,
-    "guide_error": assess_guide_error,
-    "amortization": assess_amortization,
-    "simulation": assess_simulation,
-    "codes": assess_codes,
+    "guide": assess_guide,
     "prior": assess_prior,
-    "aggregate_posterior": assess_aggregate,
     "predictive": assess_predictive,
-    "calibration": assess_calibration,
-    "growth": assess_growth,
-    "consistency": assess_consistency,
+    "intervals": assess_intervals,
+    "subgoals": assess_subgoals,
 }
 
 
@@ -89,7 +78,8 @@ def run_sections(
         part = _finished(kept / f"{name}.json", fingerprint)
         if part is None:
             pyro.set_rng_seed(context.seed)
-            part = render(SECTIONS[name](context, **_arguments(sizes.get(name, {}))))
+            arguments = {str(key): value for key, value in sizes.get(name, {}).items() if key != "_target_"}
+            part = render(SECTIONS[name](context, **arguments))
             write_json(kept / f"{name}.json", {"fingerprint": fingerprint, "part": part})
         parts.append(part)
     return parts
@@ -98,19 +88,12 @@ def run_sections(
 def print_findings(parts: Sequence[Part]) -> None:
     """Titles with their verdicts, and the findings."""
     for part in parts:
-        verdict = f" [{part['verdict']['level']}]" if part["verdict"] else ""
-        print("\n  ".join([f"{part['title']}{verdict}", *part["findings"]]))
-
-
-def _arguments(sizes: Mapping[str, Any]) -> dict[str, Any]:
-    return {str(name): value for name, value in sizes.items() if name != "_target_"}
+        print("\n  ".join([f"{part['title']} [{part['verdict']['level']}]", *part["findings"]]))
 
 
 def _finished(path: Path, fingerprint: str) -> Part | None:
-    if not path.exists():
-        return None
     try:
-        content = read_json(path)
+        content = read_json(path) if path.exists() else None
     except UserError:
         return None  # damaged: run it again
     if not isinstance(content, dict) or content.get("fingerprint") != fingerprint:

@@ -38,7 +38,7 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.criticism.export",
     "cavin_pyro.criticism.graph",
     "cavin_pyro.criticism.loading",
-    "cavin_pyro.criticism.recalibration.run",
+    "cavin_pyro.criticism.recalibration",
     "cavin_pyro.criticism.report",
     "cavin_pyro.criticism.sections",
     "cavin_pyro.data.collection",

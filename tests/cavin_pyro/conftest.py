@@ -30,17 +30,8 @@ from models.networks.pointnet import PointNet
 from tests.cavin_pyro.shell import ENVIRONMENT, ROOT, Answer, complaints
 
 SMALL_CHECK = [  # options that make a check of all sections a matter of seconds
-    *("windows=5", "sizes.guide_error.inner_windows=3", "sizes.guide_error.inner_particles=2"),
-    *("sizes.amortization.steps=2", "sizes.amortization.particles=2", "sizes.amortization.samples=20"),
-    *("sizes.aggregate_posterior.permutations=9", "sizes.prior.samples=4", "sizes.prior.permutations=9"),
-    *(
-        "sizes.simulation.samples=8",
-        "sizes.codes.particles=2",
-        "sizes.predictive.replicates=4",
-        "sizes.calibration.samples=8",
-    ),
-    *("sizes.growth.episodes=2", "sizes.growth.segments=2", "sizes.consistency.scenes=1"),
-    *("sizes.consistency.objects=2", "sizes.consistency.samples=2"),
+    *("windows=5", "sizes.guide.samples=8", "sizes.guide.particles=20", "sizes.predictive.replicates=4"),
+    *("sizes.intervals.samples=8", "sizes.subgoals.scenes=1", "sizes.subgoals.objects=2", "sizes.subgoals.samples=2"),
 ]
 WINDOWS = {  # of a training on `pushes`
     "validation_fraction": 0.4,

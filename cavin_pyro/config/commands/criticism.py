@@ -37,11 +37,9 @@ class CheckConfig:
     )
     seed: int = seed_option(group="run")
     windows: int = option(1000, "held-out windows, and as many training windows", minimum=1, group="data", limit=10**7)
-    sections: Any = option(None, "sections of the report, [elbo,consistency]; by default all", group="run")
+    sections: Any = option(None, "sections of the report, [elbo,subgoals]; by default all", group="run")
     export: str | None = option(
-        None,
-        "file.nc for samples of prior, guide and predictions as ArviZ's DataTree; needs the extra .[export]",
-        group="run",
+        None, "file.nc for samples of prior, guide and predictions, which ArviZ reads", group="run"
     )
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
@@ -81,11 +79,4 @@ class CalibrateConfig(DeviceOptions):
     windows: int = option(2000, "held-out windows for measurements", minimum=1, group="data", limit=10**7)
     samples: int = option(
         50, "samples of the guide for each window, in measurements", minimum=2, group="data", limit=10**5
-    )
-    repeats: int = option(
-        1,
-        "windows generated from the first state of each held-out one, in measurements",
-        minimum=1,
-        group="data",
-        limit=10**4,
     )

@@ -1,112 +1,32 @@
-"""A cascade whose posterior and evidence are known, and guides for it that are wrong by a known amount."""
+"""Models whose posterior is known, and guides and scales that are wrong by a known amount."""
 
 from __future__ import annotations
 
-import math
 from types import SimpleNamespace
 
 import pyro
 import pytest
 import torch
-from pyro import distributions
+from pyro import distributions, poutine
 from pyro.nn import PyroModule
 from torch import Tensor
 
 from cavin_pyro.criticism.context import CheckContext
-from cavin_pyro.criticism.statistics.inference.simulation import simulate
-from cavin_pyro.criticism.statistics.windows import seeded
+from cavin_pyro.criticism.guide import simulate
+from cavin_pyro.criticism.windows import seeded
+from guides.cascaded import CascadedGuide
+from models.cascaded import CascadedModel
+from models.dynamics_only import DynamicsModel
+from models.likelihoods import LikelihoodScales
 from models.networks.pointnet import PointNet
 from models.state import State, Window
 
 NOISE = 0.5
 PRECISION = 1 / NOISE**2
-# Orthogonal but for its length, so that the posteriors have diagonal covariances.
-COUPLING = 0.8 * torch.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=torch.float64)
-EFFECT_PRECISION = 1 + PRECISION + 0.64 / (1 + NOISE**2)
 
 
 def normal(mean: Tensor, scale: float) -> distributions.TorchDistribution:
     return distributions.Normal(mean, torch.as_tensor(scale, dtype=mean.dtype)).to_event(1)
-
-
-class LinearModel(PyroModule):
-    """c ~ N(0, I), x ~ N(c, 0.25 I), z ~ N(0, I), y ~ N(z + A c, 0.25 I), in two dimensions each.
-
-    x and y are the starts and the motions of a window's first push.
-    """
-
-    codes = ("effect_code", "motion_code")
-
-    def forward(self, window: Window) -> None:
-        x, y = window.actions[:, 0].split(2, -1)
-        with pyro.plate("windows", len(x)):
-            c = pyro.sample("effect_code", normal(torch.zeros_like(x), 1.0))
-            pyro.sample("subgoal_centers", normal(c, NOISE), obs=x)
-            z = pyro.sample("motion_code", normal(torch.zeros_like(x), 1.0))
-            pyro.sample("actions", normal(z + c @ COUPLING.T, NOISE), obs=y)
-
-
-class OneCodeModel(PyroModule):
-    """c ~ N(0, I), x ~ N(c, 0.25 I)."""
-
-    codes = ("effect_code",)
-
-    def forward(self, window: Window) -> None:
-        x = window.actions[:, 0, :2]
-        with pyro.plate("windows", len(x)):
-            c = pyro.sample("effect_code", normal(torch.zeros_like(x), 1.0))
-            pyro.sample("subgoal_centers", normal(c, NOISE), obs=x)
-
-
-class NoCodeModel(PyroModule):
-    """x ~ N(0, 1.25 I)."""
-
-    codes = ()
-
-    def forward(self, window: Window) -> None:
-        x = window.actions[:, 0, :2]
-        with pyro.plate("windows", len(x)):
-            pyro.sample("subgoal_centers", normal(torch.zeros_like(x), math.sqrt(1 + NOISE**2)), obs=x)
-
-
-class LinearGuide(PyroModule):
-    """The posterior, with c moved by `shift` of its deviations and its deviation multiplied by `stretch`."""
-
-    def __init__(self, shift: float = 0.0, stretch: float = 1.0) -> None:
-        super().__init__()
-        self.shift, self.stretch = shift, stretch
-
-    def forward(self, window: Window) -> None:
-        x, y = window.actions[:, 0].split(2, -1)
-        mean = (PRECISION * x + y @ COUPLING / (1 + NOISE**2)) / EFFECT_PRECISION
-        deviation = EFFECT_PRECISION**-0.5
-        with pyro.plate("windows", len(x)):
-            c = pyro.sample("effect_code", normal(mean + self.shift * deviation, self.stretch * deviation))
-            z_mean = PRECISION * (y - c @ COUPLING.T) / (1 + PRECISION)
-            pyro.sample("motion_code", normal(z_mean, (1 + PRECISION) ** -0.5))
-
-
-class BlindGuide(PyroModule):
-    """Codes N(shift, 1), whatever the window."""
-
-    def __init__(self, shift: float = 0.0) -> None:
-        super().__init__()
-        self.shift = shift
-
-    def forward(self, window: Window) -> None:
-        x = window.actions[:, 0, :2]
-        with pyro.plate("windows", len(x)):
-            for name in ("effect_code", "motion_code"):
-                pyro.sample(name, normal(torch.full_like(x, self.shift), 1.0))
-
-
-class OneCodeGuide(PyroModule):
-    """The posterior of `OneCodeModel`."""
-
-    def forward(self, window: Window) -> None:
-        x = window.actions[:, 0, :2]
-        with pyro.plate("windows", len(x)):
-            pyro.sample("effect_code", normal(PRECISION * x / (1 + PRECISION), (1 + PRECISION) ** -0.5))
 
 
 class NoGuide(PyroModule):
@@ -147,14 +67,13 @@ class SceneModel(PyroModule):
 class SceneGuide(PyroModule):
     """The posterior of `SceneModel`, with its deviations multiplied by `stretch`; `blind`: N(10 s + shift, I) for c."""
 
-    def __init__(self, stretch: float = 1.0, *, blind: bool = False, shift: float = 0.0, reads: float = 0.0) -> None:
+    def __init__(self, stretch: float = 1.0, *, blind: bool = False, shift: float = 0.0) -> None:
         super().__init__()
-        self.stretch, self.blind, self.shift, self.reads = stretch, blind, shift, reads
+        self.stretch, self.blind, self.shift = stretch, blind, shift
 
     def forward(self, window: Window) -> None:
         mean = scene_mean(window) + self.shift
         after = (mean + PRECISION * window.last.centers[:, 0]) / (1 + PRECISION)
-        after = after + self.reads * window.actions[:, 0, :3]
         with pyro.plate("windows", len(mean)):
             q = normal(mean, 1.0) if self.blind else normal(after, self.stretch * (1 + PRECISION) ** -0.5)
             pyro.sample("effect_code", q)
@@ -181,50 +100,53 @@ def scene_context(guide: PyroModule, *, shuffled: bool = False, batch: int = 600
     )
 
 
-def covariance() -> Tensor:
-    """Of (x, y): [4, 4]."""
-    eye = torch.eye(2, dtype=torch.float64)
-    across = COUPLING.T
-    upper = torch.cat(((1 + NOISE**2) * eye, across), 1)
-    lower = torch.cat((across.T, (1 + NOISE**2) * eye + COUPLING @ COUPLING.T), 1)
-    return torch.cat((upper, lower))
+SIZES = {"feature_dimension": 4, "width": 8, "maximum_objects": 3}
+COUNT = 400
 
 
-def evidence(window: Window) -> Tensor:
-    """log p(x, y) of each window: [B]."""
-    zero = torch.zeros(4, dtype=torch.float64)
-    return torch.distributions.MultivariateNormal(zero, covariance()).log_prob(window.actions[:, 0])
+def cascade_of(center: float = 0.01, feature: float = 0.1) -> CascadedModel:
+    """A small cascade whose codes matter, with these scales; always the same weights."""
+    torch.manual_seed(1)
+    scales = LikelihoodScales(center=center, feature=feature)
+    model = CascadedModel(**SIZES, effect_dimension=2, motion_dimension=2, scales=scales)
+    with torch.no_grad():
+        model.meta_dynamics.change.head.weight.mul_(5.0)
+    return model.requires_grad_(False).eval()
 
 
-def linear_windows(batch: int, seed: int = 0) -> Window:
-    """Windows `[B]` sampled from `LinearModel`."""
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(batch, 4, generator=generator, dtype=torch.float64)
-    actions = (noise @ torch.linalg.cholesky(covariance()).T).unsqueeze(1).expand(batch, 3, 4)
-    state = State(torch.zeros(batch, 4, 1, 3), torch.zeros(batch, 4, 1, 2), torch.ones(batch, 4, 1, dtype=torch.bool))
-    seen = torch.ones(batch, 3, dtype=torch.bool)
-    return Window(state, actions.clone(), seen, seen[:, 0].clone())
+def generated_by(model: CascadedModel, part: str) -> Window:
+    """400 windows sampled from the program, whose last states are f's or h's."""
+    torch.manual_seed(2)
+    mask = torch.ones(COUNT, 4, 3, dtype=torch.bool)
+    mask[::3, :, 2] = False
+    centers = torch.rand(COUNT, 1, 3, 3).expand(-1, 4, -1, -1) * torch.tensor([0.4, 0.8, 0.05])
+    features = torch.nn.functional.normalize(torch.randn(COUNT, 1, 3, 4), dim=-1).expand(-1, 4, -1, -1)
+    counts = torch.ones(COUNT, 3, dtype=torch.bool)
+    blank = Window(State(centers, features, mask), torch.zeros(COUNT, 3, 4), counts, counts[:, 0])
+    nodes = poutine.trace(model).get_trace(blank, generate=True).nodes
+    after, kinds = nodes["next_centers"]["value"].clone(), nodes["next_features"]["value"].clone()
+    if part == "h":
+        after[:, -1], kinds[:, -1] = nodes["subgoal_centers"]["value"], nodes["subgoal_features"]["value"]
+    kinds[:, :-1] = torch.nn.functional.normalize(kinds[:, :-1], dim=-1)  # as f reads them
+    states = State(torch.cat((centers[:, :1], after), 1), torch.cat((features[:, :1], kinds), 1), mask)
+    return blank._replace(states=states, actions=nodes["actions"]["value"])
 
 
-def linear_context(guide: PyroModule, *, model: PyroModule | None = None, batch: int = 200) -> CheckContext:
-    pointnet = PointNet(feature_dimension=2)
-    return CheckContext(model or LinearModel(), guide, pointnet, linear_windows(batch, 1), linear_windows(batch, 2))
+def cascade_context(model: CascadedModel, window: Window) -> CheckContext:
+    """The model with an untrained guide; the same windows for training and validation."""
+    guide = CascadedGuide(cascade_of(), width=8).requires_grad_(False)
+    return CheckContext(model, guide, PointNet(), training=window, validation=window, seed=3)
 
 
 @pytest.fixture(scope="session")
-def linear() -> SimpleNamespace:
-    """The known cascade and what goes with it."""
-    return SimpleNamespace(
-        blind=BlindGuide,
-        effect_precision=EFFECT_PRECISION,
-        evidence=evidence,
-        guide=LinearGuide,
-        model=LinearModel,
-        no_code=lambda: linear_context(NoGuide(), model=NoCodeModel()),
-        one_code=lambda: linear_context(OneCodeGuide(), model=OneCodeModel()),
-        context=linear_context,
-        windows=linear_windows,
-    )
+def right() -> SimpleNamespace:
+    """A cascade, windows that it has generated itself, and the same cascade with other scales."""
+    with torch.no_grad(), pyro.settings.context(module_local_params=True):
+        model = cascade_of()
+        windows = {part: generated_by(model, part) for part in ("f", "h")}
+        alone = DynamicsModel(**SIZES).requires_grad_(False)
+        dynamics = CheckContext(alone, NoGuide(), PointNet(), windows["f"], windows["f"])
+    return SimpleNamespace(context=cascade_context, dynamics=dynamics, make=cascade_of, model=model, windows=windows)
 
 
 @pytest.fixture(scope="session")

@@ -1,1 +1,0 @@
-"""One check of a trained model and its guide per file."""

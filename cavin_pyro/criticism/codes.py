@@ -1,0 +1,95 @@
+"""Samples of codes and their importance weights, for any model and guide, from Pyro's traces."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.poutine.util import site_is_subsample
+from torch import Tensor
+
+from cavin_pyro.training.elbo import Program, substitute, window_terms
+from models.state import Window
+
+ROWS = 4096  # particles times windows at once: some 100 MB with five objects
+NO_CODES = "The model has no codes, so there is nothing to check here."
+SYMBOLS = {"effect_code": "c", "motion_code": "z"}  # the paper's symbols
+Codes = dict[str, Tensor]
+
+
+@torch.no_grad()
+def log_weights(
+    model: Program,
+    guide: Program,
+    window: Window,
+    particles: int,
+    *,
+    fixed: Mapping[str, Tensor] | None = None,
+    excluded: Collection[str] = (),
+    rows: int = ROWS,
+) -> Tensor:
+    """Logarithms of p(observed, codes) / q(codes) for K samples of the codes of each window `[B]`, in nats.
+
+    Args:
+        fixed: values of codes that are not sampled: `[B, D]` for all particles, or `[K, B, D]`. Their densities stay
+            in the weight. excluded: sites that are left out of the weight.
+        rows: bounds the memory: so many particles times windows are computed at once.
+
+    Returns:
+        `[K, B]`, float64.
+    """
+    batch, found = len(window.actions), []
+    step = max(1, rows // max(1, batch))
+    wide = {name: value.expand(particles, *value.shape[-2:]) for name, value in (fixed or {}).items()}
+    for start in range(0, particles, step):
+        here = {name: value[start : start + step] for name, value in wide.items()}
+        terms = window_terms(model, guide, window, particles=min(step, particles - start), fixed=here)
+        counted = [term.double() for name, term in terms.items() if name.partition("_")[2] not in excluded]
+        found.append(-torch.stack(counted).sum(0))
+    return torch.cat(found)
+
+
+@torch.no_grad()
+def sample_guide(guide: Program, window: Window, samples: int, *, rows: int = ROWS) -> Codes:
+    """Codes `[samples, B, D]` of each window `[B]` from the guide; from the prior, if the model takes its place."""
+    pieces: dict[str, list[Tensor]] = {}
+    step = max(1, rows // max(1, len(window.actions)))
+    for start in range(0, samples, step):
+        with pyro.plate("particles", min(step, samples - start), dim=-2):
+            trace = poutine.trace(guide).get_trace(window)
+        for name, site in _codes(trace).items():
+            pieces.setdefault(name, []).append(site["value"])
+    return {name: torch.cat(values) for name, values in pieces.items()}
+
+
+@torch.no_grad()
+def sample_prior(model: Program, window: Window, *, fixed: Codes | None = None) -> Codes:
+    """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first.
+
+    Codes in `fixed` are not sampled.
+    """
+    codes = _codes(poutine.trace(substitute(model, fixed or {})).get_trace(window))
+    return {name: site["value"] for name, site in codes.items()}
+
+
+@torch.no_grad()
+def guide_density(guide: Program, window: Window, values: Codes, site: str, *, rows: int = ROWS) -> Tensor:
+    """log q(value | window) at one site for `values: [K, B, D]` of all sites: `[K, B]` float64."""
+    particles, found = len(values[site]), []
+    step = max(1, rows // max(1, len(window.actions)))
+    for start in range(0, particles, step):
+        here = {name: value[start : start + step] for name, value in values.items()}
+        with pyro.plate("particles", len(here[site]), dim=-2):
+            trace = poutine.trace(substitute(guide, here)).get_trace(window)
+        trace.compute_log_prob(site_filter=lambda name, _: name == site)
+        found.append(trace.nodes[site]["log_prob"].double())
+    return torch.cat(found)
+
+
+def _codes(trace: poutine.Trace) -> dict[str, Any]:
+    """Latent sites, without plates, which are sites of a trace too."""
+    sites = {name: trace.nodes[name] for name in trace.stochastic_nodes}
+    return {name: site for name, site in sites.items() if not site_is_subsample(site)}

@@ -1,1 +1,0 @@
-"""Two checkpoints side by side, on the same held-out windows."""

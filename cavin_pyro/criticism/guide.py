@@ -1,0 +1,209 @@
+"""Is the guide calibrated? Codes from the prior, windows from the program, codes from the guide.
+
+Talts, Betancourt, Simpson, Vehtari and Gelman, "Validating Bayesian inference algorithms with simulation-based
+calibration", 2018. On average, posterior intervals of a simulated window must cover its own code at their nominal rate.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from matplotlib.figure import Figure
+from pyro import poutine
+from torch import Tensor
+
+from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS, Codes, guide_density, log_weights, sample_guide
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.estimates import Interval, arviz, covered, draw_ranks, mean_interval, rank
+from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
+from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.training.elbo import Program
+from models.networks.layers import unit
+from models.state import State, Window
+
+NAME, TITLE = "guide", "Is the guide calibrated?"
+INFORMED = 0.1  # a dimension counts as informed where its variance shrinks by more, given s
+LEVEL = 0.9
+EQUAL = 1e-3  # nats
+GOOD, BAD = (0.86, 0.94), (0.80, 0.98)  # of the coverage of 90 % intervals
+COLORS = {"effect_code": "#0072B2", "motion_code": "#D55E00"}
+JOINT_COLOR = "#009E73"
+
+EXPLANATION = (
+    "Codes are sampled from the prior at the first states of {windows} held-out windows of {episodes} episodes, the "
+    "model's program generates a window from each, and {samples} codes are sampled from the guide for each. If the "
+    "guide were the posterior, its 90 % intervals would cover the true code in 90 % of the windows, whatever the "
+    "model. The joint region has the codes at which the guide's density is highest. A dimension is informed where the "
+    "posterior takes more than {informed:.0%} of the prior's variance, given s; others are right without merit. "
+    "On real windows, importance weights p(window, codes) / q(codes) tell how far the guide is from the posterior: "
+    "k-hat is the shape of their tail; above {limit:.2f}, the limit for so many samples (Vehtari and others, 2024), "
+    "the guide misses parts of the posterior that matter."
+)
+
+
+@torch.no_grad()
+def assess_guide(
+    context: CheckContext, *, windows: int = 1000, samples: int = 100, weighted: int = 200, particles: int = 1000
+) -> Section:
+    """Ranks and coverage of the guide's intervals for codes sampled from the prior, and k-hat on real windows.
+
+    Args:
+        windows: held-out windows whose first states are used, at most.
+        samples: samples of the guide for each generated window.
+        weighted: held-out windows for importance weights, at most.
+        particles: importance weights for each of these windows.
+    """
+    if not context.codes:
+        return not_applicable(NAME, TITLE, NO_CODES)
+    window, episodes = context.held_out(windows)
+    with seeded(context.seed):
+        found = calibration(context.model, context.guide, window, samples=samples)
+    joint = mean_interval((found.joint <= LEVEL).double(), episodes)
+    codes = {name: code_coverage(found, name, episodes) for name in context.codes}
+    graded = [joint, *(Interval(**one["informed"]) for one in codes.values())]
+    weights = importance(context, weighted, particles)
+    shares = {key: Interval(**weights[key]) for key in ("unreliable", "effective")}
+    return Section(
+        NAME,
+        TITLE,
+        EXPLANATION.format(
+            windows=len(episodes),
+            episodes=len(episodes.unique()),
+            samples=samples,
+            informed=INFORMED,
+            limit=weights["limit"],
+        ),
+        conclude(
+            worst(within(one.low, one.high, good=GOOD, bad=BAD) for one in graded),
+            "What 90 % regions cover, of all codes jointly and of the informed dimensions of each: good if the 95 % "
+            f"interval over episodes lies within {GOOD[0]:.0%} to {GOOD[1]:.0%}, bad if it lies outside of "
+            f"{BAD[0]:.0%} to {BAD[1]:.0%}.",
+            "Too narrow: run calibrate, or train longer, or with guide=joint or guide=flow.",
+            episodes,
+        ),
+        [
+            *(
+                f"90 % intervals of {SYMBOLS[name]} cover {Interval(**one['informed']).percent()} over the "
+                f"{one['informed_dimensions']} informed dimensions of {one['dimensions']}."
+                for name, one in codes.items()
+            ),
+            f"90 % regions of all codes cover {joint.percent()}.",
+            f"On real windows k-hat is above {weights['limit']:.2f} for {shares['unreliable'].percent()} of the "
+            f"windows, and {particles} importance samples are worth {shares['effective'].text(0)}.",
+        ],
+        {"windows": len(episodes), "samples": samples, "joint": joint._asdict(), "codes": codes, "importance": weights},
+        "coverage of 90 % regions of all codes",
+        joint,
+        figure=_figure(found),
+        caption="Distribution of the true codes' ranks among the guide's samples, minus the uniform one: each informed "
+        "dimension, and the joint rank by density with a pointwise 95 % band. Zero if the guide is the posterior; "
+        "ranks heaped at the ends (rising, then falling) mean too narrow.",
+    )
+
+
+@torch.no_grad()
+def simulate(model: Program, window: Window) -> tuple[Codes, Window]:
+    """Codes `[B, D]` from the prior and windows from the program, from the first states of windows `[B]`.
+
+    The last state is h's, which the guide reads, where the model has one; those between are f's.
+    """
+    nodes: Any = poutine.trace(model).get_trace(window, generate=True).nodes
+    names = [name for name in ("effect_code", "motion_code") if name in nodes]
+    centers, features = nodes["next_centers"]["value"].clone(), unit(nodes["next_features"]["value"])
+    if "subgoal_centers" in nodes:
+        centers[:, -1], features[:, -1] = nodes["subgoal_centers"]["value"], nodes["subgoal_features"]["value"]
+    first = window.first
+    mask = first.mask.unsqueeze(1).expand(-1, centers.shape[1] + 1, -1)
+    states = State(
+        torch.cat((first.centers.unsqueeze(1), centers), 1), torch.cat((first.features.unsqueeze(1), features), 1), mask
+    )
+    actions = nodes["actions"]["value"] if "actions" in nodes else window.actions
+    seen = torch.ones_like(window.transition_mask)
+    return {name: nodes[name]["value"] for name in names}, Window(states, actions, seen, seen[:, 0].clone())
+
+
+class Calibration(NamedTuple):
+    """Of simulated windows `[B]`."""
+
+    ranks: Codes  # by code, [B, D] in [0, 1]: uniform if the guide is the posterior
+    joint: Tensor  # [B] in [0, 1]: share of the guide's samples of all codes that are more dense than the true codes
+    contraction: Codes  # by code, [D]: 1 - variance of the posterior over that of the prior given s
+
+    def informed(self, name: str) -> Tensor:
+        """Ranks `[B, I]` of the informed dimensions of a code, of all if none is."""
+        which = self.contraction[name] > INFORMED
+        return self.ranks[name][:, which] if which.any() else self.ranks[name]
+
+
+@torch.no_grad()
+def calibration(
+    model: Program, guide: Program, window: Window, *, samples: int, prior_samples: int = 32
+) -> Calibration:
+    """Where the true codes of windows simulated from those of `window: [B]` lie among `samples` of the guide."""
+    codes, simulated = simulate(model, window)
+    inferred = sample_guide(guide, simulated, samples)
+    prior = sample_guide(model, simulated, prior_samples)
+    ranks = {name: rank(inferred[name], codes[name]) for name in codes}
+    truth = {name: value.unsqueeze(0) for name, value in codes.items()}
+    densities = [
+        torch.stack([guide_density(guide, simulated, values, name) for name in codes]).sum(0)
+        for values in (inferred, truth)
+    ]
+    joint = rank(-densities[0], -densities[1][0])
+    contraction = {name: 1 - inferred[name].var(0).mean(0) / prior[name].var(0).mean(0) for name in codes}
+    return Calibration(ranks, joint, contraction)
+
+
+def code_coverage(found: Calibration, name: str, episodes: Tensor) -> dict[str, Any]:
+    """What 90 % intervals of a code cover, for windows of `episodes: [B]`.
+
+    Returns:
+        Intervals over `all` dimensions and over the `informed` ones; `by_dimension`; `dimensions` and
+        `informed_dimensions`; `contraction`.
+    """
+    inside = covered(found.ranks[name], LEVEL)
+    return {
+        "all": mean_interval(inside.mean(1), episodes)._asdict(),
+        "informed": mean_interval(covered(found.informed(name), LEVEL).mean(1), episodes)._asdict(),
+        "by_dimension": inside.mean(0).tolist(),
+        "dimensions": inside.shape[1],
+        "informed_dimensions": int((found.contraction[name] > INFORMED).sum()),
+        "contraction": found.contraction[name].tolist(),
+    }
+
+
+def importance(context: CheckContext, windows: int, particles: int) -> dict[str, Any]:
+    """Pareto-smoothed importance weights of the guide on real windows, by ArviZ.
+
+    Returns:
+        `limit` of k-hat for so many particles; intervals of the share of windows that are `unreliable` (above it), and
+        of the `effective` sample size.
+    """
+    window, episodes = context.held_out(windows)
+    with seeded(context.seed):
+        logs = log_weights(context.model, context.guide, window, particles)
+    smoothed, shapes = arviz().psislw(logs.T.numpy())
+    # Fewer samples need a lighter tail; ten or fewer are never enough.
+    limit = max(0.0, min(1 - 1 / torch.tensor(float(particles)).log10().item(), 0.7)) if particles > 10 else 0.0
+    weights = torch.from_numpy(smoothed).reshape(len(episodes), particles).softmax(-1)
+    # Weights that are equal but for rounding have no tail, which ArviZ calls infinitely heavy.
+    heavy = (torch.as_tensor(shapes).reshape(-1) > limit) & (logs.amax(0) - logs.amin(0) > EQUAL)
+    return {
+        "windows": len(episodes),
+        "limit": limit,
+        "unreliable": mean_interval(heavy.double(), episodes)._asdict(),
+        "effective": mean_interval(1 / weights.square().sum(-1), episodes)._asdict(),
+    }
+
+
+def _figure(found: Calibration) -> Figure:
+    figure = Figure(figsize=(6.5, 3.6), layout="constrained")
+    panel = figure.subplots()
+    for name in found.ranks:
+        for number, ranks in enumerate(found.informed(name).T):
+            draw_ranks(panel, ranks, SYMBOLS[name] if number == 0 else "_", COLORS[name])
+    draw_ranks(panel, found.joint, "jointly", JOINT_COLOR, band=True)
+    panel.set(xlim=(0, 1), xlabel="rank", ylabel="ECDF minus uniform")
+    panel.legend(fontsize=8, frameon=False)
+    return figure

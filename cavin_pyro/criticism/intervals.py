@@ -1,0 +1,217 @@
+"""Do intervals of f and h hold what they say? Coverage of predictions on held-out windows.
+
+Gneiting, Balabdaoui and Raftery, "Probabilistic forecasts, calibration and sharpness", 2007. Samples suit every
+likelihood, also a user's own and mixtures over codes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from matplotlib.figure import Figure
+from pyro import poutine
+from torch import Tensor
+
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.estimates import Interval, covered, draw_ranks, rank, ratio_interval
+from cavin_pyro.criticism.pushing import MOVED
+from cavin_pyro.criticism.section import Section, Table, conclude, within, worst
+from cavin_pyro.criticism.windows import repeated, seeded
+from guides.guide import Guide
+from models.model import Model
+from models.state import State, Window
+
+NAME, TITLE = "intervals", "Do intervals of f and h hold what they say?"
+LEVELS = (0.5, 0.9)  # of central intervals
+GOOD, BAD = (0.86, 0.95), (0.80, 0.985)  # of the coverage of 90 % intervals
+FEATURES = 8  # components of a feature to evaluate, a fixed random choice
+COLORS = {"centres": "#009E73", "moved": "#D55E00", "features": "#0072B2", "pushes": "#CC79A7"}
+LABELS = {
+    "centres": "x and y of all objects",
+    "moved": "x and y of objects that moved",
+    "features": "features",
+    "pushes": "pushes",
+}
+PREDICTORS = {
+    "f": "f, given the state and the push",
+    "h_prior": "h, codes from the prior",
+    "h_guide": "h, codes from the guide",
+    "g_guide": "g, codes from the guide",
+}
+
+EXPLANATION = (
+    "{samples} samples of each prediction of {windows} held-out windows, in all of which some object moved more than "
+    "{minimum:g} m and none more than {maximum:g} m, as in training. f predicts the state after each push from the "
+    "state before it; h the state after the segment, with codes from the prior (its mixture p(s' | s) over p(c | s), "
+    "what can be known before acting) or from the guide, which knows the result; g the pushes. Objects that moved more "
+    "than 1 cm are shown apart, and no verdict rests on them: that group is chosen by the truth, so that a right model "
+    "need not cover 90 % of it. The stated scale is the spread of the samples; the RMS error of their mean is the right "
+    "one. Scales are the weights of the loss: one four times too wide weighs its term sixteen times too little."
+)
+
+
+@torch.no_grad()
+def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int = 200) -> Section:
+    """Coverage of central intervals of f, h and g, and their scales beside their errors.
+
+    Args:
+        windows: held-out windows, at most.
+        samples: samples of each prediction.
+    """
+    window, episodes = context.held_out(windows)
+    with seeded(context.seed):
+        predictions = predict(context, window, samples)
+        ranks = {name: rank(one.samples, one.real) for name, one in predictions.items()}
+    found = {name: score(one, ranks[name], episodes) for name, one in predictions.items()}
+    levels = {name: within(*found[name]["90"][1:], good=GOOD, bad=BAD) for name in found if not name.endswith("moved")}
+    level = worst(levels.values())
+    texts = {name: f"{LABELS[name.split()[1]]} by {PREDICTORS[name.split()[0]]}" for name in found}
+    return Section(
+        NAME,
+        TITLE,
+        EXPLANATION.format(
+            samples=samples,
+            windows=len(episodes),
+            minimum=context.selection.minimum_move,
+            maximum=context.selection.maximum_move,
+        ),
+        conclude(
+            level,
+            f"What 90 % intervals cover: good if every 95 % interval over episodes lies within {GOOD[0]:.0%} to "
+            f"{GOOD[1]:.0%}, bad if one lies outside of {BAD[0]:.0%} to {BAD[1]:.1%}. Decided by: "
+            f"{'; '.join(texts[name] for name, one in levels.items() if one == level)}.",
+            "Run calibrate parts=[scales], train with scales=predicted or scales=learned, or set scales.center, "
+            "scales.feature, scales.start and scales.motion to the RMS errors.",
+            episodes,
+        ),
+        [
+            f"90 % intervals of {texts[name]}, cover {one['90'].percent()}; the stated scale is {one['stated']:.3g}, "
+            f"the RMS error {one['error']:.3g}."
+            for name, one in found.items()
+        ],
+        {
+            "windows": len(episodes),
+            "samples": samples,
+            "predictions": {
+                name: {key: one._asdict() if isinstance(one, Interval) else one for key, one in scores.items()}
+                for name, scores in found.items()
+            },
+        },
+        "coverage of 90 % intervals of f, x and y of all objects",
+        found["f centres"]["90"],
+        [
+            Table(
+                ["intervals of", "50 % cover", "90 % cover", "stated scale", "RMS error"],
+                [
+                    [texts[name], one["50"].percent(1), one["90"].percent(1), one["stated"], one["error"]]
+                    for name, one in found.items()
+                ],
+                digits=4,
+            )
+        ],
+        _figure(predictions, ranks),
+        "Distribution of the PIT (where the truth lies among the samples) minus the uniform one, with a pointwise 95 % "
+        "band: zero if the prediction is right; rising, then falling if its intervals are too narrow.",
+    )
+
+
+class Prediction(NamedTuple):
+    """Samples of a quantity of windows `[B]`, what was observed, and which of it counts."""
+
+    samples: Tensor  # [S, B, ...]
+    real: Tensor  # [B, ...]
+    counted: Tensor  # [B, ...] bool
+
+
+def predict(context: CheckContext, window: Window, samples: int) -> dict[str, Prediction]:
+    """Predictions of windows `[B]` by f, h and g, as far as the model has them, by predictor and quantity."""
+    model = context.model
+    nodes: Any = poutine.trace(model).get_trace(window).nodes
+    before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
+    chosen = torch.randperm(after.features.shape[-1])[:FEATURES]
+    sampled = nodes["next_centers"]["fn"].sample((samples,))
+    # One sample at a time: all of them with all components would be large.
+    features = torch.stack([nodes["next_features"]["fn"].sample()[..., chosen] for _ in range(samples)])
+    found = _states("f", sampled, features, before, after, chosen, window.transition_mask.unsqueeze(-1))
+    if "subgoal_centers" in nodes:
+        for name, guide in (("h_prior", None), ("h_guide", context.guide)):
+            sites = sample_sites(model, window, samples, ("subgoal_centers", "subgoal_features"), guide)
+            centers, features = sites["subgoal_centers"], sites["subgoal_features"][..., chosen]
+            found |= _states(name, centers, features, window.first, window.last, chosen)
+    if "actions" in nodes and context.codes:
+        pushes = sample_sites(model, window, samples, ("actions",), context.guide)["actions"]
+        found["g_guide pushes"] = Prediction(pushes, window.actions, torch.ones_like(window.actions, dtype=torch.bool))
+    return found
+
+
+def _states(
+    name: str,
+    centers: Tensor,
+    features: Tensor,
+    before: State,
+    after: State,
+    chosen: Tensor,
+    known: Tensor | bool = True,
+) -> dict[str, Prediction]:
+    """Predictions of centres `[S, B, ..., M, 3]` and of the `chosen` features after states; `known`: which count."""
+    counted = (before.mask & after.mask & known).unsqueeze(-1)
+    moved = counted & ((after.centers - before.centers).norm(dim=-1, keepdim=True) > MOVED)
+    plane, real = centers[..., :2], after.centers[..., :2]
+    return {
+        f"{name} centres": Prediction(plane, real, counted.expand_as(real)),
+        f"{name} moved": Prediction(plane, real, moved.expand_as(real)),
+        f"{name} features": Prediction(
+            features, after.features[..., chosen], counted.expand(*counted.shape[:-1], len(chosen))
+        ),
+    }
+
+
+def sample_sites(
+    model: Model, window: Window, samples: int, sites: tuple[str, ...], guide: Guide | None
+) -> dict[str, Tensor]:
+    """What the program generates at some sites for windows `[B]`, with codes from the guide or prior: `[S, B, ...]`."""
+    parts: dict[str, list[Tensor]] = {site: [] for site in sites}
+    for count, copies in repeated(window, samples):
+        program: Any = model
+        if guide is not None:
+            program = poutine.replay(model, trace=poutine.trace(guide).get_trace(copies))
+        nodes: Any = poutine.trace(program).get_trace(copies, generate=True).nodes
+        for site in sites:
+            parts[site].append(nodes[site]["value"].unflatten(0, (count, -1)))
+    return {site: torch.cat(values) for site, values in parts.items()}
+
+
+def score(prediction: Prediction, ranks: Tensor, episodes: Tensor) -> dict[str, Any]:
+    """How well a prediction whose truth has `ranks: [B, ...]` holds, for windows of `episodes: [B]`.
+
+    Returns:
+        Intervals of the coverage by level, `"50"` and `"90"`; `stated`: root of the mean variance of the samples;
+        `error`: root of the mean squared error of their mean.
+    """
+    samples, real, counted = prediction
+    count = counted.double().flatten(1).sum(1)
+    coverage = {
+        f"{100 * level:.0f}": ratio_interval((covered(ranks, level) * counted).flatten(1).sum(1), count, episodes)
+        for level in LEVELS
+    }
+    variance = samples.var(0)[counted].double().mean()
+    # The mean of S samples errs by itself; that much is taken off.
+    squared = (real - samples.mean(0))[counted].double().square().mean() - variance / len(samples)
+    return {**coverage, "stated": variance.sqrt().item(), "error": squared.clamp(min=0).sqrt().item()}
+
+
+def _figure(predictions: Mapping[str, Prediction], ranks: Mapping[str, Tensor]) -> Figure:
+    predictors = list(dict.fromkeys(name.split()[0] for name in predictions))
+    figure = Figure(figsize=(3.3 * len(predictors), 3.2), layout="constrained")
+    panels = dict(zip(predictors, figure.subplots(1, len(predictors), squeeze=False)[0], strict=True))
+    for name, one in predictions.items():
+        predictor, quantity = name.split()
+        band = quantity in ("centres", "pushes")
+        draw_ranks(panels[predictor], ranks[name][one.counted], LABELS[quantity], COLORS[quantity], band=band)
+    for predictor, panel in panels.items():
+        panel.set(xlim=(0, 1), xlabel="PIT", ylabel="ECDF minus uniform")
+        panel.set_title(PREDICTORS[predictor], fontsize=9)
+        panel.legend(fontsize=7, frameon=False)
+    return figure

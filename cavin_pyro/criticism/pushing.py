@@ -1,0 +1,148 @@
+"""Statistics of windows that matter for pushing: moves, objects inside each other, and where pushes start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from cavin_pyro.criticism.windows import Outcome
+from envs.workspace import push_endpoints
+
+MOVED = 0.01  # metres; an object that moves farther counts as moved
+CLOSE_PAIR_SHARE = 0.01  # of the real windows with two objects or more
+
+
+@dataclass(frozen=True)
+class Nearness:
+    """Distances that stand for the objects' extent, which centres lack. Metres, in the plane of the table.
+
+    pair: two centres nearer than this hardly occur. tool: a push whose path comes nearer to a centre touches it.
+    """
+
+    pair: float
+    tool: float
+
+    @classmethod
+    def of(cls, real: Outcome) -> Nearness:
+        """From real windows `[B]`.
+
+        `pair`: so that 1 % of the last states have a nearer pair; 0 without two objects anywhere. `tool`: so that
+        as many pushes come nearer to a centre as moved an object by more than 1 cm.
+        """
+        closest = pair_distances(real.steps[:, -1], real.first.mask).amin((-1, -2))
+        several = closest[closest.isfinite()]
+        pair = torch.quantile(several, CLOSE_PAIR_SHARE).item() if len(several) else 0.0
+        moved = (_moves_of_pushes(real) > MOVED).any(-1).to(real.steps.dtype).mean()
+        return cls(pair, torch.quantile(path_distances(real).amin(-1), moved).item())
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """One number per window, or per push of a window.
+
+    Attributes:
+        function: of an `Outcome` `[B]` -> `[B]` or `[B, T]`. part: of the model, that makes it: h, f or g.
+    """
+
+    name: str
+    label: str
+    function: Callable[[Outcome], Tensor]
+    part: str
+    unit: str = ""
+
+
+def statistics_of(nearness: Nearness) -> list[Statistic]:
+    """All statistics. Those of h look at its subgoal, those of f at the states after each push."""
+    pair, tool = 100 * nearness.pair, 100 * nearness.tool  # centimetres
+    found = []
+    for part in ("h", "f"):
+        move, moved = f"farthest move over the segment, {part}", f"objects that move more than 1 cm, {part}"
+        near = f"pairs of centres nearer than {pair:.1f} cm, {part}"
+        found += [
+            Statistic(f"farthest_move_{part}", move, partial(_farthest_move, part), part, "m"),
+            Statistic(f"moved_objects_{part}", moved, partial(_moved_objects, part), part),
+            Statistic(f"close_pairs_{part}", near, partial(_close_pairs, part, nearness.pair), part),
+        ]
+    touching = f"share of pushes that pass within {tool:.1f} cm of a centre"
+    return [
+        *found,
+        Statistic("start_to_nearest", "from a push's start to the nearest centre", _start_to_nearest, "g", "m"),
+        Statistic("touching", touching, partial(_touching, nearness.tool), "g"),
+    ]
+
+
+def _end(part: str, outcome: Outcome) -> Tensor:
+    """Centres `[B, M, 3]` after the segment, as h or f has them."""
+    if part == "f":
+        return outcome.steps[:, -1]
+    assert outcome.subgoal is not None
+    return outcome.subgoal
+
+
+def _moves(part: str, outcome: Outcome) -> Tensor:
+    """How far each object goes over the segment: `[B, M]` metres, 0 for padding."""
+    return (_end(part, outcome) - outcome.first.centers).norm(dim=-1) * outcome.first.mask
+
+
+def _farthest_move(part: str, outcome: Outcome) -> Tensor:
+    return _moves(part, outcome).amax(-1)
+
+
+def _moved_objects(part: str, outcome: Outcome) -> Tensor:
+    return (_moves(part, outcome) > MOVED).sum(-1).float()
+
+
+def _close_pairs(part: str, near: float, outcome: Outcome) -> Tensor:
+    # Every pair stands in the matrix twice.
+    return (pair_distances(_end(part, outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
+
+
+def _touching(near: float, outcome: Outcome) -> Tensor:
+    return (path_distances(outcome).amin(-1) < near).float().mean(-1)
+
+
+def _before(outcome: Outcome) -> Tensor:
+    """Centres before each push: `[B, T, M, 3]`."""
+    return torch.cat((outcome.first.centers.unsqueeze(1), outcome.steps[:, :-1]), 1)
+
+
+def _moves_of_pushes(outcome: Outcome) -> Tensor:
+    """How far each push moves each object: `[B, T, M]` metres, 0 for padding."""
+    return (outcome.steps - _before(outcome)).norm(dim=-1) * outcome.first.mask.unsqueeze(1)
+
+
+def pair_distances(centers: Tensor, mask: Tensor) -> Tensor:
+    """Planar distances `[B, M, M]` between `centers: [B, M, 3]`; infinite unless both are real and distinct."""
+    plane = centers[..., :2]
+    distances = (plane.unsqueeze(-2) - plane.unsqueeze(-3)).norm(dim=-1)
+    real = mask.unsqueeze(-1) & mask.unsqueeze(-2) & ~torch.eye(mask.shape[-1], dtype=torch.bool)
+    return distances.masked_fill(~real, torch.inf)
+
+
+def _endpoints(actions: Tensor) -> tuple[Tensor, Tensor]:
+    start, end = push_endpoints(actions.numpy())
+    return torch.from_numpy(start).to(actions), torch.from_numpy(end).to(actions)
+
+
+def path_distances(outcome: Outcome) -> Tensor:
+    """From each push's path to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
+    start, end = (point.unsqueeze(-2) for point in _endpoints(outcome.actions))
+    line, offset = end - start, _before(outcome)[..., :2] - start
+    along = (offset * line).sum(-1) / line.square().sum(-1).clamp_min(1e-12)
+    distances = (offset - along.clamp(0.0, 1.0).unsqueeze(-1) * line).norm(dim=-1)
+    return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
+
+
+def start_distances(outcome: Outcome) -> Tensor:
+    """From each push's start to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
+    start, _ = _endpoints(outcome.actions)
+    distances = (_before(outcome)[..., :2] - start.unsqueeze(-2)).norm(dim=-1)
+    return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
+
+
+def _start_to_nearest(outcome: Outcome) -> Tensor:
+    return start_distances(outcome).amin(-1)

@@ -1,1 +1,0 @@
-"""Repair of a guide that fails simulation-based calibration."""

@@ -1,1 +1,0 @@
-"""Statistics of checks, without figures."""

@@ -1,1 +1,0 @@
-"""Whether the guide is right: importance weights, information, simulation-based calibration."""

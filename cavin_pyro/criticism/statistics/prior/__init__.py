@@ -1,1 +1,0 @@
-"""Whether the prior is right, given the state: tests and coverage of (s, c, z)."""

@@ -1,0 +1,236 @@
+"""Does a push reach its subgoal in physics? Pushes generated for (s, c) against the subgoal h(s, c).
+
+The paper asserts it (sections 3.1 and 3.2: h and g share the effect code); here the pushes are carried out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.codes import NO_CODES
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.estimates import Interval, ratio_interval
+from cavin_pyro.criticism.rollouts import Floats, SubgoalRollout, motions, subgoal_rollouts
+from cavin_pyro.criticism.section import FEW, GOOD, Section, Table, Verdict, grade, not_applicable
+from cavin_pyro.storage.progress import progress_bar
+from models.model import Model
+
+NAME, TITLE = "subgoals", "Do pushes reach their subgoals in physics?"
+MOVING = 0.02  # metres; objects that a subgoal moves less are not counted among those that it wants moved
+NEAR, FAR = 0.35, 0.65  # of the way to the subgoal that is left
+FEWEST = 50  # scenes
+COLORS = ("#D55E00", "#0072B2")
+
+EXPLANATION = (
+    "The paper asserts that the pushes generated for a state s and an effect code c lead to the subgoal h(s, c). This "
+    "check executes them in PyBullet, in {scenes} scenes of {objects} objects, and compares the state observed "
+    "afterwards with the subgoal and with f's prediction. Effect codes are sampled from the prior. A motion code is "
+    "sampled from the prior, or it is the closest of {samples}: the one that leads f closest to the subgoal, which is "
+    "what the planner executes. Models of one code have no motion to choose; models without h are compared with f's "
+    f"prediction only. Distances are means over the objects that the subgoal moves by more than {100 * MOVING:g} cm, "
+    "between centres. An unsafe push would bring the tool down on an object and is not executed; an ineffective one "
+    "moves nothing."
+)
+
+
+def check_objects(model: Model, objects: int) -> None:
+    """Make sure that a model knows so many objects.
+
+    Raises:
+        UserError: it does not.
+    """
+    if objects > model.maximum_objects:
+        raise UserError(f"sizes.subgoals.objects={objects}, but the model knows at most {model.maximum_objects}")
+
+
+def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 3, samples: int = 1024) -> Section:
+    """Execute plans for subgoals in sampled scenes.
+
+    Args:
+        scenes: number of scenes to sample.
+        objects: number of objects in a scene, at most as many as the model knows.
+        samples: N, candidates for the closest motion.
+
+    Raises:
+        UserError: the model does not know so many objects.
+    """
+    check_objects(context.model, objects)
+    if not context.codes:
+        return not_applicable(NAME, TITLE, f"{NO_CODES} It generates no pushes.")
+    groups: dict[str, list[SubgoalRollout]] = {}
+    with progress_bar("executing", total=scenes, unit="scene") as bar:
+        for rollouts in subgoal_rollouts(context, scenes=scenes, objects=objects, samples=samples):
+            for rollout in rollouts:
+                groups.setdefault(f"motion {rollout.motion}", []).append(rollout)
+            bar.update()
+    measured = {name: measure(rollouts, seed=context.seed) for name, rollouts in groups.items()}
+    best = f"motion {motions(context.codes)[-1]}"
+    left = measured[best].get("left")
+    return Section(
+        NAME,
+        TITLE,
+        EXPLANATION.format(scenes=scenes, objects=objects, samples=samples),
+        _verdict(left, best, scenes),
+        [_finding(name, numbers) for name, numbers in measured.items()],
+        {
+            "scenes": scenes,
+            "objects": objects,
+            "samples": samples,
+            "motions": {
+                name: {key: one._asdict() if isinstance(one, Interval) else one for key, one in numbers.items()}
+                for name, numbers in measured.items()
+            },
+        },
+        f"part of the way to the subgoal that is left ({best})" if left else "",
+        left,
+        [_table(measured)],
+        draw_distances(groups),
+        "Left: share of the objects that are to move within a distance of their subgoal (of f's prediction for a model "
+        "without subgoals), after the pushes, and before (dashed). Right: how far objects move in physics and by f; "
+        "at the bottom a push missed what f expects it to move.",
+    )
+
+
+def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> dict[str, Any]:
+    """Numbers of rollouts whose codes were obtained in one way; metres, shares as fractions, NaN where nothing counts.
+
+    Counted in distances are rollouts in which no object fell or hid. An object is *wanted* where the subgoal lies
+    more than `MOVING` from it.
+
+    Returns:
+        Shares `unsafe` and `ineffective` of the pushes, `fallen` and `hidden` of the rollouts; of objects that moved
+        more than `MOVING` or were predicted to: `moved` and f's `error`. With subgoals, of the wanted objects:
+        `wanted` (their mean distance to the subgoal at first), `from_subgoal` (at the end), `predicted_from_subgoal`
+        (f's end state), `from_prediction` (at the end; f against physics), and `left`: `from_subgoal` over `wanted`, an
+        interval over scenes.
+    """
+    pushes = sum(len(rollout.plan.actions) for rollout in rollouts)
+    finished = [rollout for rollout in rollouts if not rollout.fallen and not rollout.hidden]
+    shape = (len(finished), *rollouts[0].before.shape)
+    before, reached, predicted = (
+        np.reshape(states, shape)
+        for states in (
+            [rollout.before for rollout in finished],
+            [rollout.reached for rollout in finished],
+            [rollout.plan.predicted for rollout in finished],
+        )
+    )
+    moved, error = _lengths(reached - before), _lengths(reached - predicted)
+    moving = np.maximum(moved, _lengths(predicted - before)) > MOVING
+    numbers: dict[str, Any] = {
+        "counted": len(finished),
+        "unsafe": sum(rollout.unsafe for rollout in rollouts) / pushes,
+        "ineffective": sum(rollout.ineffective for rollout in rollouts) / pushes,
+        "fallen": float(np.mean([rollout.fallen for rollout in rollouts])),
+        "hidden": float(np.mean([rollout.hidden for rollout in rollouts])),
+        "moved": _mean(moved[moving]),
+        "error": _mean(error[moving]),
+    }
+    if rollouts[0].plan.subgoal is None:
+        return numbers
+    subgoal = np.reshape([rollout.plan.subgoal for rollout in finished], shape)
+    way, end = _lengths(subgoal - before), _lengths(reached - subgoal)
+    wanted = way > MOVING
+    left = Interval(math.nan, math.nan, math.nan)
+    if wanted.any():
+        totals = (torch.from_numpy((lengths * wanted).sum(-1)) for lengths in (end, way))
+        left = ratio_interval(*totals, torch.arange(len(finished)), seed=seed)
+    return numbers | {
+        "wanted": _mean(way[wanted]),
+        "from_subgoal": _mean(end[wanted]),
+        "predicted_from_subgoal": _mean(_lengths(predicted - subgoal)[wanted]),
+        "from_prediction": _mean(error[wanted]),
+        "left": left,
+    }
+
+
+def _lengths(vectors: Floats) -> Floats:
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if values.size else math.nan
+
+
+def _verdict(left: Interval | None, name: str, scenes: int) -> Verdict:
+    if left is None:
+        return not_applicable(NAME, TITLE, "The model has no subgoals.").verdict
+    rule = (
+        f"The part of the way to the subgoal that is left ({name}): good if its 95 % interval over scenes ends below "
+        f"{NEAR:.0%}, bad if it begins above {FAR:.0%}."
+    )
+    if scenes < FEWEST:
+        return Verdict(FEW, f"Only {scenes} scenes: a conclusion needs at least {FEWEST}. ({rule})", "More scenes.")
+    level = grade(left.low, left.high, good=NEAR, bad=FAR)
+    advice = "If f predicted less to be left, f is too optimistic: plan with planner.robustness or more perturbed data."
+    return Verdict(level, rule, advice if level != GOOD else "")
+
+
+def _finding(name: str, numbers: Mapping[str, Any]) -> str:
+    pushes = f"{numbers['unsafe']:.0%} of the pushes are unsafe and {numbers['ineffective']:.0%} ineffective"
+    name = name[0].upper() + name[1:]
+    if "left" not in numbers:
+        return (
+            f"{name}: f errs by {100 * numbers['error']:.1f} cm on objects that move {100 * numbers['moved']:.1f} cm; "
+            f"{pushes}."
+        )
+    if math.isnan(numbers["left"].mean):
+        return f"{name}: no subgoal moves an object by more than {100 * MOVING:g} cm; {pushes}."
+    return (
+        f"{name}: objects that are to move {100 * numbers['wanted']:.1f} cm end {100 * numbers['from_subgoal']:.1f} cm "
+        f"from the subgoal, so that {numbers['left'].percent()} of the way is left; f predicted "
+        f"{100 * numbers['predicted_from_subgoal']:.1f} cm; {pushes}."
+    )
+
+
+def _table(measured: Mapping[str, Mapping[str, Any]]) -> Table:
+    columns = {
+        "to move, cm": ("wanted", 100),
+        "from the subgoal, cm": ("from_subgoal", 100),
+        "by f, cm": ("predicted_from_subgoal", 100),
+        "moved, cm": ("moved", 100),
+        "f's error, cm": ("error", 100),
+        "unsafe, % of pushes": ("unsafe", 100),
+        "ineffective, %": ("ineffective", 100),
+        "scenes with a fall, %": ("fallen", 100),
+    }
+    rows = [
+        [name, *(factor * numbers.get(key, math.nan) for key, factor in columns.values())]
+        for name, numbers in measured.items()
+    ]
+    return Table(["codes", *columns], rows, digits=1)
+
+
+def draw_distances(groups: Mapping[str, Sequence[SubgoalRollout]]) -> Figure:
+    """Distances of the objects that are to move, and f's moves against those in physics."""
+    figure = Figure(figsize=(8.5, 3.6), layout="constrained")
+    shares, moves = figure.subplots(1, 2)
+    for color, (name, rollouts) in zip(COLORS, groups.items(), strict=False):
+        finished = [rollout for rollout in rollouts if not rollout.fallen and not rollout.hidden]
+        for rollout in finished:
+            states = (rollout.plan.predicted, rollout.reached)
+            moves.plot(*(100 * _lengths(state - rollout.before) for state in states), ".", color=color, alpha=0.5)
+        distances = [wanted_distances(rollout) for rollout in finished]
+        if sum(one.size for one in distances):
+            before, after = 100 * np.concatenate(distances, 1)
+            shares.ecdf(after, color=color, label=name)
+            shares.ecdf(before, color=color, linestyle="--", linewidth=0.8)
+    moves.plot([0, 30], [0, 30], color="#999999", linewidth=1, linestyle="--")
+    moves.set(xlabel="by f (cm)", ylabel="moved in physics (cm)", xlim=(-0.5, 30), ylim=(-0.5, 30))
+    shares.set(xlabel="distance to the subgoal (cm)", ylabel="share of objects", xlim=(0, 30), ylim=(0, 1))
+    shares.legend(fontsize=8, frameon=False, loc="lower right")
+    return figure
+
+
+def wanted_distances(rollout: SubgoalRollout) -> Floats:
+    """[2, n] metres, of the objects that are to move: to where they should be, before and after the pushes."""
+    aim = rollout.plan.predicted if rollout.plan.subgoal is None else rollout.plan.subgoal
+    distances = np.stack([_lengths(aim - state) for state in (rollout.before, rollout.reached)])
+    return distances[:, distances[0] > MOVING]

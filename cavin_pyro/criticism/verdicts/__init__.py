@@ -1,1 +1,0 @@
-"""What sections conclude, and the words that they use."""

@@ -1,0 +1,101 @@
+"""Replicated windows: the values that a model's program generates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from pyro import poutine
+from pyro.poutine.messenger import Messenger
+from pyro.poutine.util import site_is_subsample
+from torch import Tensor
+
+from cavin_pyro.training.elbo import substitute
+from guides.guide import Guide
+from models.model import Model
+from models.state import State, Window
+
+WINDOWS_AT_ONCE = 4096  # a few megabytes per layer, so that a pass stays in the processor's cache
+
+
+class Outcome(NamedTuple):
+    """Actions and states of windows `[B]`, observed or generated. Lengths are metres."""
+
+    first: State  # [B], the state s
+    actions: Tensor  # [B, T, 4] normalised
+    steps: Tensor  # [B, T, M, 3] centres after each push, from f
+    subgoal: Tensor | None  # [B, M, 3] centres after the segment, from h; None for a model without h
+    chosen: bool = True  # whether the actions are the model's own
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Seed torch inside the block, and restore its generator afterwards."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
+
+
+def observed(window: Window) -> Outcome:
+    """The windows `[B]` themselves."""
+    return Outcome(window.first, window.actions, window.states.centers[:, 1:], window.last.centers)
+
+
+def generated(
+    model: Model,
+    window: Window,
+    *,
+    guide: Guide | None = None,
+    means: Sequence[str] | None = None,
+    codes: Mapping[str, Tensor] | None = None,
+) -> Outcome:
+    """Run the program once for each window `[B]` with `generate=True`.
+
+    Args:
+        guide: where the codes come from; by default the model's own prior given s.
+        means: names of the codes. If given, everything else takes the mean of its likelihood, as planning does;
+            by default everything is sampled.
+        codes: `[B, D]` by name, in place of samples.
+    """
+    program: Any = substitute(model, codes or {})
+    if guide is not None:
+        program = poutine.replay(model, trace=poutine.trace(guide).get_trace(window))
+    if means is not None:
+        program = _Means(means)(program)
+    nodes = poutine.trace(program).get_trace(window, generate=True).nodes
+    return Outcome(
+        first=window.first,
+        actions=nodes["actions"]["value"] if "actions" in nodes else window.actions,
+        steps=nodes["next_centers"]["value"],
+        subgoal=nodes["subgoal_centers"]["value"] if "subgoal_centers" in nodes else None,
+        chosen="actions" in nodes,
+    )
+
+
+def repeated(window: Window, copies: int) -> Iterator[tuple[int, Window]]:
+    """Copies of windows `[B]`, one after the other: `(n, [n * B])` until there were `copies`."""
+    # Longer batches instead of a further dimension: they suit every model, and cost the same.
+    each = max(1, min(copies, WINDOWS_AT_ONCE // len(window.actions)))
+    for made in range(0, copies, each):
+        count = min(each, copies - made)
+        yield count, window.map(partial(_tile, count))
+
+
+def _tile(count: int, field: Tensor) -> Tensor:
+    return field.repeat(count, *[1] * (field.dim() - 1))
+
+
+class _Means(Messenger):
+    """Gives every latent site but the codes the mean of its distribution."""
+
+    def __init__(self, codes: Sequence[str]) -> None:
+        super().__init__()
+        self._codes = codes
+
+    def _pyro_sample(self, message: Any) -> None:
+        if message["is_observed"] or message["name"] in self._codes or site_is_subsample(message):
+            return
+        message["value"], message["done"] = message["fn"].mean, True

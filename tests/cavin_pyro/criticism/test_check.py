@@ -1,0 +1,233 @@
+"""The command that criticises, from a checkpoint and a dataset to the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism import sections
+from cavin_pyro.criticism.comparison import assess_pair, check_pair, write_pair
+from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.loading import (
+    compare_data,
+    load_context,
+    load_programs,
+    sample_windows,
+    trained_windows,
+)
+from cavin_pyro.criticism.section import Section, Verdict
+from cavin_pyro.data.dataset import content_records
+from cavin_pyro.data.windows import load_windows
+from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
+
+SMALL = [*SMALL_CHECK, "sizes.subgoals.scenes=2"]
+
+
+@pytest.fixture(scope="module")
+def trained(small: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint that tells which windows it was trained on."""
+    path = tmp_path_factory.mktemp("trained") / "checkpoint.safetensors"
+    config = {**small.config(), "windows": WINDOWS, "seed": 1}
+    save_checkpoint(path, parts=small.parts(), config=config, provenance={"step": 0, "command": "train <here>"})
+    return path
+
+
+@pytest.fixture
+def check_config(trained: Path, pushes: Path) -> Callable[..., DictConfig]:
+    def configuration(*further: str) -> DictConfig:
+        return compose("check", f"checkpoint={trained}", f"data={pushes}", *SMALL, *further)
+
+    return configuration
+
+
+def test_the_command_writes_a_report_and_runs_no_section_twice(
+    trained: Path, pushes: Path, shell: SimpleNamespace, tmp_path: Path
+) -> None:
+    line = [f"checkpoint={trained}", f"data={pushes}", "output=out", *SMALL]
+    first = shell.run_command("check", *line, folder=tmp_path)
+    assert first.status == 0, first.errors
+    assert first.complaints == []
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert left == {"config.yaml", "report.html", "report.json", "sections"}
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["about"]["model"] == "CascadedModel"
+    assert report["about"]["windows"] == {"training": 5, "validation": 5}
+    assert report["sections"]["subgoals"]["values"]["scenes"] == 2
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert "train &lt;here&gt;" in html and "http" not in html.replace("http-equiv", "")
+    again = shell.run_command("check", *line, folder=tmp_path)
+    assert again.status == 0, again.errors
+    assert "executing" in first.errors and "executing" not in again.errors
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["sections"] == report["sections"]
+
+
+@pytest.mark.parametrize("name", ["dynamics", "flat", "single_latent"])
+def test_other_models_are_checked_for_what_they_have(
+    name: str, small: SimpleNamespace, pushes: Path, tmp_path: Path
+) -> None:
+    small.save_baseline(tmp_path / "checkpoint", name, windows=WINDOWS, seed=1)
+    config = compose("check", f"checkpoint={tmp_path / 'checkpoint'}", f"data={pushes}", *SMALL_CHECK)
+    context, _ = load_context(config)
+    parts = sections.run_sections(list(sections.SECTIONS), context, config.sizes, tmp_path, "")
+    nothing = {part["name"] for part in parts if "The model has no codes" in " ".join(part["findings"])}
+    assert nothing == ({"guide", "prior", "subgoals"} if name == "dynamics" else set())
+
+
+def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
+    check_config: Callable[..., DictConfig], trained: Path, pushes: Path
+) -> None:
+    context, about = load_context(check_config("windows=1000"))
+    assert context.seed == 0
+    checkpoint = load_checkpoint(trained)
+    windows, segment_length, seed = trained_windows(checkpoint, trained)
+    table = load_windows([pushes], context.geometry, windows, segment_length=segment_length, seed=seed)
+    for name in ("training", "validation"):
+        window = getattr(context, name)
+        counted = getattr(table, name)[table.sequence_mask[getattr(table, name)]]
+        torch.testing.assert_close(window.states.centers, table.batch(counted).states.centers, rtol=0, atol=0)
+        assert window.sequence_mask.all()
+        assert about["windows"][name] == len(counted) > 0
+        assert getattr(context, f"{name}_episodes").equal(table.episodes[counted])
+    assert not context.model.training and not context.guide.training
+    parameters = [*context.model.parameters(), *context.guide.parameters()]
+    assert parameters and not any(parameter.requires_grad for parameter in parameters)
+    assert json.loads(json.dumps(about)) == about
+    assert context.selection == windows and windows.minimum_move == WINDOWS["minimum_move"]
+    assert load_context(check_config("windows=1000"))[1]["windows_digest"] == about["windows_digest"]
+    for other in ("windows=2", "seed=1"):
+        assert load_context(check_config("windows=3", other))[1]["windows_digest"] != about["windows_digest"]
+
+
+def test_sampled_windows_depend_on_their_seed() -> None:
+    numbers = torch.arange(40)
+    table: Any = SimpleNamespace(sequence_mask=numbers % 2 == 0)
+    first, again, other = (sample_windows(table, numbers, 6, seed=[seed, 0]) for seed in (0, 0, 1))
+    assert len(set(first.tolist())) == 6 and first.equal(again) and not first.equal(other)
+    assert (first % 2 == 0).all()
+    assert sample_windows(table, numbers[:7], 1000, seed=[0]).tolist() == [0, 2, 4, 6]
+
+
+def test_a_report_says_whether_the_model_was_trained_on_the_data(pushes: Path) -> None:
+    fingerprint = content_records(pushes)[0]["fingerprint"]
+    cases = {True: [{"fingerprint": "0"}, {"fingerprint": fingerprint}], False: [{"fingerprint": "0"}], None: []}
+    for same, entries in cases.items():
+        assert compare_data(pushes, {"data": entries})["same"] is same
+    assert compare_data(pushes, {})["same"] is None and compare_data(pushes, {"data": "damaged"})["same"] is None
+
+
+def test_checkpoints_that_cannot_be_checked_are_refused_with_the_reason(small: SimpleNamespace, tmp_path: Path) -> None:
+    path, parts, config = tmp_path / "checkpoint", small.parts(), small.config()
+
+    def saved(parts: dict[str, torch.nn.Module], config: dict[str, Any]) -> Any:
+        save_checkpoint(path, parts=parts, config=config, provenance={})
+        return load_checkpoint(path)
+
+    load_programs(saved(parts, config), path)
+    without_guide = {name: part for name, part in parts.items() if name != "guide"}
+    unnamed = {name: part for name, part in config.items() if name != "guide"}
+    for what, kept in ((without_guide, config), (parts, unnamed)):
+        with pytest.raises(UserError, match="holds no guide: give one that train has written"):
+            load_programs(saved(what, kept), path)
+    for wrong in ({}, {"windows": WINDOWS}, {"windows": {}, "seed": 0}, {"windows": 3, "seed": 0}):
+        with pytest.raises(UserError, match="does not tell which windows its training held out"):
+            trained_windows(saved(parts, {**config, **wrong}), path)
+    told = trained_windows(saved(parts, {**config, "windows": WINDOWS, "seed": 7}), path)
+    assert told == (WindowConfig(**WINDOWS, held_out_objects=[]), 3, 7)
+
+
+def test_sections_are_chosen_by_name_and_run_in_the_reports_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sections, "SECTIONS", {"one": None, "two": None, "three": None})
+    assert sections.choose_sections(None, {}) == ["one", "two", "three"]
+    assert sections.choose_sections(["three", "one"], {}) == ["one", "three"]
+    assert sections.choose_sections("two", {"one": {"scenes": 0}}) == ["two"]
+    for names, said in ((["one", "four"], "unknown section 'four': choose from one, two, three"), ([], "at least one")):
+        with pytest.raises(UserError, match=said):
+            sections.choose_sections(names, {})
+    with pytest.raises(UserError, match=r"sizes\.one\.scenes must be at least 1, not 0"):
+        sections.choose_sections(["one"], {"one": {"scenes": 0}})
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the sections that ran, of two that tell random numbers."""
+    ran: list[str] = []
+
+    def assess(context: CheckContext, *, name: str) -> Section:
+        ran.append(name)
+        sampled = [float(torch.rand(())), float(np.random.rand())]  # noqa: NPY002
+        return Section(name, name, "", Verdict("none", ""), values={"sampled": sampled})
+
+    both = {"one": lambda context: assess(context, name="one"), "two": lambda context: assess(context, name="two")}
+    monkeypatch.setattr(sections, "SECTIONS", both)
+    return ran
+
+
+def test_finished_sections_are_kept_and_others_run_again(counted: list[str], tmp_path: Path) -> None:
+    nothing: Any = None
+    context = CheckContext(nothing, nothing, nothing, nothing, nothing, seed=3)
+
+    def run(*names: str, fingerprint: str = "a") -> list[Any]:
+        counted.clear()
+        return sections.run_sections(names, context, {}, tmp_path, fingerprint)
+
+    both = run("one", "two")
+    assert counted == ["one", "two"]
+    assert run("one", "two") == both and counted == []
+    (tmp_path / "sections" / "two.json").write_text("{")
+    assert run("one", "two") == both and counted == ["two"]  # whatever ran before it samples the same numbers
+    run("one", fingerprint="b")
+    assert counted == ["one"]
+
+
+def test_two_checkpoints_are_compared_on_the_windows_that_both_held_out(
+    small: SimpleNamespace, pushes: Path, tmp_path: Path
+) -> None:
+    def save(name: str, seed: int) -> None:
+        config = {**small.config(), "windows": WINDOWS, "seed": seed}
+        save_checkpoint(tmp_path / name, parts=small.parts(), config=config, provenance={})
+
+    def check() -> dict[str, Any]:
+        write_pair(config, ["elbo"], folder)
+        return {name: json.loads((folder / name / "report.json").read_text()) for name in ("a", "b", ".")}
+
+    save("a", seed=1), save("b", seed=2)
+    options = [f"a={tmp_path / 'a'}", f"b={tmp_path / 'b'}", f"data={pushes}", "windows=1000", *SMALL_CHECK[1:]]
+    config, folder = compose("check", *options), tmp_path / "out"
+    folder.mkdir()
+    first = check()
+    assert first["a"]["about"]["windows_digest"] != first["b"]["about"]["windows_digest"]  # of training windows too
+    alone = load_context(compose("check", f"checkpoint={tmp_path / 'a'}", f"data={pushes}", "windows=1000"))[1]
+    assert 0 < first["a"]["about"]["windows"]["validation"] < alone["windows"]["validation"]
+    assert set(first["."]["sections"]) == {"verdicts", "comparison"}
+    assert first["."]["about"]["checkpoint"] == f"a: {tmp_path / 'a'}; b: {tmp_path / 'b'}"
+    save("b", seed=1)  # another training under the same path, which held out all windows of a
+    assert check()["a"]["about"]["windows"] == alone["windows"]
+    assert check_pair(config) and not check_pair(compose("check"))
+    with pytest.raises(UserError, match="give both"):
+        check_pair(compose("check", f"a={tmp_path / 'a'}"))
+
+
+def test_a_model_compared_with_itself_shows_no_difference_and_a_worse_one_does(
+    cascade: CheckContext, small: SimpleNamespace
+) -> None:
+    same = assess_pair({"a": cascade, "b": cascade}).values
+    assert {one["better"] for one in same.values()} == {"no difference shown"} and len(same) == 7
+    worse = small.parts()["model"].double().requires_grad_(False)
+    for parameter in worse.dynamics.parameters():
+        parameter.add_(0.5)
+    found = assess_pair({"a": cascade, "b": replace(cascade, model=worse)}).values
+    assert found["f: next states"]["better"] == "a is better" and found["f: next states"]["high"] < 0
+    assert found["g: actions"]["better"] == "no difference shown"  # only f is worse

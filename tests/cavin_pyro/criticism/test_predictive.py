@@ -1,0 +1,178 @@
+"""Does the predictive distribution look like the data: statistics of windows by hand, and of right and wrong models."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from pyro import poutine
+from torch import Tensor
+
+from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.criticism.predictive import assess_predictive, compare, effect_size, replicate
+from cavin_pyro.criticism.pushing import Nearness, statistics_of
+from cavin_pyro.criticism.windows import Outcome, generated, observed, repeated, seeded
+from envs.workspace import normalised_push
+from models.cascaded import CascadedModel
+from models.state import State, Window
+
+NEAR = Nearness(pair=0.05, tool=0.04)
+
+
+def outcome(centers: list[list[list[float]]], pushes: list[list[float]], subgoal: list[list[float]]) -> Outcome:
+    """One window: planar centres before and after each push, pushes (x, y, dx, dy) in metres; and padding."""
+
+    def padded(points: Tensor) -> Tensor:
+        return torch.nn.functional.pad(points, (0, 1, 0, 1))  # height 0, and one object that is not there
+
+    states = padded(torch.tensor([centers]))
+    real = torch.tensor([[True] * len(centers[0]) + [False]])
+    wanted = np.array(pushes)
+    actions = torch.from_numpy(normalised_push(wanted[:, :2], wanted[:, 2:])).float()[None]
+    first = State(states[:, 0], torch.zeros(*real.shape, 4), real)
+    return Outcome(first, actions, states[:, 1:], padded(torch.tensor([subgoal])))
+
+
+def values(made: Outcome, near: Nearness = NEAR) -> dict[str, Tensor]:
+    return {statistic.name: statistic.function(made)[0] for statistic in statistics_of(near)}
+
+
+@pytest.fixture
+def pushed() -> Outcome:
+    """Two objects 0.2 m apart; the first push moves one by 0.06 m, the second misses both by far.
+
+    f lets the second object slip by 0.012 m in the second push; h wants the first 0.16 m further, at the second.
+    """
+    return outcome(
+        centers=[[[0.5, 0.0], [0.7, 0.0]], [[0.56, 0.0], [0.7, 0.0]], [[0.56, 0.0], [0.7, 0.012]]],
+        pushes=[[0.42, 0.0, 0.1, 0.0], [0.5, 0.4, 0.0, 0.1]],
+        subgoal=[[0.66, 0.0], [0.7, 0.0]],
+    )
+
+
+def test_moves_are_of_the_farthest_object_and_of_those_beyond_a_centimetre(pushed: Outcome) -> None:
+    found = values(pushed)
+    assert found["farthest_move_h"].item() == pytest.approx(0.16, abs=1e-6)
+    assert found["farthest_move_f"].item() == pytest.approx(0.06, abs=1e-6)
+    assert (found["moved_objects_h"].item(), found["moved_objects_f"].item()) == (1.0, 2.0)
+
+
+def test_objects_inside_each_other_are_counted_as_pairs(pushed: Outcome) -> None:
+    found = values(pushed)
+    assert (found["close_pairs_h"].item(), found["close_pairs_f"].item()) == (1.0, 0.0)
+    assert values(pushed, Nearness(pair=0.15, tool=0.04))["close_pairs_f"].item() == 1.0
+
+
+def test_pushes_start_where_they_start(pushed: Outcome) -> None:
+    found = values(pushed)
+    aside = math.hypot(0.06, 0.4)  # from (0.5, 0.4) to the first object, which lies at (0.56, 0) by then
+    assert found["start_to_nearest"].tolist() == pytest.approx([0.08, aside], abs=1e-6)
+
+
+def test_a_push_touches_along_its_whole_path() -> None:
+    still = [[[0.6, 0.0]]] * 4
+    passing = [[0.55, 0.039, 0.1, 0.0], [0.55, 0.041, 0.1, 0.0], [0.48, 0.0, 0.07, 0.0]]
+    assert values(outcome(still, passing, still[0]))["touching"].item() == pytest.approx(1 / 3)
+
+
+def test_a_lone_object_is_inside_of_none() -> None:
+    lone = outcome([[[0.6, 0.0]]] * 2, [[0.4, 0.3, 0.1, 0.0]], [[0.6, 0.0]])
+    assert values(lone)["close_pairs_h"].item() == 0.0
+    assert Nearness.of(lone).pair == 0.0
+
+
+def test_nearness_is_what_real_windows_show() -> None:
+    """101 windows whose objects end 0.1 to 0.2 m apart; pushes pass by at 0 to 0.1 m; 51 of them move something."""
+    count, offset = 101, torch.linspace(0.0, 0.1, 101)
+    first = torch.tensor([[0.5, 0.0, 0.0], [0.6, 0.0, 0.0]]).repeat(count, 1, 1)
+    first[:, 1, 0] += offset
+    after = first.clone()
+    after[:51, :, 1] += 0.05
+    start = np.stack([np.full(count, 0.45), offset.numpy()], -1)
+    actions = torch.from_numpy(normalised_push(start, np.tile([0.1, 0.0], (count, 1)))).float()[:, None]
+    state = State(first, torch.zeros(count, 2, 4), torch.ones(count, 2, dtype=torch.bool))
+    near = Nearness.of(Outcome(state, actions, after[:, None], after))
+    assert near.pair == pytest.approx(0.101, abs=1e-6)
+    assert near.tool == pytest.approx(0.1 * 51 / 101, abs=1e-3)
+
+
+@given(
+    points=arrays.arrays(np.float32, (3, 3), elements=st.floats(0.0, 0.75, width=32)),
+    push=arrays.arrays(np.float32, (4,), elements=st.floats(-1.0, 1.0, width=32)),
+    order=st.permutations(range(3)),
+)
+def test_the_order_of_objects_and_their_padding_do_not_matter(
+    points: np.ndarray, push: np.ndarray, order: list[int]
+) -> None:
+    def made(which: list[int], junk: float) -> Outcome:
+        centers = torch.from_numpy(points)[which][None]
+        centers = torch.cat((centers, torch.full((1, 1, 3), junk)), 1)
+        first = State(centers, torch.zeros(1, 4, 4), torch.tensor([[True] * 3 + [False]]))
+        return Outcome(first, torch.from_numpy(push)[None, None], (centers * 1.05)[:, None], centers * 0.9)
+
+    for name, value in values(made([0, 1, 2], 0.0)).items():
+        assert torch.allclose(value, values(made(order, 0.3))[name], atol=1e-6), name
+
+
+def tails(model: CascadedModel, window: Window, part: str) -> dict[str, float]:
+    """Tail probabilities of the means of all statistics that part has to do with, codes from the prior."""
+    chosen = [one for one in statistics_of(Nearness.of(observed(window))) if one.part in (part, "g")]
+    with torch.no_grad(), seeded(5):
+        drawn = replicate(model, window, chosen, replicates=100)
+    return {one.name: compare(drawn[one.name], one.function(observed(window)))["tail"] for one in chosen}
+
+
+@pytest.mark.parametrize("part", ["f", "h"])
+def test_tail_probabilities_of_the_right_model_are_not_extreme(right: SimpleNamespace, part: str) -> None:
+    found = tails(right.model, right.windows[part], part)
+    assert len(found) == 5 and all(0.01 < tail < 0.99 for tail in found.values()), found
+
+
+def test_a_model_whose_objects_move_too_little_is_found(right: SimpleNamespace) -> None:
+    assert tails(right.make(center=0.002), right.windows["f"], "f")["farthest_move_f"] == 0.0
+    section = assess_predictive(right.context(right.make(center=0.002), right.windows["f"]), windows=200, replicates=5)
+    assert section.verdict.level == "bad" and section.number is not None and abs(section.number.mean) > 0.8
+
+
+def test_where_nothing_ever_happens_the_tail_is_a_half_and_the_effect_unknown() -> None:
+    assert compare(torch.zeros(20, 5), torch.zeros(5))["tail"] == 0.5
+    assert math.isnan(effect_size(torch.zeros(20, 5), torch.zeros(5), torch.arange(5)).mean)
+    observed = torch.tensor([0.0, 2.0])
+    assert effect_size(torch.full((3, 2), 2.0), observed, torch.arange(2)).mean == pytest.approx(1 / 2**0.5)
+
+
+def test_copies_add_up_to_as_many_as_asked_for(right: SimpleNamespace) -> None:
+    window = right.windows["f"]
+    batches = list(repeated(window, 25))
+    assert sum(count for count, _ in batches) == 25
+    assert all(torch.equal(copies.actions[-len(window.actions) :], window.actions) for _, copies in batches)
+
+
+def test_means_leave_only_the_codes_to_chance(right: SimpleNamespace) -> None:
+    codes = ("effect_code", "motion_code")
+    fixed = poutine.condition(right.model, dict.fromkeys(codes, torch.zeros(2)))
+    with torch.no_grad(), seeded(6):
+        first, second = (generated(right.model, right.windows["f"], means=codes) for _ in range(2))
+        same = [generated(fixed, right.windows["f"], means=codes) for _ in range(2)]
+    assert not torch.equal(first.steps, second.steps)
+    assert torch.equal(same[0].steps, same[1].steps) and torch.equal(same[0].actions, same[1].actions)
+
+
+def test_all_parts_of_a_model_are_compared_and_repeatable(right: SimpleNamespace) -> None:
+    context = right.context(right.model, right.windows["h"])
+    context = replace(context, selection=WindowConfig(minimum_move=0.025, maximum_move=0.375))
+    section = assess_predictive(context, windows=30, replicates=4)
+    statistics = section.values["statistics"]
+    assert len(statistics) == len(section.findings) == 8 and section.figure is not None
+    assert set(statistics["touching"]) == {"observed", "prior_means", "prior", "guide_means", "guide", "effect"}
+    assert "moved more than 0.025 m" in section.explanation and "more than 0.375 m" in section.explanation
+    assert str(assess_predictive(context, windows=30, replicates=4).values) == str(section.values)
+    statistics = assess_predictive(right.dynamics, windows=30, replicates=4).values["statistics"]
+    assert set(statistics) == {"farthest_move_f", "moved_objects_f", "close_pairs_f"}
