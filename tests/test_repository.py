@@ -119,7 +119,7 @@ def test_every_dependency_is_locked_at_the_version_that_the_project_names() -> N
 def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
     # What an optional extra brings is imported only on request: tests/cavin_pyro/visualization/test_recording.py.
     extras = PROJECT["project"]["optional-dependencies"]
-    optional = [one for name in ("assets", "viewer", "export", "minari", "ray") for one in extras[name]]
+    optional = [one for name in ("assets", "viewer", "graph", "minari", "ray") for one in extras[name]]
     declared = pins(PROJECT["project"]["dependencies"] + optional)
     known = {*sys.stdlib_module_names, *PACKAGES}
     strangers = [

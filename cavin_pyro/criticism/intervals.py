@@ -47,8 +47,8 @@ EXPLANATION = (
     "state before it; h the state after the segment, with codes from the prior (its mixture p(s' | s) over p(c | s), "
     "what can be known before acting) or from the guide, which knows the result; g the pushes. Objects that moved more "
     "than 1 cm are shown apart, and no verdict rests on them: that group is chosen by the truth, so that a right model "
-    "need not cover 90 % of it. The stated scale is the spread of the samples; the RMS error of their mean is the right "
-    "one. Scales are the weights of the loss: one four times too wide weighs its term sixteen times too little."
+    "need not cover 90 % of it. The stated scale is the spread of the samples, the RMS error of their mean what is "
+    "right. Scales are the weights of the loss: one four times too wide weighs its term sixteen times too little."
 )
 
 

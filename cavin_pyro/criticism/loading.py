@@ -150,7 +150,7 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     """
     records, entries = content_records(folder), trained.get("data")
     entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
-    known = {entry.get("fingerprint") for entry in entries}
+    known = {entry["fingerprint"] for entry in entries if "fingerprint" in entry}
     seen = [record["fingerprint"] in known for record in records]
     if not known:
         same, verdict = None, "the checkpoint does not say what it was trained on"

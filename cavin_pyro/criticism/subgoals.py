@@ -140,8 +140,8 @@ def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> dict[str, Any]:
     wanted = way > MOVING
     left = Interval(math.nan, math.nan, math.nan)
     if wanted.any():
-        totals = (torch.from_numpy((lengths * wanted).sum(-1)) for lengths in (end, way))
-        left = ratio_interval(*totals, torch.arange(len(finished)), seed=seed)
+        remaining, whole = (torch.from_numpy((lengths * wanted).sum(-1)) for lengths in (end, way))
+        left = ratio_interval(remaining, whole, torch.arange(len(finished)), seed=seed)
     return numbers | {
         "wanted": _mean(way[wanted]),
         "from_subgoal": _mean(end[wanted]),
