@@ -1,13 +1,12 @@
 """The tiles of a layout and objects' places in colour pictures for people; never in the depth image or in the mask.
 
-A `Paint` colours the pixels of a rendered picture that show the table's top. What it paints is no body of the
-simulator: nothing can touch it, it is not in the depth image, and objects occlude it.
+Markings colour the pixels of a rendered picture that show the table's top. They are no body of the simulator: nothing
+can touch them, they are not in the depth image, and objects occlude them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -37,32 +36,8 @@ class TileGroup(NamedTuple):
     tiles: tuple[Tile, ...]
 
 
-@dataclass(frozen=True)
-class Paint:
-    """What a camera sees of markings on the table's top, where nothing lies on it.
-
-    Attributes:
-        rows, columns: [P] pixels with a marking, among those that look at the table's top.
-        camera_height: metres. falls: [P] metres that a pixel's ray falls per metre of depth.
-        kept: [P, 1] share of the picture's colour that stays. added: [P, 3] what is added to it, 0 to 255.
-    """
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    camera_height: float
-    falls: NDArray[np.float64]
-    kept: NDArray[np.float64]
-    added: NDArray[np.float64]
-
-    def on(self, rendering: Rendering, objects: Sequence[int]) -> NDArray[np.uint8]:
-        """A copy of the rendered picture [height, width, 3] with the markings that no body of `objects` hides."""
-        where = self.rows, self.columns
-        height = self.camera_height - rendering.depth[where] * self.falls
-        seen = np.flatnonzero((np.abs(height) < LEVEL) & ~np.isin(rendering.bodies[where], objects))
-        where = self.rows[seen], self.columns[seen]
-        painted = rendering.color.copy()
-        painted[where] = np.rint(self.kept[seen] * painted[where] + self.added[seen]).astype(np.uint8)
-        return painted
+Paint = Callable[[Rendering, Sequence[int]], NDArray[np.uint8]]
+"""A copy of a rendered picture [height, width, 3] with the markings that no body of the given objects hides."""
 
 
 @lru_cache(maxsize=8)  # a film has a hundred pictures by one camera
@@ -72,7 +47,7 @@ def paint_of(
     places: tuple[Place, ...] = (),
     colors: tuple[tuple[float, float, float], ...] = (),
 ) -> Paint:
-    """Groups of tiles, and over them a disc at each object's place.
+    """Paint groups of tiles, and over them a disc at each object's place.
 
     Args:
         places: centres of the discs. colors: of each disc, red, green and blue from 0 to 1.
@@ -90,7 +65,17 @@ def paint_of(
         kept = kept * (1.0 - opacity)
         added = added * (1.0 - opacity) + opacity * color
     marked = np.flatnonzero(kept < 1.0)
-    return Paint(rows[marked], columns[marked], camera_height, falls[marked], kept[marked], added[marked])
+    rows, columns, falls, kept, added = (part[marked] for part in (rows, columns, falls, kept, added))
+
+    def paint(rendering: Rendering, objects: Sequence[int]) -> NDArray[np.uint8]:
+        height = camera_height - rendering.depth[rows, columns] * falls
+        seen = np.flatnonzero((np.abs(height) < LEVEL) & ~np.isin(rendering.bodies[rows, columns], objects))
+        where = rows[seen], columns[seen]
+        painted = rendering.color.copy()
+        painted[where] = np.rint(kept[seen] * painted[where] + added[seen]).astype(np.uint8)
+        return painted
+
+    return paint
 
 
 Opacity = tuple[NDArray[np.float64], NDArray[np.float64]]

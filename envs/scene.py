@@ -243,7 +243,7 @@ class Scene:
         if not self.markings and not self.places:
             return rendering.color
         places = tuple((float(x), float(y)) for x, y in self.places)
-        return paint_of(camera, tuple(self.markings), places, COLORS).on(rendering, self.bodies)
+        return paint_of(camera, tuple(self.markings), places, COLORS)(rendering, self.bodies)
 
     def ground_truth(self) -> Poses:
         """True poses of the objects; for physics and tests, never for a planner."""

@@ -97,13 +97,11 @@ class EpisodeRecording(EpisodeCallback):
         self._seconds += PAUSE
 
     def on_frame(self) -> None:
-        """Log poses."""
         self._stream.set_time(TIMELINE, duration=self._seconds)
         self._log_poses()
         self._seconds += 1.0 / FRAMES_PER_SECOND
 
     def on_end(self, episode: Episode) -> None:
-        """Log the outcome."""
         self._stream.set_time(TIMELINE, duration=self._seconds)
         self._log_photograph(episode.photograph)
         level = rr.TextLogLevel.INFO if episode.outcome == "success" else rr.TextLogLevel.ERROR

@@ -48,15 +48,12 @@ class EpisodeProgress(EpisodeCallback):
         self._planned: PlanRecord | None = None  # a plan whose first push is not made yet
 
     def on_observation(self, observation: ObservationDict) -> None:
-        """Start the clock."""
         self._began = self._began or time.perf_counter()
 
     def on_plan(self, record: PlanRecord) -> None:
-        """Keep the plan for the line of its first push."""
         self._planned = record
 
     def on_transition(self, transition: Transition) -> None:
-        """Print the push."""
         assert self._began is not None
         left, rest = self.maximum_steps - transition.step, "the last"
         if left and not (transition.success or transition.violation or transition.fall):

@@ -79,7 +79,6 @@ class EpisodeVideo(EpisodeCallback):
             self._overlay = None
 
     def on_frame(self) -> None:
-        """Append a photograph."""
         self._add(self._scene.photograph(self.camera), "pushing")
 
     def on_end(self, episode: Episode) -> None:
