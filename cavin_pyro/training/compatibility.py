@@ -48,14 +48,15 @@ def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> N
         )
     for code, site in found.items():
         theirs = wanted[code]
-        missing = _plates(theirs) - _plates(site)
-        if missing:
+        plates, given = ({frame.name for frame in one["cond_indep_stack"]} for one in (theirs, site))
+        if missing := plates - given:
             raise UserError(
                 f"{name} samples {code} outside of the plate {', '.join(sorted(missing))}: use windows_plate"
             )
-        if _shape(site) != _shape(theirs):
+        shape, wanted_shape = (f"{[*one['fn'].batch_shape]} {[*one['fn'].event_shape]}" for one in (site, theirs))
+        if shape != wanted_shape:
             raise UserError(
-                f"{name} samples {code} with batch and event shape {_shape(site)}, the model's is {_shape(theirs)}: "
+                f"{name} samples {code} with batch and event shape {shape}, the model's is {wanted_shape}: "
                 "the code's numbers are the event, see to_event(1)"
             )
         if ((site["log_prob"] != 0) & (theirs["log_prob"] == 0)).any():
@@ -68,14 +69,6 @@ def _codes(program: nn.Module, window: Window) -> Sites:
     trace.compute_log_prob()
     sites: Sites = {name: trace.nodes[name] for name in trace.stochastic_nodes}
     return {name: site for name, site in sites.items() if not site_is_subsample(site)}
-
-
-def _plates(site: Site) -> set[str]:
-    return {frame.name for frame in site["cond_indep_stack"]}
-
-
-def _shape(site: Site) -> str:
-    return f"{[*site['fn'].batch_shape]} {[*site['fn'].event_shape]}"
 
 
 def _listed(sites: Sites) -> str:

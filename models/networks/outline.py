@@ -110,12 +110,6 @@ def mean_extent(features: Tensor) -> Tensor:
     return OUTLINE_UNIT * (OUTLINE_MEAN + OUTLINE_SPREAD * scaled)
 
 
-def outline_values(features: Tensor) -> Tensor:
-    """`features: [..., 64]` -> `[..., 63]`: series of three outlines and heights, in units of 0.05 m."""
-    values = standard_values(features.movedim(-1, 0)).movedim(0, -1)
-    return TYPICAL.to(features) + SPREAD.to(features) * values
-
-
 def turned(outlines: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
     """Outlines in axes that are turned by an angle, components first, so that loops run over candidates.
 

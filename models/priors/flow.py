@@ -2,44 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pyro import distributions
 from pyro.distributions import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 
 from models.networks.flows import CodeFlow
-from models.priors.prior import SceneContext
+from models.priors.prior import LearnedPrior
 from models.state import State
 
 
-class FlowPrior(nn.Module):
+class FlowPrior(LearnedPrior):
     """Normalizing flow p(c | s) or p(z | s, c): N(0, I) through couplings conditioned on s and c.
 
     It is initialised to N(0, I), the paper's prior. Divergences from a flow have no closed form:
     `TraceMeanField_ELBO` uses the one-sample estimate of `Trace_ELBO`.
     """
 
-    def __init__(
-        self,
-        *,
-        dimension: int = 16,
-        feature_dimension: int = 64,
-        effect_dimension: int | None = None,
-        width: int = 32,
-        transforms: int = 4,
-    ) -> None:
-        """The layers.
-
-        Args:
-            dimension: of the code.
-            feature_dimension: F of the states.
-            effect_dimension: C for p(z | s, c), None for p(c | s).
-            width: width of all layers.
-            transforms: number of couplings of the flow.
-        """
-        super().__init__()
-        self.dimension = dimension
-        self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)
-        self.flow = CodeFlow(dimension, width, width=width, transforms=transforms)
+    def __init__(self, *, width: int = 32, transforms: int = 4, **shared: Any) -> None:
+        """`transforms`: number of couplings of the flow. `shared`: the arguments of `LearnedPrior`."""
+        super().__init__(width=width, **shared)
+        self.flow = CodeFlow(self.dimension, width, width=width, transforms=transforms)
 
     def forward(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
         """`state: [...]`, `effect_code: [..., C]` for motions -> batch `[...]`, event `[dimension]`."""

@@ -12,14 +12,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.networks.layers import SCALE_FLOOR
-from models.priors.prior import SceneContext
+from models.priors.prior import LearnedPrior
 from models.state import State
 
 SYMMETRY_BREAKING = 1e-3  # standard deviation of the head's first weights: equal components would stay equal
 LEAST_QUANTILE = 1e-6  # of a component's noise, so that it stays finite
 
 
-class ObjectMixturePrior(nn.Module):
+class ObjectMixturePrior(LearnedPrior):
     """Mixture of diagonal Gaussians p(c | s) or p(z | s, c), some components for each object.
 
     i ~ Categorical(weights(s, c))          # object and component, real objects only
@@ -31,33 +31,15 @@ class ObjectMixturePrior(nn.Module):
     `TraceMeanField_ELBO` uses the one-sample estimate of `Trace_ELBO`.
     """
 
-    def __init__(
-        self,
-        *,
-        dimension: int = 16,
-        feature_dimension: int = 64,
-        effect_dimension: int | None = None,
-        width: int = 32,
-        components: int = 4,
-    ) -> None:
-        """The layers.
+    def __init__(self, *, width: int = 32, components: int = 4, **shared: Any) -> None:
+        """`components`: number of Gaussians per object. `shared`: the arguments of `LearnedPrior`.
 
-        Args:
-            dimension: of the code.
-            feature_dimension: F of the states.
-            effect_dimension: C for p(z | s, c), None for p(c | s).
-            width: width of all layers.
-            components: number of Gaussians per object.
-
-        Raises:
-            ValueError: fewer than one component.
+        Raises `ValueError` for fewer than one component.
         """
-        super().__init__()
         if components < 1:
             raise ValueError(f"components must be at least 1, not {components}")
-        self.dimension = dimension
-        self.components = components
-        self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)
+        super().__init__(width=width, **shared)
+        dimension, self.components = self.dimension, components
         self.own = nn.Linear(width, width)
         self.head = nn.Linear(width, components * (1 + 2 * dimension))
         nn.init.normal_(self.head.weight, std=SYMMETRY_BREAKING)

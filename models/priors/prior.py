@@ -61,3 +61,25 @@ class SceneContext(nn.Module):
             raise ValueError(f"this prior {wanted}: effect_dimension says whether it is p(z | s, c) or p(c | s)")
         objects = self.objects(hidden.relu_()) * state.mask.unsqueeze(-1)
         return objects, self.scene(objects.sum(-2))
+
+
+class LearnedPrior(nn.Module):
+    """Base class of learned priors.
+
+    Args:
+        dimension: of the code. feature_dimension: F of the states.
+        effect_dimension: C for p(z | s, c), None for p(c | s).
+        width: width of all layers.
+    """
+
+    def __init__(
+        self,
+        *,
+        dimension: int = 16,
+        feature_dimension: int = 64,
+        effect_dimension: int | None = None,
+        width: int = 32,
+    ) -> None:
+        super().__init__()
+        self.dimension = dimension
+        self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)

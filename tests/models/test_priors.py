@@ -172,26 +172,3 @@ def test_padding_is_never_chosen_and_no_objects_give_numbers(random_state: Calla
     assert empty.log_prob(torch.zeros(3, 2)).isfinite().all() and empty.sample().isfinite().all()
     with pytest.raises(ValueError, match="components must be at least 1, not 0"):
         ObjectMixturePrior(components=0)
-
-
-def test_codes_at_one_object_or_another_are_told_from_those_between(random_state: Callable[..., State]) -> None:
-    """One Gaussian covers what lies between two objects; the mixture does not."""
-
-    def codes(state: State) -> Tensor:
-        chosen = torch.randint(2, (len(state.mask), 1, 1)).expand(-1, 1, 2)
-        return 10 * state.centers[..., :2].gather(1, chosen).squeeze(1) + 0.05 * torch.randn(len(state.mask), 2)
-
-    torch.manual_seed(0)
-    held_out, densities = random_state(512, objects=2, real=2), {}
-    for kind in (ConditionalPrior, ObjectMixturePrior):
-        torch.manual_seed(1)
-        prior = kind(dimension=2, feature_dimension=6, width=16)
-        optimizer = torch.optim.Adam(prior.parameters(), 1e-2)
-        for _ in range(200):
-            state = random_state(128, objects=2, real=2)
-            optimizer.zero_grad()
-            (-prior(state).log_prob(codes(state))).mean().backward()
-            optimizer.step()
-        torch.manual_seed(2)
-        densities[kind] = prior(held_out).log_prob(codes(held_out)).mean().item()
-    assert densities[ObjectMixturePrior] > densities[ConditionalPrior] + 0.5

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import pyro
 import pytest
 import torch
 from hypothesis import given, settings
@@ -23,7 +22,7 @@ from models.networks.contact.dynamics import ContactDynamics
 from models.networks.outline import Outline
 from models.priors.standard import StandardPrior
 from models.single_latent import SingleLatentModel
-from models.state import State, Window, stack_steps
+from models.state import State, Window
 
 SIZES = {"feature_dimension": 6, "width": 8}
 TRANSITIONS = {"next_centers": (4, 3, 4, 3), "next_features": (4, 3, 4, 6)}
@@ -171,13 +170,6 @@ def test_planning_broadcasts_and_ignores_the_order_of_objects(
         assert torch.allclose(many[name], repeated, atol=1e-12)
 
 
-def test_a_code_that_a_model_lacks_is_never_read(random_state: Callable[..., State]) -> None:
-    state, z, other = random_state(2), torch.randn(2, 32), torch.full((2, 7), math.nan)
-    flat, single = FlatModel(**SIZES), SingleLatentModel(**SIZES)
-    assert torch.equal(flat.actions(state, effect_code=other, motion_code=z), flat.actions(state, motion_code=z))
-    assert torch.equal(single.actions(state, z, motion_code=other), single.actions(state, effect_code=z))
-
-
 def test_counterparts_of_the_baselines_are_the_networks_of_the_cascade() -> None:
     """Same layers, but for the width of a code and what nothing reads any more."""
 
@@ -212,14 +204,6 @@ def test_a_weight_of_actions_is_positive(weight: float) -> None:
         SingleLatentModel(action_weight=weight, **SIZES)
 
 
-def test_parameters_are_registered_unless_they_are_module_local(random_window: Callable[..., Window]) -> None:
-    for local in (False, True):
-        with pyro.settings.context(module_local_params=local):
-            registered = poutine.trace(DynamicsModel(**SIZES)).get_trace(random_window()).param_nodes
-        assert bool(registered) != local
-    pyro.clear_param_store()
-
-
 def contact_model(scales: LikelihoodScales) -> tuple[CascadedModel, Window]:
     """With an f that predicts scales, which it needs for `PredictedScales` alone."""
     torch.manual_seed(0)
@@ -244,18 +228,3 @@ def test_f_is_scored_by_students_t_with_its_own_scales_or_by_fixed_ones(scales: 
     trace(model, seen, generate=True)
     with pytest.raises(ValueError, match="scales=predicted needs an f that predicts them"):
         CascadedModel(scales=PredictedScales(), **SIZES)
-
-
-def test_states_and_windows_are_indexed_stacked_and_repeated(
-    random_state: Callable[..., State], random_window: Callable[..., Window]
-) -> None:
-    state, window = random_state(5, 4), random_window(batch=4, steps=3)
-    assert torch.equal(state.step(-1).centers, state.centers[:, -1])
-    assert torch.equal(state.scene(torch.tensor([0, 3])).mask, state.mask[[0, 3]])
-    for field, original in zip(stack_steps([state.step(step) for step in range(4)]), state, strict=True):
-        assert torch.equal(field, original)
-    plans = state.expand_plans(3)
-    assert plans.batch_shape == (5, 4, 3)
-    assert plans.centers.untyped_storage().data_ptr() == state.centers.untyped_storage().data_ptr()
-    assert (window.batch_shape, window.segment_length) == ((4,), 3)
-    assert torch.equal(window.last.centers, window.states.centers[:, 3])

@@ -73,7 +73,7 @@ class Rows:
         both, ways = firsts & seconds, [seconds, firsts]  # whether the other one counts, one way and the other
         if near is not None:
             orders = (first, second), (second, first)
-            ways = [way & of_each_pair(near, *order).flatten(1) for way, order in zip(ways, orders, strict=True)]
+            ways = [way & near[order].flatten(1) for way, order in zip(ways, orders, strict=True)]
             both &= ways[0] | ways[1]
         if self._every:
             found = torch.arange(both.numel(), device=both.device)
@@ -126,11 +126,6 @@ def near_pairs(place: Tensor, real: Tensor, most: int | None) -> Tensor | None:
     if most is None or len(real) - 1 <= most:
         return None
     return nearest_pairs(place.movedim((0, 1), (-1, -2)), real.movedim(0, -1), most).movedim((-2, -1), (0, 1))
-
-
-def of_each_pair(near: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """`near: [M, M, ...]`, numbers `[P]` of objects -> `[P, ...]`."""
-    return near.flatten(0, 1).index_select(0, len(near) * first + second)
 
 
 def _rounded_up(numbers: Tensor) -> Tensor:

@@ -18,7 +18,6 @@ from models.networks.dynamics import (
     SUBGOAL_RANGE,
     ActionGenerator,
     Dynamics,
-    EffectTrunk,
     MetaDynamics,
     StateChange,
 )
@@ -113,15 +112,6 @@ def test_an_object_alone_has_no_relations_and_other_features_are_refused(random_
     assert not small_encoder()(double(random_state(2, objects=1)))[..., 16:].any()
     with pytest.raises(ValueError, match="features have 7 numbers per object; this model expects 6"):
         small_encoder()(random_state(features=7))
-
-
-def test_a_trunk_is_a_linear_layer_on_state_and_repeated_context() -> None:
-    trunk = EffectTrunk(4, width=8, encoder_width=8).double()
-    encoded, context = torch.randn(2, 3, 24, dtype=torch.float64), torch.randn(2, 4, dtype=torch.float64)
-    repeated = trunk.context(context).unsqueeze(1).expand(2, 3, 8)
-    weight = torch.cat([trunk.from_state.weight, trunk.from_context.weight], 1)
-    hidden = (torch.cat([encoded, repeated], -1) @ weight.T + trunk.from_state.bias).relu()
-    assert torch.allclose(trunk(encoded, context), trunk.second(hidden), atol=1e-12)
 
 
 @pytest.mark.parametrize("maximum", [PUSH_RANGE, SUBGOAL_RANGE])

@@ -13,12 +13,12 @@ from models.networks.outline import (
     PER_OUTLINE,
     Outline,
     multiples,
-    outline_values,
     standard_features,
     standard_values,
     supports,
     turned,
 )
+from tests.models.networks.contact.by_hand import outline_values
 
 SERIES = OUTLINES * PER_OUTLINE
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
 from models.networks.contact.geometry import CORNER, DISPLACEMENT_UNIT, PUSH_UNIT, REACH_HIGH, REACH_LOW, TOOL_RADIUS
@@ -22,11 +23,18 @@ from models.networks.outline import (
     SPREAD,
     STANDARD_UNIT,
     TYPICAL,
+    standard_values,
 )
 
 Numbers = NDArray[np.float64]
 SHAPE = OUTLINES * PER_OUTLINE
 ORDERS = np.arange(1, PER_OUTLINE // 2 + 1)
+
+
+def outline_values(features: Tensor) -> Tensor:
+    """`features: [..., 64]` -> `[..., 63]`: series of three outlines and heights, in units of 0.05 m."""
+    values = standard_values(features.movedim(-1, 0)).movedim(0, -1)
+    return TYPICAL.to(features) + SPREAD.to(features) * values
 
 
 def reach(outline: Numbers, angle: float) -> float:

@@ -26,12 +26,11 @@ from models.networks.contact.geometry import (
     TOOL_RADIUS,
     ToolContact,
     endpoints,
-    in_reach,
     pair_contact,
 )
 from models.networks.contact.rows import Rows
 from models.networks.layers import fixed_shapes
-from models.networks.outline import DIRECTIONS, PER_OUTLINE, Outline, mean_extent, outline_values
+from models.networks.outline import DIRECTIONS, PER_OUTLINE, Outline, mean_extent
 from models.state import State
 from tests.models.networks.contact import by_hand
 
@@ -186,16 +185,6 @@ def test_pairs_are_those_of_objects_that_count(every: bool, near: Tensor | None)
     }
 
 
-def test_few_numbers_of_rows_and_of_pairs_occur() -> None:
-    sizes = set()
-    for number in range(100):
-        torch.manual_seed(number)
-        rows = Rows(torch.rand(3, 200) < number / 100)
-        pairs = rows.pairs(None)
-        sizes.add((len(rows.of_objects(torch.zeros(1, 3, 200))[0]), 0 if pairs is None else len(pairs.first)))
-    assert len(sizes) < 40
-
-
 @settings(max_examples=10, deadline=None)
 @given(batch=st.lists(st.integers(1, 3), min_size=1, max_size=3), margin=st.sampled_from([None, MARGIN]))
 def test_order_padding_and_leading_dimensions(batch: list[int], margin: float | None) -> None:
@@ -268,17 +257,6 @@ def test_predictions_are_within_range_and_a_push_of_no_length_gives_numbers() ->
         ContactDynamics(reach_margin=-0.01)
 
 
-@pytest.mark.parametrize(
-    ("along", "across", "reached"),
-    [(0.05, 0.049, True), (0.05, 0.051, False), (-0.049, 0.0, True), (-0.051, 0.0, False), (0.151, 0.0, False)],
-)
-def test_an_object_is_reached_within_its_radius_the_tools_and_the_margin(
-    along: float, across: float, reached: bool
-) -> None:
-    values = (torch.tensor([value]) for value in (along, across, 0.1, 0.03))
-    assert in_reach(*values, MARGIN).tolist() == [reached]
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1.5, 1.5), min_size=4, max_size=4))
 def test_pushes_start_and_stop_where_the_robot_starts_and_stops(action: list[float]) -> None:
@@ -294,7 +272,7 @@ def discs(*radii: float) -> Tensor:
     ring = torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
     features = Outline()(torch.tensor(radii)[:, None, None] * ring)
     assert mean_extent(features).tolist() == pytest.approx(radii, abs=1e-4)
-    return outline_values(features)[..., :PER_OUTLINE].T
+    return by_hand.outline_values(features)[..., :PER_OUTLINE].T
 
 
 def test_where_the_tool_meets_a_disc_is_where_geometry_says() -> None:
