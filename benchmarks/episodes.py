@@ -96,9 +96,6 @@ FARTHER = [
 LEFT_OUT = {  # an addition, and the options without it
     "all": (),
     "one push per plan": ("pushes_per_plan=null",),
-    "warm start": ("planner.warm_start=false",),
-    "idle pushes last": ("planner.idle_distance=0",),
-    "uncertain outcomes": ("planner.robustness.outcome_noise=0",),
     "perturbed rollouts": ("planner.robustness=null",),
     "failure avoidance": ("planner.avoid_failures=false",),
     "margin": ("margin=0",),

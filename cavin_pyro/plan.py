@@ -13,13 +13,12 @@ def main(config: DictConfig) -> None:
     import copy
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.evaluation.factory import announce_objects, announce_waiting, make_runner
+    from cavin_pyro.evaluation.factory import announce_objects, make_runner
     from cavin_pyro.evaluation.statistics import plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
     from cavin_pyro.visualization.rendering import check_goal, check_viewer, episode_files, render_episode, write_goal
-    from planning.searching import SearchingPlanner
 
     config.device = choose_device(config.device).type
     check_viewer(config.viewer)
@@ -28,14 +27,12 @@ def main(config: DictConfig) -> None:
         check_same_run(folder, config, ignore=("output", "video", "viewer", "save_goal", "planner.compile"))
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
-        announce_waiting(config)
         announce_objects(config)
         row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
         if config.save_goal is not None:
             write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
-        native = isinstance(runner.planner, SearchingPlanner) and runner.planner.backend.native
-        write_json(folder / "results.json", {**row, "native_code": native, "provenance": provenance()})
+        write_json(folder / "results.json", {**row, "provenance": provenance()})
         print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)

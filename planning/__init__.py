@@ -1,20 +1,13 @@
 """Planners over a learned model and a reward, for many environments at once.
 
-`planning/cavin.py` is Algorithm 1. The subpackages: `rollouts` (candidates, segment by segment), `optimizers` (which
-search candidates), `extensions` (our additions), `baselines` (the planners that the paper compares with) and `backends`
-(which run the inner functions).
+`cavin` is Algorithm 1 of the paper, `baselines` has the planners that it compares with, `additions` what we add. All
+search candidates (`rollout`, `returns`) with one of the `optimizers`; `protocol` says what a model and a reward offer.
 """
 
-from planning.baselines.cavin_without_effects import CavinWithoutEffectsPlanner
-from planning.baselines.cvae_mpc import CvaeMpcPlanner
-from planning.baselines.mpc import MpcPlanner
-from planning.baselines.proposals import PushBox
-from planning.baselines.random_pushes import RandomPlanner
-from planning.baselines.sectar import SectarPlanner
+from planning.additions.perturbed_rollouts import PerturbedRollouts
+from planning.baselines import CavinWithoutEffectsPlanner, CvaeMpcPlanner, MpcPlanner, RandomPlanner, SectarPlanner
 from planning.cavin import MOTION_HORIZONS, CavinPlanner
-from planning.extensions.perturbed_rollouts import PerturbedRollouts
-from planning.plan import Plan
-from planning.protocol import Outcome, Planner, PlanningModel, RewardFunction
+from planning.protocol import Outcome, Plan, Planner, PlanningModel, RewardFunction
 
 __all__ = [
     "MOTION_HORIZONS",
@@ -27,7 +20,6 @@ __all__ = [
     "Plan",
     "Planner",
     "PlanningModel",
-    "PushBox",
     "RandomPlanner",
     "RewardFunction",
     "SectarPlanner",

@@ -10,25 +10,19 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning.backends.chunking import chunked
-from planning.extensions.effect_retries import try_other_effects
-from planning.extensions.failure_avoidance import AvoidFailures, prefer_no_failure
-from planning.extensions.guidance import guided_tracking
-from planning.extensions.nearest_objects import NearestObjects, nearest_objects
-from planning.extensions.perturbed_rollouts import PerturbedRollouts
-from planning.extensions.sequential_halving import most_robust
-from planning.extensions.touchdown import ObservedPoints
-from planning.inputs import check_choice, check_positive, check_weight
+from planning.additions.effect_retries import try_other_effects
+from planning.additions.failure_avoidance import AvoidFailures, prefer_no_failure
+from planning.additions.guidance import guided_tracking
+from planning.additions.nearest_objects import NearestObjects, nearest_objects
+from planning.additions.perturbed_rollouts import PerturbedRollouts, most_robust
+from planning.additions.touchdown import ObservedPoints
+from planning.checks import check_choice, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
-from planning.plan import Plan
-from planning.protocol import EffectModel, ModelRequirements, PlanningModel, RewardFunction, goal_objects
-from planning.rollouts.candidates import Candidates
-from planning.rollouts.dynamics import predict_states
-from planning.rollouts.ranking import AUTO, END, FIRST_PUSH, SubgoalDistance, best_of
-from planning.rollouts.returns import interpolate
-from planning.rollouts.sampling import sample_codes
-from planning.rollouts.segment import Objective, SegmentRollout, actions_of, select_segment
-from planning.searching import SearchingPlanner, summary
+from planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, RewardFunction, goal_objects
+from planning.returns import AUTO, END, FIRST_PUSH, SubgoalDistance, best_of, interpolate
+from planning.rollout import Candidates, Objective, SegmentRollout, actions_of, predict_states, select_segment
+from planning.sampling import sample_codes
+from planning.searching import SearchingPlanner, chunked, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
 # Motions are all sampled for one effect, so few candidates suffice.
@@ -44,17 +38,9 @@ class CavinPlanner(SearchingPlanner):
     model: h, g, f and their priors.
     reward: the task.
     samples: N, at line 5, and in the paper also at line 8.
-    horizon: H steps, a multiple of the model's T.
-    optimizer: searches codes at both levels: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
-        `planning.optimizers.Optimizer`.
     motion_samples: how many motions to sample at line 8: N in the paper; None takes half of N, and 1 leaves nothing to
         choose at line 10.
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
-    reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the subgoals (published
-        implementation).
-    stride_limits: two distances in metres; a subgoal that moves every object less than the first, or any object more
-        than the second, ends the plan like a violation (0.1 and 0.3 in the published implementation); None in the
-        paper.
     motion_horizon: `full_horizon` plans motions for all K segments and compares them with all K subgoals (paper);
         `first_segment` plans and compares only the executed segment (published implementation).
     feature_weight: square metres per squared unit of feature distance, in "closest to the subgoals"; 0 compares
@@ -67,19 +53,9 @@ class CavinPlanner(SearchingPlanner):
         nearest to it, this many in all; None plans for all objects (paper).
     effect_retries: our addition to line 7: how often another effect is tried where no motion moves anything; 0 in the
         paper.
-    warm_start: our addition to line 5: the last plan's noise is among the candidates of `shooting`, `evolution` and
-        `smc`; the other optimizers do not read it.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
-    idle_distance: metres; our addition to line 11: pushes that, according to f, move no object by this distance come
-        last; 0 keeps g's order (paper).
-    touchdown_distance: metres; our addition to line 10: motions whose first push starts nearer to a point that the
-        camera sees are left out, as far as the caller gives such points; 0 in the paper.
-    guidance: our addition to lines 7 and 10: `layout` prefers, among plans that miss the goal, those that leave the
-        shortest way to it along allowed places; `none` in the paper.
-    compile: true runs the inner functions as native code, which takes minutes once and is cached on disk; `auto` loads
-        what is cached and runs the rest eagerly; `cuda_graphs` captures them on the GPU where the model is. All sample
-        noise, from which codes follow, as a warm start does.
+    options: of `planning.searching.SearchingPlanner`, whose optimizer searches codes at both levels.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer`,
     `reward_at` or `tracking_at`, limits out of order, and a weight or a distance that is negative or not finite.
@@ -141,14 +117,12 @@ class CavinPlanner(SearchingPlanner):
         self,
         state: State,
         generators: Sequence[torch.Generator],
-        previous: Plan | None = None,
         observed: ObservedPoints | None = None,
     ) -> Plan:
         """Algorithm 1 for observed scenes `state: [B]`; the call advances `generators`, one per environment.
 
-        `previous`: the last plans of the same episodes, whose first pushes have been executed, for the warm start.
         `observed`: points of the objects that the camera sees, where no push may touch down. An environment's plan
-        depends on its own arguments only. For errors see `planning.backends.chunking.chunked`.
+        depends on its own arguments only. For errors see `planning.searching.chunked`.
         """
         # Line 1 (K = H / T) is in the constructor. Lines 2, 3 and 12, the loop over t, are the caller's.
         # Line 4: receive the new s_t from the environment.
@@ -156,7 +130,7 @@ class CavinPlanner(SearchingPlanner):
         near = nearest_objects(s_t, self.nearest_objects, self.reward)
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
-        effects = self.search_by_reward(EffectSpace(self.model), near.of(s_t), generators, previous)
+        effects = self.search_by_reward(EffectSpace(self.model), near.of(s_t), generators)
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
@@ -207,7 +181,6 @@ class CavinPlanner(SearchingPlanner):
             j = most_robust(self.robustness, motions, scores, later_cost, *task)
         chosen = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = chosen.codes[:, 0], chosen.actions[:, 0], chosen.path[:, 0]
-        a_star, path = self.idle_last(a_star, path, s_t, observed)
 
         # Line 11: the caller executes the first T actions, or the first of them.
         return Plan(
@@ -234,7 +207,7 @@ class EffectSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollouts.segment.SearchSpace`."""
+        """See `planning.rollout.SearchSpace`."""
         # Line 5: sample c_k, a segment at a time, since a learned prior p(c | s) depends on the state before it.
         c = sample_codes(self.model.effect_prior, [plans], noise, generators)
         # Line 6: predict the subgoal by equation 2 ...
@@ -259,7 +232,7 @@ class MotionSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollouts.segment.SearchSpace`."""
+        """See `planning.rollout.SearchSpace`."""
         c = select_segment(self.effect_codes, segment).expand(-1, plans.batch_shape[-1], -1)
         # Line 8: sample z_k, a segment at a time, as in line 5.
         z = sample_codes(self.model.motion_prior, [self.near.of(plans), c], noise, generators)

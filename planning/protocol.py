@@ -1,4 +1,4 @@
-"""Protocols of the models, rewards and planners of this package: structural types, not to be inherited.
+"""What models, rewards and planners of this package offer, and a plan. The protocols are structural types.
 
 Letters used in all of `planning`: B environments, N candidates, K segments of T steps each, H = K T steps
 of horizon, M objects (padding included).
@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from models.state import State
-from planning.plan import Plan
 
 
 class DynamicsModel(Protocol):
@@ -36,16 +35,8 @@ class DynamicsModel(Protocol):
 
 
 @runtime_checkable
-class SampledDynamics(Protocol):
-    """Dynamics with a predictive distribution: `planner.robustness.outcomes=sampled`."""
-
-    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
-        """A sample of f(s'' | s, a): `[...]`, which `uniform: [..., M, 2]` in [0, 1) determines."""
-
-
-@runtime_checkable
 class FixedShapes(Protocol):
-    """A model that computes less where shapes of tensors may depend on values, which native code does not allow."""
+    """A model that computes less where shapes of tensors may depend on values, which a CUDA graph does not allow."""
 
     def fixed_shapes(self) -> AbstractContextManager[None]:
         """Within it shapes follow from the shapes of arguments; results are the same up to rounding."""
@@ -125,7 +116,7 @@ class ModelRequirements:
 class Reparameterized(Protocol):
     """A distribution with its own reparameterisation.
 
-    Torch's normal distributions and their transforms do not need it: `planning.rollouts.sampling.reparameterize`.
+    Torch's normal distributions and their transforms do not need it: `planning.sampling.reparameterize`.
     """
 
     def reparameterize(self, noise: Tensor) -> Tensor:
@@ -220,6 +211,47 @@ class GuidingReward(RewardFunction, Protocol):
         """The distance to the goal, the same object in every call."""
 
 
+class Evidence(NamedTuple):
+    """Estimates of planning as inference, and their reliability (`planner.optimizer=smc`).
+
+    Z is the expected exp(return / temperature) of a plan from the prior. With a low effective sample size few plans
+    carry all the weight, and neither Z nor the sample is reliable.
+    """
+
+    log_evidence: Tensor  # [B] float64: the logarithm of the estimate of Z; -inf if every weight was zero
+    temperature: Tensor  # [B] float64: in units of return, after the last segment
+    effective_samples: Tensor  # [B, K] float64: effective sample size after each segment, before resampling
+    particles: Tensor  # [B] int64: the largest possible effective sample size
+
+
+class Plan(NamedTuple):
+    """The chosen plan of every environment, and the candidates (for pictures).
+
+    S is the number of segments with motions: K, or 1 if motions are planned for the first segment only. C and Z are the
+    dimensions of the codes. Fields that a planner lacks are empty: without effect codes K = 0 for these and the
+    subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for its pushes,
+    and no codes, states or candidates.
+    """
+
+    actions: Tensor  # [B, T, 4] the first segment; it, or its first pushes, are executed before the next plan
+    planned_actions: Tensor  # [B, S T, 4] a*, which begins with `actions`
+    effect_codes: Tensor  # [B, K, C] c*
+    motion_codes: Tensor  # [B, S, Z] z*
+    subgoals: State  # [B, K, M, .] chosen subgoals; those after the plan's end repeat the last one
+    segments: Tensor  # [B] int64: segments until the chosen plan ends, 1..K; later ones have no meaning
+    predicted_centers: Tensor  # [B, S T, M, 3] metres, predicted by f after each of the planned actions
+    expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
+    expected_success: Tensor  # [B] bool: the chosen plan reaches the goal
+    # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies; of the nearest objects alone, the
+    # target first, where plans are about these
+    candidate_centers: Tensor
+    candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
+    evidence: Evidence | None = None  # of the search by return; None for optimizers that do not sample by weights
+    # [B] share of the candidates that reach the goal by the model, as far as they were rolled out; None for planners
+    # that predict nothing
+    share_reaching_goal: Tensor | None = None
+
+
 class Planner(Protocol):
     """Turns observed states into pushes."""
 
@@ -227,15 +259,12 @@ class Planner(Protocol):
     def segment_length(self) -> int:
         """T, the number of pushes in a plan's `actions`."""
 
-    def plan(self, state: State, generators: Sequence[torch.Generator], previous: Plan | None = None) -> Plan:
-        """Plan for the scenes `state: [B]`, each with its own generator.
-
-        `previous`: the plans whose `actions`, or the first of them, have just been executed, for the warm start.
-        """
+    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+        """Plan for the scenes `state: [B]`, each with its own generator."""
 
 
 @runtime_checkable
 class ObservingPlanner(Planner, Protocol):
-    """A planner whose method `plan` also takes what the camera sees: `planning.extensions.touchdown.ObservedPoints`."""
+    """A planner whose method `plan` also takes what the camera sees: `planning.additions.touchdown.ObservedPoints`."""
 
     touchdown_distance: float

@@ -1,66 +1,99 @@
-"""Base class of planners that search: their options, and the search itself."""
+"""Base class of planners that search: their options, the search itself, and many environments in chunks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
+from functools import wraps
+from operator import itemgetter
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from models.state import State
-from planning.backends.compiled import Compiled
-from planning.backends.cuda_graphs import CudaGraphs
-from planning.backends.eager import Backend, eager
-from planning.extensions.guidance import check_guidance, distance_to_goal_of, guided_return
-from planning.extensions.idle_pushes import IDLE_DISTANCE, idle_last
-from planning.extensions.perturbed_rollouts import PerturbedRollouts
-from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
-from planning.extensions.warm_start import chosen_noise, warm_start_noise
-from planning.inputs import check_horizon, check_positive, check_weight
+from planning import records
+from planning.additions.guidance import check_guidance, distance_to_goal_of, guided_return
+from planning.additions.perturbed_rollouts import PerturbedRollouts
+from planning.additions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
+from planning.backends import make_backend
+from planning.checks import NoFiniteCandidateError, check_horizon, check_positive, check_scenes, check_weight
 from planning.optimizers import Optimizer, make_optimizer, search
-from planning.plan import Plan
 from planning.protocol import (
     DistanceToGoal,
     DynamicsModel,
     EpisodicReward,
     FixedShapes,
     ModelRequirements,
+    Plan,
     RewardFunction,
-    SampledDynamics,
 )
-from planning.rollouts.candidates import Candidates, SearchProblem
-from planning.rollouts.cumulative_reward import CumulativeReward, StrideLimits
-from planning.rollouts.segment import Objective, SearchSpace
+from planning.returns import CumulativeReward, StrideLimits
+from planning.rollout import Candidates, Objective, SearchProblem, SearchSpace
 
 ROBUSTNESS = PerturbedRollouts()
-AUTO = "auto"  # value of `compile`: native code where it is cached; never compiles
-GRAPHS = "cuda_graphs"  # value of `compile`: for models on a GPU
+# Measured: a plan of 1,024 samples fills a processor's caches; sixteen plans in one pass take 1.6 times as long per
+# plan. Matrix products of another number of rows may also round differently, and a plan must not depend on its
+# neighbours.
+ENVIRONMENTS_ON_PROCESSOR = 1
+PLANS_ON_ACCELERATOR = 131_072  # samples of all environments of a chunk
+
+PlanMethod = Callable[..., Plan]  # (self, state, generators, observed)
+
+
+def chunked(plan: PlanMethod) -> PlanMethod:
+    """Let a planner's method `plan` take any number of environments `[B]`, in chunks of whole environments.
+
+    It concatenates the plans of the chunks. Raises ValueError for a state that is not a batch of scenes, for another
+    number of generators than B, and for an environment without a finite candidate, which it names.
+    """
+
+    @wraps(plan)
+    def planned(
+        self: SearchingPlanner,
+        state: State,
+        generators: Sequence[torch.Generator],
+        observed: ObservedPoints | None = None,
+    ) -> Plan:
+        check_scenes(state, generators)
+        size, plans = ENVIRONMENTS_ON_PROCESSOR, []
+        if state.centers.device.type != "cpu":
+            size = max(1, PLANS_ON_ACCELERATOR // self.samples)
+        for start in range(0, max(len(generators), 1), size):
+            chunk = slice(start, start + size)
+            seen = observed and records.apply(observed, itemgetter(chunk))
+            try:
+                plans.append(plan(self, state.scene(chunk), generators[chunk], seen))
+            except NoFiniteCandidateError as error:
+                raise NoFiniteCandidateError(start + error.environment, error.what) from error
+        return plans[0] if len(plans) == 1 else records.join(plans, dimension=0)
+
+    return planned
 
 
 class SearchingPlanner:
     """Searches N = `samples` plans of K = `horizon` / T segments for the highest cumulative reward.
 
-    The options, of which `planning.cavin.CavinPlanner` says more:
+    The options, of which `planning.cavin.CavinPlanner` has more:
 
     samples: N, plans to compare.
     horizon: H steps, a multiple of the model's T.
     optimizer: searches the plans: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `planning.optimizers.Optimizer`.
-    reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment.
+    reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment (published
+        implementation).
     stride_limits: two distances in metres; a segment that moves every object less than the first, or any object more
-        than the second, ends the plan like a violation; None in the paper.
-    warm_start: the last plan's noise is among the candidates of `shooting`, `evolution` and `smc` (our addition).
+        than the second, ends the plan like a violation (0.1 and 0.3 from subgoal to subgoal in the published
+        implementation); None in the paper.
+    early_stopping: `shooting` stops when no candidate can become the best, which leaves the chosen plan as it is up to
+        its end (our addition); false in the paper. Codes then follow from noise, which is sampled beforehand.
     robustness: ranks the best plans by perturbed rollouts (our addition); None in the paper.
-    idle_distance: metres; pushes that, according to f, move no object by this distance come last (our addition); 0 in
-        the paper.
-    touchdown_distance: metres; plans whose first push starts nearer to a point that the camera sees are left out (our
-        addition); 0 in the paper.
+    touchdown_distance: metres; plans whose first push starts nearer to a point that the camera sees are left out, as
+        far as the caller gives such points (our addition to line 10); 0 in the paper.
     guidance: `layout` prefers, among plans that miss the goal, those that leave the shortest way to it along allowed
         places (our addition); `none` in the paper.
-    compile: true runs the inner functions as native code, which takes minutes once and is cached on disk; `auto` loads
-        what is cached and runs the rest eagerly; `cuda_graphs` captures them on the GPU where the model is.
+    compile: true compiles the inner functions by `torch.compile`, which takes minutes and is cached on disk;
+        `cuda_graphs` captures them on the GPU where the model is. Codes then follow from noise, too.
     """
 
     requires: ClassVar[ModelRequirements]  # of the planner on its model
@@ -76,28 +109,24 @@ class SearchingPlanner:
         optimizer: str | Optimizer = "shooting",
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
-        warm_start: bool = True,
+        early_stopping: bool = True,
         robustness: PerturbedRollouts | None = ROBUSTNESS,
-        idle_distance: float = IDLE_DISTANCE,
         touchdown_distance: float = TOUCHDOWN_DISTANCE,
         guidance: str = "none",
         compile: bool | str = False,
     ) -> None:
-        """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names, no compiler."""
+        """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names."""
         check_positive("samples", samples)
         check_horizon(horizon, model.segment_length)
-        check_weight("idle_distance", idle_distance)
         check_weight("touchdown_distance", touchdown_distance)
         check_guidance(guidance)
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.model, self._reward, self.guidance = model, reward, guidance
         self.reward_at, self.stride_limits = reward_at, stride_limits
-        self.backend = _backend(compile, model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext)
-        self.reparameterized = warm_start or bool(compile)
-        if robustness is not None and robustness.outcomes == "sampled" and not isinstance(model, SampledDynamics):
-            raise ValueError("robustness.outcomes=sampled needs a model that samples f: it has no sampled_next_state")
+        self.backend = make_backend(compile, model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext)
+        self.reparameterized = early_stopping or bool(compile)
         _ = self.cumulative_reward(), self.distance_to_goal  # refuse bad options now, not in the first plan
-        self.warm_start, self.robustness, self.idle_distance = warm_start, robustness, idle_distance
+        self.early_stopping, self.robustness = early_stopping, robustness
         self.touchdown_distance = touchdown_distance
         self.samples = samples
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
@@ -134,8 +163,7 @@ class SearchingPlanner:
         optimizer: Optimizer | None = None,
         segments: int | None = None,
         samples: int | None = None,
-        warm_start: Tensor | None = None,
-        best_only: bool = False,
+        early_stopping: bool = False,
     ) -> Candidates:
         """All candidates `[B, N]` that the optimizer evaluates.
 
@@ -144,8 +172,7 @@ class SearchingPlanner:
             state: `[B]`, observed scenes. generators: one per scene.
             optimizer: by default `self.optimizer`.
             segments: of a candidate, by default K. samples: number of candidates, by default N.
-            warm_start: `[B, h, K, D]`, noise of promising candidates, from the last plan.
-            best_only: whether the caller reads only the best candidate.
+            early_stopping: whether the search may stop when no candidate can become the best.
 
         Raises:
             ValueError: codes must be reparameterised and their prior cannot be.
@@ -157,19 +184,15 @@ class SearchingPlanner:
             generators,
             self.segments if segments is None else segments,
             self.reparameterized,
-            warm_start,
-            best_only,
+            early_stopping,
             self.backend,
         )
         return search(optimizer or self.optimizer, problem, self.samples if samples is None else samples)
 
-    def search_by_reward(
-        self, space: SearchSpace, state: State, generators: Sequence[torch.Generator], previous: Plan | None
-    ) -> Candidates:
-        """Candidates `[B, N]` of K segments, searched by cumulative reward, with a warm start from `previous`."""
-        warm_start = warm_start_noise(previous, generators) if self.warm_start else None
+    def search_by_reward(self, space: SearchSpace, state: State, generators: Sequence[torch.Generator]) -> Candidates:
+        """Candidates `[B, N]` of K segments, searched by cumulative reward."""
         objective = guided_return(self.cumulative_reward(), self.distance_to_goal)
-        return self.search(space, objective, state, generators, warm_start=warm_start, best_only=True)
+        return self.search(space, objective, state, generators, early_stopping=self.early_stopping)
 
     def prefer_free(self, scores: Tensor, pushes: Tensor, observed: ObservedPoints | None) -> Tensor:
         """Scores `[B, N]` that leave out candidates whose first push would touch down on an object.
@@ -177,22 +200,6 @@ class SearchingPlanner:
         pushes: `[B, N, T, 4]`, their first segments.
         """
         return prefer_free(scores, pushes[..., 0, :], observed, self.touchdown_distance)
-
-    def idle_last(
-        self, actions: Tensor, path: Tensor, state: State, observed: ObservedPoints | None
-    ) -> tuple[Tensor, Tensor]:
-        """The chosen actions `[B, H, 4]` with idle pushes last, and the states after each: `[B, H, M, 3]` metres."""
-        return idle_last(
-            actions, path, state, self.segment_length, self.idle_distance, observed, self.touchdown_distance
-        )
-
-
-def _backend(compile: bool | str, tracing: Callable[[], AbstractContextManager[None]]) -> Backend:
-    if not isinstance(compile, bool) and compile not in (AUTO, GRAPHS):
-        raise ValueError(f"compile must be true, false, {AUTO} or {GRAPHS}, not {compile}")
-    if compile == GRAPHS:
-        return CudaGraphs(tracing)
-    return Compiled(tracing=tracing, make=compile is True) if compile else eager
 
 
 def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
@@ -206,7 +213,6 @@ def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:
         "segments": progress.segments[environments, best],
         "expected_return": progress.earned[environments, best],
         "expected_success": progress.succeeded[environments, best],
-        "noise": chosen_noise(candidates.take(best.unsqueeze(-1))),
         "candidate_centers": candidates.centers,
         "candidate_returns": progress.earned,
         "evidence": candidates.problem.evidence[-1] if candidates.problem.evidence else None,

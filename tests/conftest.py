@@ -33,14 +33,6 @@ def products_are_not_rounded() -> Iterator[None]:
     torch.set_float32_matmul_precision("highest")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def native_code_of_this_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests neither read nor fill the user's cache of native code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CAVIN_PYRO_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="session")
 def real_assets() -> Path:
     """The folder of real meshes, which a checkout may lack."""

@@ -19,8 +19,6 @@ from envs.robots import Robot, RobotFactory, robot_factory
 from envs.segmentation import Segmenter, SegmenterFactory
 from envs.sensors import DepthSensor
 from envs.tasks import Task
-from envs.workspace import MAXIMUM_MOTION, REACH_HIGH, REACH_LOW
-from planning import PushBox
 
 LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
     "scale": (0.1, 10.0),
@@ -79,11 +77,6 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
             raise UserError(f"env.ranges.{name} must be low, then high, between {least:g} and {most:g}, not {given}")
         ranges[name] = tuple(given)
     return ObjectRanges(**ranges)
-
-
-def push_box() -> PushBox:
-    """The scale of normalised pushes, for planners that propose pushes near objects."""
-    return PushBox(REACH_LOW, REACH_HIGH, MAXIMUM_MOTION)
 
 
 def plain(value: Named) -> str | dict[str, Any]:

@@ -22,9 +22,9 @@ from envs.observation import Observation
 from envs.scene import Scene
 from models.model import Model
 from models.state import State
-from planning.rollouts import ranking
-from planning.rollouts.dynamics import predict_states
-from planning.rollouts.sampling import sample_each
+from planning.returns import best_of, squared_distance
+from planning.rollout import predict_states
+from planning.sampling import sample_each
 
 SAMPLED, CLOSEST, GIVEN = "sampled", "closest", "given by the effect"  # how a motion is obtained
 
@@ -132,7 +132,7 @@ def plan_segment(model: Model, state: State, motion: str, seed: list[int], sampl
         motion_code = sample_each(model.motion_prior, [plans, code], [_generator([*seed, 3])])
         actions = model.actions(here, effect_code=code, motion_code=motion_code)
     ends, _ = predict_states(model, here, actions)
-    best = int(ranking.best_of(-ranking.squared_distance(ends, subgoal), "distances of motions to the subgoal"))
+    best = int(best_of(-squared_distance(ends, subgoal), "distances of motions to the subgoal"))
     return SegmentPlan(actions[0, best].numpy(), subgoal.centers[0, 0].numpy(), ends.centers[0, best].numpy())
 
 

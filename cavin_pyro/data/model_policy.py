@@ -23,10 +23,10 @@ from envs.observation import Observation
 from envs.policy import Intent
 from models.model import Model
 from models.networks.geometry import Geometry
-from planning.extensions.touchdown import TOUCHDOWN_DISTANCE, prefer_free
-from planning.rollouts.dynamics import predict_states
-from planning.rollouts.ranking import best_of, squared_distance
-from planning.rollouts.sampling import sample_each
+from planning.additions.touchdown import TOUCHDOWN_DISTANCE, prefer_free
+from planning.returns import best_of, squared_distance
+from planning.rollout import predict_states
+from planning.sampling import sample_each
 
 
 class PushingPolicy(Protocol):

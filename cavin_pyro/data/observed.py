@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from envs.workspace import REACH_HIGH, REACH_LOW
 from models.networks.geometry import Geometry
 from models.state import State
-from planning.extensions.touchdown import ObservedPoints
+from planning.additions.touchdown import ObservedPoints
 
 
 @torch.inference_mode()

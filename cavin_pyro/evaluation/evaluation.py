@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, announce_waiting, make_runner
+from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.launching.launcher import Launcher, as_launcher, chosen_launcher, of_shard
@@ -39,7 +39,6 @@ def evaluate(config: DictConfig, folder: Path) -> list[Row]:
     missing = missing_seeds(seeds, rows)
     launcher = chosen_launcher(config)
     if missing:
-        announce_waiting(config)
         announce_objects(config)
     with (
         closing(run_jobs([(config, seed) for seed in missing], launcher)) as finished,

@@ -20,7 +20,6 @@ from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.parts import check_sizes, class_of, construct, naming
 from cavin_pyro.config.world import camera_of, object_ranges, object_set_of, robot_of, segmentation_of, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
-from cavin_pyro.evaluation.native_code import argument_compile, check_native_code, searches
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
@@ -33,14 +32,14 @@ from envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
 from models.model import Model
 from models.networks.geometry import Geometry
 from planning import Planner
-from planning.inputs import NoFiniteCandidateError, OptimizerError
-from planning.optimizers import OPTIMIZERS, Shooting
+from planning.backends import GRAPHS
+from planning.checks import NoFiniteCandidateError, OptimizerError
+from planning.optimizers import Shooting
 from planning.protocol import RewardFunction
-from planning.rollouts import ranking
-from planning.searching import AUTO, SearchingPlanner
+from planning.returns import AUTO, END
+from planning.searching import SearchingPlanner
 
 CPU = torch.device("cpu")
-FAST_OPTIMIZER = "shooting"  # the only one of ours that never refines candidates
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,6 @@ def check_options(config: DictConfig, device: torch.device) -> None:
     """
     robot_of(config.env.robot, config.env.assets)
     check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
-    check_native_code(config)
     if device.type != "cpu" and config.get("launcher") == "ray":
         raise UserError(
             f"launcher=ray runs episodes on processors, and device={config.device} plans on {device.type}: "
@@ -110,14 +108,6 @@ def planner_name(config: DictConfig) -> str:
     """The planner's class, and its optimizer's where it has one: "CavinPlanner, Shooting"."""
     parts = (config.planner, config.planner.get("optimizer") or {})
     return ", ".join(str(part["_target_"]).rpartition(".")[2] for part in parts if part.get("_target_"))
-
-
-def announce_waiting(config: DictConfig) -> None:
-    """Announce on standard error, before the first plan, that plans will take long; compilation announces itself."""
-    chosen = class_of(config.planner.get("optimizer") or {})
-    name = next((name for name, kind in OPTIMIZERS.items() if kind is chosen), FAST_OPTIMIZER)
-    if name != FAST_OPTIMIZER:
-        print(f"planner.optimizer={name}: a plan takes about twice as long as with {FAST_OPTIMIZER}", file=sys.stderr)
 
 
 def announce_objects(config: DictConfig) -> None:
@@ -180,18 +170,16 @@ def make_planner(config: DictConfig, reward: RewardFunction, device: torch.devic
     geometry = geometry_of(checkpoint, path)
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
-    if options.get("compile") == AUTO and not searches(config.planner):
-        del options["compile"]  # which only planners that search know
     if options.pop("model_free"):
         with naming("planner", options):
             return construct(options), geometry
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = model_of(checkpoint, path).to(device)
     _check_planner(options, model, path)
-    if "compile" in options:
-        options["compile"] = argument_compile(config, device, model, path)
-    if options.get("tracking_at") == ranking.AUTO and config.pushes_per_plan != 1:
-        options["tracking_at"] = ranking.END  # the first push alone counts only where it alone is executed
+    if options.get("compile") is True and device.type == "cuda":
+        options["compile"] = GRAPHS
+    if options.get("tracking_at") == AUTO and config.pushes_per_plan != 1:
+        options["tracking_at"] = END  # the first push alone counts only where it alone is executed
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
     with naming("planner", config.planner):

@@ -166,7 +166,6 @@ def rollout(
         RuntimeError: the robot stands in the camera's view.
     """
     episode = Episode(seed)
-    previous: Plan | None = None
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.scene.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
     observation, _ = env.reset(seed=seed)
@@ -177,8 +176,7 @@ def rollout(
         began = time.perf_counter()
         state = observed_state(observation, geometry, device)
         observed = {"observed": observed_points(observation, device)} if isinstance(planner, ObservingPlanner) else {}
-        previous = planner.plan(state, [generator], previous, **observed)
-        plan = apply(previous, lambda field: field.cpu())
+        plan = apply(planner.plan(state, [generator], **observed), lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),
             centers=observation["centers"],

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 # The paper's way of planning, for the baselines as `planner=paper` has it for CAVIN.
 WITHOUT_ADDITIONS = (
-    "planner.warm_start=false",
+    "planner.early_stopping=false",
     "planner.robustness=null",
-    "planner.idle_distance=0.0",
     "planner.touchdown_distance=0.0",
     "pushes_per_plan=null",
     "push_decimals=null",

@@ -143,7 +143,7 @@ def write_steps(path: Path, episode: Episode) -> None:
     its candidates that reach the goal by the model.
 
     A plan by inference (`planner.optimizer=smc`) also has its estimate of log Z, its temperature, and the fewest
-    effective samples after any segment; see `planning.plan.Evidence`.
+    effective samples after any segment; see `planning.protocol.Evidence`.
     """
     planned = {record.step: record for record in episode.plan_records}
     with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:

@@ -34,7 +34,7 @@ def fixed_shapes() -> Iterator[None]:
 
 def shapes_are_fixed() -> bool:
     """Whether the caller is within `fixed_shapes`: else a shape may depend on values, such as objects within reach."""
-    return _FIXED.get()
+    return torch.compiler.is_compiling() or _FIXED.get()
 
 
 def fully_connected(inputs: int, outputs: int) -> nn.Sequential:

@@ -3,13 +3,15 @@
 Standard normal noise `[B, n, K, D]` determines codes and pushes, so every optimizer respects the prior and the bounds.
 """
 
-from planning.optimizers.cross_entropy import CrossEntropy
+from __future__ import annotations
+
+import inspect
+
+from planning.checks import OptimizerError
+from planning.optimizers.base import Optimizer, samples_of_iteration, search
+from planning.optimizers.cross_entropy import CrossEntropy, ImprovedCrossEntropy
 from planning.optimizers.evolution import Evolution
-from planning.optimizers.improved_cross_entropy import ImprovedCrossEntropy
 from planning.optimizers.path_integral import PathIntegral
-from planning.optimizers.proposals import LastPlan, NoiseProposal, Value
-from planning.optimizers.protocol import Optimizer, search
-from planning.optimizers.registry import OPTIMIZERS, make_optimizer
 from planning.optimizers.sequential_monte_carlo import SequentialMonteCarlo
 from planning.optimizers.shooting import Shooting
 
@@ -18,13 +20,46 @@ __all__ = [
     "CrossEntropy",
     "Evolution",
     "ImprovedCrossEntropy",
-    "LastPlan",
-    "NoiseProposal",
     "Optimizer",
     "PathIntegral",
     "SequentialMonteCarlo",
     "Shooting",
-    "Value",
     "make_optimizer",
     "search",
 ]
+
+OPTIMIZERS: dict[str, type[Optimizer]] = {
+    "shooting": Shooting,
+    "cem": CrossEntropy,
+    "icem": ImprovedCrossEntropy,
+    "mppi": PathIntegral,
+    "evolution": Evolution,
+    "smc": SequentialMonteCarlo,
+}
+
+
+def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer") -> Optimizer:
+    """The optimizer of that name, with its defaults, or the given one; `argument` is what errors call it.
+
+    Raises ValueError, naming the valid ones, for an unknown name or for an object that is no optimizer; for a method
+    `optimize` that takes other arguments; and for fewer samples than iterations.
+    """
+    if isinstance(optimizer, str):
+        if optimizer not in OPTIMIZERS:
+            raise ValueError(f"unknown {argument} '{optimizer}': choose from {', '.join(OPTIMIZERS)}")
+        optimizer = OPTIMIZERS[optimizer]()
+    if isinstance(optimizer, type) or not isinstance(optimizer, Optimizer):
+        raise ValueError(
+            f"{argument} must be one of {', '.join(OPTIMIZERS)}, or an object with a method "
+            f"optimize(problem, samples), not {optimizer!r}"
+        )
+    taken = inspect.signature(optimizer.optimize)
+    try:
+        taken.bind("problem", "samples")
+    except TypeError as error:
+        raise OptimizerError(
+            f"optimizer {type(optimizer).__name__}: optimize must take the arguments (problem, samples), not {taken}"
+        ) from error
+    if isinstance(optimizer, CrossEntropy | PathIntegral | Evolution):
+        samples_of_iteration(samples, optimizer.iterations, 0)
+    return optimizer

@@ -1,4 +1,4 @@
-"""The cross-entropy method (Rubinstein and Kroese 2004), in the noise of codes or pushes."""
+"""The cross-entropy method and iCEM, in the noise of codes or pushes."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning.inputs import check_fraction, check_positive
-from planning.optimizers.weights import Population, best, samples_of_iteration
-from planning.rollouts.candidates import SearchProblem
+from planning import records
+from planning.checks import check_fraction, check_positive, check_weight
+from planning.optimizers.base import Population, best, samples_of_iteration
+from planning.rollout import SearchProblem
 
 MINIMUM_SCALE = 1e-3  # so that a search never collapses onto a point
 
@@ -17,6 +18,8 @@ MINIMUM_SCALE = 1e-3  # so that a search never collapses onto a point
 @dataclass(frozen=True)
 class CrossEntropy:
     """Samples from a Gaussian fitted to the elites of the last iteration; the first iteration samples the prior.
+
+    The cross-entropy method (Rubinstein and Kroese 2004).
 
     iterations: number of iterations, which share the samples equally. elite_fraction: fraction of an iteration's
     candidates for the next fit. momentum: weight of the last mean and scale in the next. replacement: failed candidates
@@ -37,17 +40,58 @@ class CrossEntropy:
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""
-        mean = scale = None
+        mean = scale = elites = None
         for number in range(self.iterations):
             count = samples_of_iteration(samples, self.iterations, number)
-            noise = problem.noise(count)
+            noise = self.colour(problem.noise(count))
             if mean is not None and scale is not None:
                 noise = mean + scale * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
             candidates = problem.evaluate(noise, replacement=self.replacement)
-            elites = best(Population(candidates.noise, candidates.returns), max(1, round(self.elite_fraction * count)))
+            wanted = max(1, round(self.elite_fraction * count))
+            population = self.competing(Population(candidates.noise, candidates.returns), elites, wanted)
+            elites = best(population, wanted)
             mean, scale = refit(elites, mean, scale, self.momentum)
+
+    def colour(self, noise: Tensor) -> Tensor:
+        """The noise `[B, n, K, D]` of new candidates, from white noise: unchanged here."""
+        return noise
+
+    def competing(self, population: Population, elites: Population | None, wanted: int) -> Population:
+        """The candidates of which `wanted` become elites: those of this iteration alone."""
+        return population
+
+
+@dataclass(frozen=True)
+class ImprovedCrossEntropy(CrossEntropy):
+    """The cross-entropy method with kept elites and noise that is coloured over a plan's segments.
+
+    iCEM (Pinneri et al., CoRL 2020). From the published method: coloured noise, elites that compete again in the next
+    iteration, and the mean as a candidate of the last iteration. Omitted: elites carried over from the last plan.
+
+    kept_elite_fraction: fraction of the elites that compete again. exponent: the noise's power falls as
+    frequency^-exponent; 0 is white, 2 makes neighbouring segments similar. For the rest see `CrossEntropy`.
+    """
+
+    kept_elite_fraction: float = 0.3
+    exponent: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fraction("kept_elite_fraction", self.kept_elite_fraction)
+        check_weight("exponent", self.exponent)
+
+    def colour(self, noise: Tensor) -> Tensor:
+        """Noise `[B, n, K, D]` that is coloured over the segments."""
+        return coloured(noise, self.exponent)
+
+    def competing(self, population: Population, elites: Population | None, wanted: int) -> Population:
+        """The candidates of this iteration, and some of the last elites."""
+        if elites is None:
+            return population
+        # Predictions repeat exactly: elites compete again at no cost.
+        return records.join([best(elites, round(self.kept_elite_fraction * wanted)), population])
 
 
 def refit(elites: Population, mean: Tensor | None, scale: Tensor | None, momentum: float) -> tuple[Tensor, Tensor]:
@@ -65,3 +109,24 @@ def refit(elites: Population, mean: Tensor | None, scale: Tensor | None, momentu
     old_scale = torch.ones_like(new_scale) if scale is None else scale
     mean = momentum * old_mean + (1.0 - momentum) * new_mean
     return mean, (momentum * old_scale + (1.0 - momentum) * new_scale).clamp(min=MINIMUM_SCALE)
+
+
+def coloured(noise: Tensor, exponent: float) -> Tensor:
+    """White noise `[B, n, K, D]` made coloured over its K segments, each number still of variance 1.
+
+    Its power falls as frequency^-exponent (Timmer and Koenig 1995); the lowest frequency, which is zero, has the
+    power of the next one.
+    """
+    segments = noise.shape[2]
+    if segments == 1 or exponent == 0:
+        return noise
+    frequencies = torch.fft.rfftfreq(segments, device=noise.device, dtype=noise.dtype)
+    frequencies[0] = frequencies[1]
+    gain = frequencies.pow(-exponent / 2.0)
+    mirrored = torch.full_like(gain, 2.0)  # but for the ends, frequencies stand for two
+    mirrored[0] = 1.0
+    if segments % 2 == 0:
+        mirrored[-1] = 1.0
+    gain = gain / ((mirrored * gain.square()).sum() / segments).sqrt()
+    spectrum = torch.fft.rfft(noise, dim=2) * gain[:, None]
+    return torch.fft.irfft(spectrum, n=segments, dim=2)

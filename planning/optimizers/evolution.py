@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from planning import records
-from planning.inputs import check_fraction, check_positive, check_weight
-from planning.optimizers.weights import Population, best, samples_of_iteration
-from planning.rollouts.candidates import SearchProblem
-from planning.rollouts.sampling import noise_each, uniform_each
+from planning.checks import check_fraction, check_positive, check_weight
+from planning.optimizers.base import Population, best, samples_of_iteration
+from planning.rollout import SearchProblem
+from planning.sampling import noise_each, uniform_each
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,7 @@ class Evolution:
     samples for the initial generation. parents: number of parents, at most. deletion_rate: segments that an offspring
     loses, on average. mutation_rate: segments of an offspring that mutate, on average. step: size of a mutation, in
     (0, 1], which leaves the prior invariant; 1 samples the segment anew. replacement: failed candidates of the initial
-    generation become copies of active ones, as in shooting. warm_start: fraction of the initial generation for the warm
-    start and its offspring.
+    generation become copies of active ones, as in shooting.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -39,7 +38,6 @@ class Evolution:
     mutation_rate: float = 1.0
     step: float = 0.5
     replacement: bool = True
-    warm_start: float = 0.2
 
     def __post_init__(self) -> None:
         check_positive("generations", self.generations)
@@ -48,7 +46,6 @@ class Evolution:
         check_weight("deletion_rate", self.deletion_rate)
         check_weight("mutation_rate", self.mutation_rate)
         check_fraction("step", self.step, positive=True)
-        check_fraction("warm_start", self.warm_start)
 
     @property
     def iterations(self) -> int:
@@ -58,13 +55,7 @@ class Evolution:
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`."""
         initial = min(max(1, round(self.initial_fraction * samples)), samples - self.generations)
-        noise = problem.noise(initial)
-        warm = min(initial, math.ceil(self.warm_start * initial))
-        if warm and problem.warm_start is not None:
-            # In the last places: among equal candidates, such as all that miss the goal, a new one wins.
-            known = torch.cat([problem.warm_start, self._offspring(problem, problem.warm_start, warm)], 1)
-            noise[:, initial - warm :] = known[:, :warm]
-        candidates = problem.evaluate(noise, replacement=self.replacement)
+        candidates = problem.evaluate(problem.noise(initial), replacement=self.replacement)
         population = Population(candidates.noise, candidates.returns)
         for number in range(self.generations):
             population = best(population, self.parents)

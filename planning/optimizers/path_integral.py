@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
-from planning.inputs import check_fraction, check_positive
-from planning.optimizers.weights import adapt_temperature, samples_of_iteration
-from planning.rollouts.candidates import SearchProblem
+from planning.checks import check_fraction, check_positive
+from planning.optimizers.base import samples_of_iteration
+from planning.optimizers.weights import adapt_temperature
+from planning.rollout import SearchProblem
 
 
 @dataclass(frozen=True)

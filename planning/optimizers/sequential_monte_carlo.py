@@ -2,8 +2,7 @@
 
 Plans are sampled from p(plan) exp(return / temperature): the learned prior, weighted by their returns (Levine
 2018; Piche et al., ICLR 2019). Resampling and moves as in Del Moral, Doucet and Jasra (2006), moves that leave the
-prior invariant as in Cotter et al. (2013), "preconditioned Crank-Nicolson"; values as in twisted particle filters
-(Whiteley and Lee 2014).
+prior invariant as in Cotter et al. (2013), "preconditioned Crank-Nicolson".
 """
 
 from __future__ import annotations
@@ -15,45 +14,37 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning.inputs import OptimizerError, check_choice, check_fraction, check_positive
-from planning.optimizers.proposals import PROPOSALS, NoiseProposal, Value, propose
+from planning.checks import check_fraction, check_positive
 from planning.optimizers.weights import adapt_temperature, effective_sample_size, log_mean
-from planning.plan import Evidence
-from planning.rollouts.candidates import Candidates, SearchProblem, join
-from planning.rollouts.sampling import noise_each, uniform_each
-
-SCHEDULES = ("constant", "linear")
+from planning.protocol import Evidence
+from planning.rollout import Candidates, SearchProblem, join
+from planning.sampling import noise_each, uniform_each
 
 
 @dataclass(frozen=True)
 class SequentialMonteCarlo:
     """Extends, weights, resamples and moves particles, a segment at a time.
 
-    After segment k of K the particles target p(codes) exp((return so far + value) / temperature_k). A segment's
-    weight is the ratio of this to the one before, times prior / proposal. Z is the normalising constant after segment
-    K: the prior's expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight
-    since the last resampling, is in the plan's `evidence`.
+    After segment k of K the particles target p(codes) exp(return so far / temperature_k). A segment's weight is the
+    ratio of this to the one before. Z is the normalising constant after segment K: the prior's
+    expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight since the last
+    resampling, is in the plan's `evidence`.
 
-    With a `temperature` the estimate of Z is unbiased for any number of particles, any proposal and any value. Without
-    one, every temperature is chosen by the weights that it gives. The estimate is then biased, its Z is of that
-    temperature, and failed particles count as impossible while others have not failed.
+    With a `temperature` the estimate of Z is unbiased for any number of particles. Without one, every
+    temperature is chosen by the weights that it gives. The estimate is then biased, its Z is of that temperature, and
+    failed particles count as impossible while others have not failed.
 
     effective_sample_size: without a `temperature`, the one after a segment is the lowest at which the weights'
     effective sample size is this fraction of the particles that have not failed. moves: number for every particle
     after every segment. block: last segments that a move changes. step: size of a move, in (0, 1]; 1 samples
     independently of the current value. temperature: temperature of the target, in units of the return; None adapts it.
-    schedule: with a `temperature`, `constant` has it after every segment, `linear` has K / k times as much after
-    segment k. resample_below: resample if the effective sample size is at most this fraction of the particles, and
-    after the last segment; 1 resamples after every segment.
-    proposal: distribution of codes, `prior`, `last_plan` or a `NoiseProposal`. value: a `Value` of states that leads
-    particles before the last segment; None has none. keep_last_plan: the planner also chooses from the warm start's
-    plans, as with `shooting`; they are no particles, so the estimate does not count them, but they take their share of
-    samples.
+    resample_below: resample if the effective sample size is at most this fraction of the particles, and after the last
+    segment; 1 resamples after every segment.
 
     Extending n particles over K segments and moving their last ones costs as much as N samples of shooting.
 
-    Raises ValueError for a block below 1, fewer than 0 moves, a temperature that is not positive, fractions outside of
-    their range, unknown names, and a schedule without a temperature.
+    Raises ValueError for a block below 1, fewer than 0 moves, a temperature that is not positive, and fractions outside
+    of their range.
     """
 
     effective_sample_size: float = 0.3
@@ -61,11 +52,7 @@ class SequentialMonteCarlo:
     block: int = 2
     step: float = 0.4
     temperature: float | None = None
-    schedule: str = "constant"
     resample_below: float = 1.0
-    proposal: str | NoiseProposal = "prior"
-    value: Value | None = None
-    keep_last_plan: bool = False
 
     def __post_init__(self) -> None:
         check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
@@ -75,16 +62,7 @@ class SequentialMonteCarlo:
         check_fraction("step", self.step, positive=True)
         if self.temperature is not None and not (math.isfinite(self.temperature) and self.temperature > 0):
             raise ValueError(f"temperature must be a positive number or null, not {self.temperature}")
-        check_choice("schedule", self.schedule, SCHEDULES)
-        if self.temperature is None and self.schedule != "constant":
-            raise ValueError(f"schedule={self.schedule} needs a temperature: without one, it adapts")
         check_fraction("resample_below", self.resample_below, positive=True)
-        if isinstance(self.proposal, str):
-            check_choice("proposal", self.proposal, list(PROPOSALS))
-        elif isinstance(self.proposal, type) or not isinstance(self.proposal, NoiseProposal):
-            raise ValueError(f"proposal must be {', '.join(PROPOSALS)} or a NoiseProposal, not {self.proposal!r}")
-        if self.value is not None and (isinstance(self.value, type) or not callable(self.value)):
-            raise ValueError(f"value must be a Value or null, not {self.value!r}")
 
     def particles(self, samples: int, segments: int) -> int:
         """n, for which extending and moving costs at most N = `samples` whole plans; at least 1."""
@@ -93,20 +71,16 @@ class SequentialMonteCarlo:
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; at most N = `samples` candidates are whole."""
-        known = (
-            problem.warm_start[:, : samples // 2] if self.keep_last_plan and problem.warm_start is not None else None
-        )
-        count = self.particles(samples - (0 if known is None else known.shape[1]), problem.segments)
-        proposal = PROPOSALS[self.proposal] if isinstance(self.proposal, str) else self.proposal
+        count = self.particles(samples, problem.segments)
         particles = problem.begin(count)
         tempered = torch.zeros_like(particles.returns).double()  # log density over the prior's, after moves
         weights = torch.zeros_like(tempered)  # logarithms, since the last resampling; their mean weight is 1
         evidence, sizes = torch.zeros_like(tempered[:, 0]), []
         for number in range(1, problem.segments + 1):
-            noise, ratios = propose(proposal, particles)
+            noise = noise_each((count, problem.dimension), problem.generators, problem.device)
             particles = particles.extend(noise)
-            scores, before = self._scores(particles), tempered - ratios - weights
-            inverse, relative = self._tempered(scores, before, number / problem.segments)
+            scores, before = self._scores(particles), tempered - weights
+            inverse, relative = self._tempered(scores, before)
             logarithms = inverse.unsqueeze(-1) * scores.double() - before
             factor = log_mean(logarithms)
             evidence = evidence + factor
@@ -123,16 +97,14 @@ class SequentialMonteCarlo:
                 if number == problem.segments:
                     problem.add_candidates(proposed)
             tempered = inverse.unsqueeze(-1) * self._scores(particles).nan_to_num(neginf=0.0)
-        if known is not None:
-            problem.evaluate(known)  # last, so that a new plan wins among equals
         possible = torch.full_like(evidence, count, dtype=torch.int64)
         problem.evidence.append(Evidence(evidence, 1.0 / inverse, torch.stack(sizes, -1), possible))
 
-    def _tempered(self, scores: Tensor, before: Tensor, part: float) -> tuple[Tensor, Tensor]:
-        """Inverse temperatures `[B]` after this part of the segments, and log weights `[B, n]` up to a constant."""
+    def _tempered(self, scores: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Inverse temperatures `[B]` after a segment, and log weights `[B, n]` up to a constant."""
         if self.temperature is None:
             return adapt_temperature(scores, self.effective_sample_size, before=before)
-        inverse = (1.0 if self.schedule == "constant" else part) / self.temperature
+        inverse = 1.0 / self.temperature
         return torch.full_like(before[:, 0], inverse), inverse * scores.double() - before
 
     def _move(self, particles: Candidates, inverse: Tensor) -> tuple[Candidates, Candidates]:
@@ -154,16 +126,8 @@ class SequentialMonteCarlo:
         return join([particles, proposed]).take(indices), proposed
 
     def _scores(self, candidates: Candidates) -> Tensor:
-        """Return so far and value `[B, n]`; -inf for candidates of weight zero."""
-        returns = active_returns(candidates) if self.temperature is None else candidates.returns
-        number = len(candidates.segments)
-        if self.value is None or number == candidates.problem.segments:
-            return returns
-        active = candidates.score_state.active
-        value = torch.where(active, self.value(number, candidates.plans), 0.0)
-        if value.shape != returns.shape or not torch.isfinite(value).all():
-            raise OptimizerError(f"a value must be finite, of shape [B, n] = {list(returns.shape)}")
-        return returns + value
+        """Returns so far `[B, n]`; -inf for candidates of weight zero."""
+        return active_returns(candidates) if self.temperature is None else candidates.returns
 
 
 def active_returns(candidates: Candidates) -> Tensor:

@@ -1,40 +1,15 @@
-"""The best candidates, and weights of candidates, from their returns."""
+"""Weights of candidates from their returns, at a temperature that is given or adapted."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from planning import records
-
 TEMPERATURES = 97  # inverse temperatures on a grid, evenly spaced in the logarithm
 RANGE = (1e-3, 1e9)  # of inverse temperatures times the range of returns, which one violation can widen a million times
 SAME = 1.05  # effective sample sizes within this factor count as equal
-
-
-class Population(NamedTuple):
-    """Candidates and their returns."""
-
-    noise: Tensor  # [B, n, K, D]
-    returns: Tensor  # [B, n]
-
-
-def best(population: Population, count: int) -> Population:
-    """The `count` with the highest returns, best first: `[B, n] -> [B, count]`."""
-    return records.take(population, population.returns.topk(min(count, population.returns.shape[-1]), -1).indices)
-
-
-def samples_of_iteration(samples: int, iterations: int, number: int) -> int:
-    """The number of the N = `samples` for iteration `number` of `iterations`; the first iterations take the remainder.
-
-    Raises ValueError if there are fewer samples than iterations.
-    """
-    if samples < iterations:
-        raise ValueError(f"{iterations} iterations need at least as many samples, not {samples}")
-    return samples // iterations + (number < samples % iterations)
 
 
 def effective_sample_size(log_weights: Tensor) -> Tensor:

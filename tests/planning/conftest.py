@@ -12,11 +12,10 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from models.state import State
-from planning import CavinPlanner
-from planning.backends import chunking
+from planning import CavinPlanner, searching
 from planning.protocol import PlanningModel, RewardFunction
-from planning.rollouts.sampling import noise_each
-from planning.rollouts.segment import SegmentRollout
+from planning.rollout import SegmentRollout
+from planning.sampling import noise_each
 
 REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1
 
@@ -222,7 +221,7 @@ def plain(
     **options: object,
 ) -> CavinPlanner:
     """Algorithm 1 that avoids failures, with those of our additions that the options name."""
-    without: dict[str, Any] = {"robustness": None, "idle_distance": 0.0, "warm_start": False, "effect_retries": 0}
+    without: dict[str, Any] = {"robustness": None, "early_stopping": False, "effect_retries": 0}
     without["motion_samples"] = samples
     return CavinPlanner(model, reward, samples, horizon, motion_horizon, **{**without, **options})
 
@@ -230,7 +229,7 @@ def plain(
 @pytest.fixture(autouse=True)
 def environments_in_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plan all environments of a test in one chunk, so that what is computed for several at once is tested."""
-    monkeypatch.setattr(chunking, "ENVIRONMENTS_ON_PROCESSOR", 1000)
+    monkeypatch.setattr(searching, "ENVIRONMENTS_ON_PROCESSOR", 1000)
 
 
 @pytest.fixture

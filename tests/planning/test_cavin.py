@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
 from types import SimpleNamespace
 
 import pytest
 import torch
 from torch import Tensor
 
-from envs.layouts import load_task
-from envs.tasks import TaskReward
 from models.state import State
-from planning import CavinPlanner, Outcome, Plan, RewardFunction
+from planning import Plan, RewardFunction
+from planning.checks import NoFiniteCandidateError, check_scenes
 from tests.planning.conftest import same, tensors
 
 START = (0.0, 0.02)  # metres; close above the forbidden half-plane y < 0 of `near_the_edge`
@@ -75,28 +75,6 @@ def test_tracking_at_the_first_push_prefers_motions_that_go_far_at_once(toy: Sim
     end, first_push = left("end"), left("first_push")
     assert (first_push[:, 0] < end[:, 0]).all()
     assert (first_push[:, 2] >= end[:, 2]).all()  # and pays for it at the end
-
-
-def test_by_default_the_first_push_is_tracked_where_the_goal_is_about_all_objects(toy: SimpleNamespace) -> None:
-    def at(reward: RewardFunction, **options: str) -> str:
-        return CavinPlanner(toy.PointMass(), reward, samples=8, horizon=3, **options).distance.at
-
-    clearing, crossing = (TaskReward(load_task(name)) for name in ("clearing", "crossing"))
-    assert at(clearing) == "first_push"
-    assert at(crossing) == "end"
-    assert at(near_the_edge(toy)) == "end"  # it does not say what its goal is about
-    assert at(clearing, tracking_at="end") == "end"
-    assert at(crossing, tracking_at="first_push") == "first_push"
-
-
-def test_dead_plans_are_replaced_by_copies_of_living_ones(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=256, horizon=12)
-    plan = planner.plan(toy.scenes([[START]]), toy.generators(0))
-    firsts = plan.candidate_centers[0, :, 0, 0]
-    assert (firsts[:, 1] >= 0.0).all()  # about half of the first subgoals were not
-    assert len(firsts.unique(dim=0)) < 256
-    # After the last segment failed candidates stay: the drawing shows them.
-    assert (plan.candidate_returns < -100).any()
 
 
 def test_codes_traced_back_through_copies_replay_to_the_recorded_subgoals(toy: SimpleNamespace) -> None:
@@ -204,24 +182,6 @@ def test_pushes_that_are_not_finite_never_win_even_if_the_dynamics_ignore_it(toy
     assert plan.planned_actions.isfinite().all()
 
 
-def test_rewards_see_unbroken_trajectories(toy: SimpleNamespace) -> None:
-    def recording(previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
-        segments.append((previous, centers))
-        return goal(previous, centers, mask)
-
-    goal = toy.GoalDisc(goal=(9.0, 9.0))
-    segments: list[tuple[Tensor, Tensor]] = []
-    start = toy.scenes([[START]])
-    toy.plain(toy.PointMass(), recording, samples=4, horizon=9).plan(start, toy.generators(0))
-    assert len(segments) == 2 * 3  # once per segment at both levels
-    for level in (segments[:3], segments[3:]):
-        before = start.centers.expand(4, 1, 3)
-        for previous, centers in level:
-            assert torch.equal(previous[0, :, 0], before)
-            assert torch.equal(previous[0, :, 1:], centers[0, :, :-1])
-            before = centers[0, :, -1]
-
-
 def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
     planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=8, horizon=3)
     state = toy.scenes([[START], [(0.0, float("nan"))]])
@@ -233,14 +193,14 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
     ("options", "message"),
     [
         ({"horizon": 31}, "horizon=31 is not divisible by the model's segment length T=3: choose 30 or 33"),
-        ({"horizon": 2}, "horizon=2 is not divisible by the model's segment length T=3: choose 3"),
-        ({"horizon": 0}, "horizon must be at least 1, not 0"),
-        ({"horizon": -3}, "horizon must be at least 1, not -3"),
         ({"samples": 0}, "samples must be at least 1, not 0"),
-        ({"samples": -5}, "samples must be at least 1, not -5"),
         ({"motion_horizon": "last"}, "unknown motion_horizon 'last': choose full_horizon or first_segment"),
-        ({"feature_weight": -1.0}, "feature_weight must be zero or a positive number, not -1.0"),
         ({"tracking_at": "start"}, "unknown tracking_at 'start': choose auto, end or first_push"),
+        ({"motion_samples": 0}, "motion_samples must be at least 1, not 0"),
+        ({"nearest_objects": 0}, "nearest_objects must be at least 1, not 0"),
+        ({"effect_retries": -1}, "effect_retries must be 0 or more, not -1"),
+        ({"reward_at": "end"}, "unknown reward_at 'end': choose path or subgoals"),
+        ({"compile": "fast"}, "compile must be true, false or cuda_graphs, not fast"),
         ({"feature_weight": float("nan")}, "feature_weight must be zero or a positive number, not nan"),
     ],
 )
@@ -250,26 +210,44 @@ def test_bad_options_are_one_clear_line(toy: SimpleNamespace, options: dict, mes
     assert str(error.value) == message
 
 
-def test_bad_scenes_are_one_clear_line(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=4, horizon=3)
-    two = toy.scenes([[START], [START]])
-    same = toy.generators(0)[0]
-    for state, generators, message in (
-        (two, toy.generators(0), "one generator per environment: 2 needed, 1 given"),
-        (two, [same, same], "one generator per environment: the same generator was given twice"),
-        (
-            two.scene(0),
-            toy.generators(0),
-            "a planner takes states with centers [B, M, 3] and mask [B, M], not [1, 3] and [1]",
-        ),
-    ):
-        with pytest.raises(ValueError) as error:
-            planner.plan(state, generators)
-        assert str(error.value) == message
-
-
 def assert_same_plans(batch: Plan, single: Plan, index: int) -> None:
     """Environment `index` of one plan equals the only environment of the other, bit by bit."""
     for name, ours, theirs in zip(Plan._fields, batch, single, strict=True):
         for field, other in zip(tensors((ours,)), tensors((theirs,)), strict=True):
             assert same(field[index], other[0]), name
+
+
+GOOD = State(torch.zeros(2, 3, 3), torch.zeros(2, 3, 64), torch.ones(2, 3, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"centers": GOOD.centers.double()}, "mask of bool, not float64, float32, bool"),
+        ({"features": GOOD.features.half()}, "mask of bool, not float32, float16, bool"),
+        ({"mask": GOOD.mask.long()}, "mask of bool, not float32, float32, int64"),
+        ({"features": GOOD.features[:1]}, r"features \[B, M, F\], not \[1, 3, 64\] for centers \[2, 3, 3\]"),
+        ({"mask": GOOD.mask[:1]}, r"mask \[B, M\], not \[2, 3, 3\] and \[1, 3\]"),
+    ],
+)
+def test_states_of_the_wrong_kind_are_refused(changes: dict, said: str) -> None:
+    generators = [torch.Generator(), torch.Generator()]
+    check_scenes(GOOD, generators)
+    with pytest.raises(ValueError, match=said):
+        check_scenes(GOOD._replace(**changes), generators)
+
+
+def test_a_worker_process_hands_over_that_no_candidate_is_finite() -> None:
+    error = pickle.loads(pickle.dumps(NoFiniteCandidateError(2, "returns of effect plans")))
+    assert (error.environment, error.what, str(error)) == (
+        2,
+        "returns of effect plans",
+        "environment 2: returns of effect plans",
+    )
+
+
+@pytest.mark.parametrize(("seeds", "said"), [((0,), "2 needed, 1 given"), (None, "the same generator was given twice")])
+def test_every_environment_needs_a_generator_of_its_own(seeds: tuple[int, ...] | None, said: str) -> None:
+    generators = [torch.Generator()] * 2 if seeds is None else [torch.Generator() for _ in seeds]
+    with pytest.raises(ValueError, match=f"one generator per environment: {said}"):
+        check_scenes(GOOD, generators)

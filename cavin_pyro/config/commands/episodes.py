@@ -126,9 +126,6 @@ class EpisodeConfig(SceneConfig):
 class PlanConfig(EpisodeConfig):
     """Options of `python -m cavin_pyro.plan`."""
 
-    defaults: list[Any] = field(
-        default_factory=lambda: [*DEFAULTS, {"task": ENVIRONMENT["task"]}, "cached_native_code"]
-    )
     output: str | None = option(None, "folder for the results; by default a separate one in runs/plan")
     video: bool = option(True, "write a video of the episode")
     save_goal: str | None = option(

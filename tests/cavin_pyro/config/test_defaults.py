@@ -25,10 +25,9 @@ from planning import CavinPlanner
 
 PAPER = {  # Algorithm 1 as it is printed
     "planner.motion_horizon": "full_horizon",
-    "planner.warm_start": False,
+    "planner.early_stopping": False,
     "planner.avoid_failures": False,
     "planner.robustness": None,
-    "planner.idle_distance": 0.0,
     "planner.touchdown_distance": 0.0,
     "planner.tracking_at": "end",
     "planner.nearest_objects": None,

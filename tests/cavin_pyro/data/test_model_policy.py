@@ -22,7 +22,7 @@ from envs.observation import Observation
 from envs.scene import Scene
 from models.model import Model
 from models.networks.geometry import Geometry
-from planning.rollouts.dynamics import predict_states
+from planning.rollout import predict_states
 
 MOTIONS = 32
 

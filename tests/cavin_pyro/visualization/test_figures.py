@@ -30,7 +30,7 @@ from envs.sensors.camera import Camera
 from models.networks.pointnet import PointNetAutoencoder
 from models.state import State
 from planning import Plan, RandomPlanner
-from planning.plan import Evidence
+from planning.protocol import Evidence
 
 CAMERA = Camera().resized(512, 424)
 OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5

@@ -1,0 +1,99 @@
+"""Another effect where no motion moves anything (our addition to Algorithm 1, between lines 10 and 7).
+
+Line 7 chooses an effect without checking that a motion can achieve it. If an obstacle occupies the place from which to
+push the target, f predicts that no motion without a failure moves anything, and the next plan chooses the same effect
+again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import records
+from planning.protocol import Plan
+from planning.returns import best_of
+from planning.rollout import Candidates
+
+STILL = 0.01  # metres; what moves no object by as much does nothing
+EFFECT = 0.02  # metres; an effect that moves an object farther needs a motion that moves something
+SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objects together
+
+
+def try_other_effects(
+    retries: int,
+    motions_for: Callable[[Candidates, Tensor], Plan],
+    chosen: Tensor,
+    near: State,
+    effects: Candidates,
+    state: State,
+    generators: Sequence[torch.Generator],
+) -> Plan:
+    """The plans for the effects `chosen: [B]` int64, or for other effects where these move nothing.
+
+    Args:
+        retries: how often another effect is tried. motions_for: lines 8 to 11 for effect plans by number, `[B]`; it
+            advances the `generators`, one per environment.
+        state: `[B]`. near: `[B]`, the same of the objects that `effects: [B, N]` are about. The search for the best of
+            these may have stopped early; the others are then rolled out to their ends.
+    """
+    plan, scores = motions_for(effects, chosen), effects.returns
+    for number in range(retries):
+        after = plan.predicted_centers[:, plan.actions.shape[1] - 1]
+        stuck = is_unmoved(state, plan.subgoals.centers[:, 0], after)
+        if not stuck.any():
+            break
+        if number == 0:
+            effects = effects.rolled_out()
+            scores = effects.returns
+        scores = leave_out_similar(scores, first_moves(near, effects), chosen, stuck)
+        chosen = best_of(scores, "returns of effect plans")
+        before = [generator.get_state() for generator in generators]
+        plan = records.where(stuck, motions_for(effects, chosen), plan)
+        for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
+            if not tried:  # an environment's plan depends on its own arguments only
+                generator.set_state(own)
+    return plan
+
+
+def is_unmoved(state: State, subgoals: Tensor, predicted: Tensor) -> Tensor:
+    """Where the chosen motion moves nothing, and the chosen effect should: `[B]` bool.
+
+    Args:
+        state: `[B]`. subgoals: `[B, M, 3]` metres, the first ones. predicted: `[B, M, 3]` metres, by f after T pushes.
+    """
+    return (_farthest(state, predicted) < STILL) & (_farthest(state, subgoals) >= EFFECT)
+
+
+def first_moves(state: State, effects: Candidates) -> Tensor:
+    """How the first effect of `effects: [B, N]` moves each object of `state: [B]`: `[B, N, M, 2]` metres."""
+    ends = effects.at(0, lambda record: record.rollout.states.centers)
+    moves = (ends - state.centers.unsqueeze(1))[..., :2]
+    return torch.where(state.mask[:, None, :, None], moves, 0.0)
+
+
+def leave_out_similar(scores: Tensor, moves: Tensor, chosen: Tensor, where: Tensor) -> Tensor:
+    """Scores `[B, N]` that leave out candidates whose first effect is like the chosen one, or none at all.
+
+    Where nothing would be left, and outside of `where: [B]` bool, the scores stay as they are.
+
+    Args:
+        moves: `[B, N, M, 2]` metres, see `first_moves`. chosen: `[B]` int64, candidates.
+    """
+    flat = moves.flatten(-2)  # [B, N, 2 M]
+    environments = torch.arange(len(chosen), device=chosen.device)
+    length = flat.norm(dim=-1)
+    one = flat[environments, chosen].unsqueeze(-2)
+    cosine = (flat * one).sum(-1) / (length * one.norm(dim=-1)).clamp_min(1e-9)
+    other = (cosine < SIMILAR) & (moves.norm(dim=-1).amax(-1) >= EFFECT) & torch.isfinite(scores)
+    usable = (where & other.any(-1)).unsqueeze(-1)
+    return torch.where(usable & ~other, -torch.inf, scores)
+
+
+def _farthest(state: State, centers: Tensor) -> Tensor:
+    """How far the object that moves farthest would move on the table: `[B]` metres."""
+    away = (centers - state.centers)[..., :2].norm(dim=-1)
+    return torch.where(state.mask, away, 0.0).amax(-1)

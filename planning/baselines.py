@@ -1,0 +1,325 @@
+"""The planners that the paper compares with (section 4.1, appendix A.2), an ablation, and random pushes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning.additions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
+from planning.additions.touchdown import ObservedPoints
+from planning.cavin import EffectSpace
+from planning.checks import NoFiniteCandidateError, check_positive, check_scenes
+from planning.protocol import (
+    DynamicsModel,
+    FlatModel,
+    ModelRequirements,
+    Plan,
+    PlanningModel,
+    RewardFunction,
+    SingleLatentModel,
+)
+from planning.returns import best_of, prefer
+from planning.rollout import Candidates, SearchSpace, SegmentRollout, actions_of, predict_states
+from planning.sampling import noise_each, sample_codes
+from planning.searching import SearchingPlanner, chunked, summary
+
+
+class PushSearch(SearchingPlanner):
+    """The common part of CVAE-MPC and MPC, everything but the source of pushes.
+
+    space: generates the pushes of a segment, and predicts their states with f. stride_limits: metres per push, as
+    published 0.01 and 0.15; None in the paper. For the other options see `CavinPlanner`.
+
+    Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
+
+    Our additions, as in `CavinPlanner`: `robustness`, `touchdown_distance` and `guidance`. There is
+    no subgoal, so perturbed rollouts only estimate how often the executed segment fails. The chosen sequence has the
+    highest return minus `failure_cost / RETURN_WEIGHT` times the fraction of failed rollouts. By default this is 200
+    times the fraction, because a failure earns -100 instead of the +100 at the goal. So the score of a sequence with
+    predicted success is about its expected return. Sequences that reach the goal rank first: the rollouts of others may
+    have stopped early, so their returns are not comparable, and pushes that do nothing never fail.
+    """
+
+    has_codes: ClassVar[bool] = False  # the space searches motion codes
+    strides = "pushes"
+
+    def __init__(self, space: SearchSpace, model: DynamicsModel, reward: RewardFunction, **options: Any) -> None:
+        """`options`: of `SearchingPlanner`."""
+        super().__init__(model, reward, **options)
+        self.space = space
+
+    @chunked
+    @torch.inference_mode()
+    def plan(
+        self,
+        state: State,
+        generators: Sequence[torch.Generator],
+        observed: ObservedPoints | None = None,
+    ) -> Plan:
+        """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
+        candidates = self.search_by_reward(self.space, state, generators)
+        # A sum is finite only if all of its terms are.
+        finite = torch.isfinite(candidates.actions.sum((-2, -1)))
+        scores, pushes = torch.where(finite, candidates.returns, -torch.inf), candidates.at(0, actions_of)
+        scores = self.prefer_free(scores, pushes, observed)
+        best = best_of(scores, "returns of push sequences")
+        if self.robustness is not None:
+            scores = prefer(scores, candidates.score_state.succeeded)
+            what = state, None, scores, pushes, -RETURN_WEIGHT * scores, generators
+            best = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
+        chosen = candidates.take(best.unsqueeze(-1))
+        actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
+        no_codes = codes.new_empty(len(codes), 0, 0)
+        return Plan(
+            actions=actions[:, : self.segment_length],
+            planned_actions=actions,
+            effect_codes=no_codes,
+            motion_codes=codes if self.has_codes else no_codes,
+            subgoals=state.map(lambda field: field[:, None][:, :0]),
+            predicted_centers=path,
+            **summary(candidates, best),
+        )
+
+
+class FlatMotionSpace(NamedTuple):
+    """Motion codes, the pushes that g generates from them alone, and the states that f predicts."""
+
+    model: FlatModel
+
+    @property
+    def dimension(self) -> int:
+        """Z."""
+        return self.model.motion_dimension
+
+    def extend(
+        self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
+    ) -> SegmentRollout:
+        """See `planning.rollout.SearchSpace`."""
+        z = sample_codes(self.model.motion_prior, [plans], noise, generators)
+        a = self.model.actions(here, motion_code=z)
+        states, path = predict_states(self.model, here, a)
+        return SegmentRollout(z, a, states, path)
+
+
+class CvaeMpcPlanner(PushSearch):
+    """CVAE-MPC: sequences of K motion codes z ~ p(z | s), T pushes g(s, z) for each, and f's prediction for all H.
+
+    model: p(z | s), g without effect codes, f. For the options and errors see `PushSearch`.
+    """
+
+    requires = ModelRequirements("flat", ("motion_prior", "actions", "next_state"), excluded=("effect_prior",))
+    has_codes = True
+
+    def __init__(self, model: FlatModel, reward: RewardFunction, **options: Any) -> None:
+        """`options` are those of `PushSearch`."""
+        super().__init__(FlatMotionSpace(model), model, reward, **options)
+
+
+class PushSpace(NamedTuple):
+    """Raw pushes, T a segment, uniform over the action space, and the states that f predicts step by step."""
+
+    model: DynamicsModel
+
+    @property
+    def dimension(self) -> int:
+        """4 T numbers of noise."""
+        return 4 * self.model.segment_length
+
+    def extend(
+        self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
+    ) -> SegmentRollout:
+        """See `planning.rollout.SearchSpace`."""
+        if noise is None:
+            noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
+        actions = (2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4))
+        states, path = predict_states(self.model, here, actions)
+        return SegmentRollout(actions.flatten(-2), actions, states, path)
+
+
+class MpcPlanner(PushSearch):
+    """Sequences of H raw pushes in "the original action space" (paper, section 4.1 and appendix A.2).
+
+    model: any model, since only f is used. For the options and errors see `PushSearch`.
+    """
+
+    requires = ModelRequirements("dynamics", ("next_state",))
+
+    def __init__(self, model: DynamicsModel, reward: RewardFunction, **options: Any) -> None:
+        """`options` are those of `PushSearch`."""
+        super().__init__(PushSpace(model), model, reward, **options)
+
+
+class SectarPlanner(SearchingPlanner):
+    """SeCTAR: effect codes ranked by reward, as in `CavinPlanner`; g generates the pushes from the chosen code alone.
+
+    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). Without our additions, f
+    only predicts the states after the pushes, for pictures.
+
+    Our additions, as in `CavinPlanner`: `robustness`, `touchdown_distance` and `guidance`. An effect
+    has one motion here, so perturbed rollouts compare effect plans: of those that reach the goal, the
+    `robustness.candidates` with the highest return. Their cost is the distance of the pushes' outcome to the plan's own
+    first subgoal and `failure_cost` for failures, as in `CavinPlanner`, minus `RETURN_WEIGHT` times the return. Without
+    the return, the pushes that move least would win, because they end closest to their own subgoals. For the same
+    reason, where no plan reaches the goal, the one with the highest return is chosen, as without this addition.
+
+    model: p(c | s), h, g without motion codes, f. For the options see `CavinPlanner`. Raises ValueError for counts
+    below 1, a horizon that T does not divide, and unknown names.
+    """
+
+    requires = ModelRequirements(
+        "single_latent", ("effect_prior", "subgoal", "actions", "next_state"), excluded=("motion_prior",)
+    )
+
+    def __init__(self, model: SingleLatentModel, reward: RewardFunction, *positional: Any, **options: Any) -> None:
+        """`options` are those of `SearchingPlanner`."""
+        super().__init__(model, reward, *positional, **options)
+        self.space, self._actions = EffectSpace(model), model.actions
+
+    @chunked
+    @torch.inference_mode()
+    def plan(
+        self,
+        state: State,
+        generators: Sequence[torch.Generator],
+        observed: ObservedPoints | None = None,
+    ) -> Plan:
+        """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
+        # Lines 5 to 7: choose the codes c* and their subgoals.
+        effects = self.search_by_reward(self.space, state, generators)
+        here, returns = state.expand_plans(1), effects.returns
+        if observed is not None and self.touchdown_distance:
+            pushes = self._actions(here, effects.at(0, lambda segment: segment.rollout.code))
+            returns = self.prefer_free(returns, pushes, observed)
+        best = best_of(returns, "returns of effect plans")
+        if self.robustness is not None:
+            returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
+            robust = self._most_robust(effects, returns, generators)
+            best = torch.where(torch.isfinite(returns).any(-1), robust, best)
+        chosen = effects.take(best.unsqueeze(-1))
+        effect_codes = chosen.codes[:, 0]
+        # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
+        actions = self._actions(here, effect_codes[:, :1])
+        _, path = predict_states(self.model, here, actions)
+        broken = (~torch.isfinite(actions).flatten(1).all(-1)).nonzero().flatten().tolist()
+        if broken:
+            raise NoFiniteCandidateError(
+                broken[0], "the pushes of the chosen effect are not finite; check the model's weights"
+            )
+        return Plan(
+            actions=actions[:, 0],
+            planned_actions=actions[:, 0],
+            effect_codes=effect_codes,
+            motion_codes=effect_codes.new_empty(len(actions), 0, 0),
+            subgoals=chosen.states.map(lambda field: field[:, 0]),
+            predicted_centers=path[:, 0],
+            **summary(effects, best),
+        )
+
+    def _most_robust(self, effects: Candidates, returns: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+        """The effect plan whose first segment costs least on average, `[B]` int64; needs `robustness`.
+
+        returns: `[B, N]`, -inf for plans that are not to be chosen.
+        """
+        robustness, state = self.robustness, effects.problem.state
+        assert robustness is not None
+        best = returns.topk(min(robustness.candidates, effects.count), -1)
+        first = effects.take(best.indices)
+        actions = self._actions(state.expand_plans(1), first.at(0, lambda segment: segment.rollout.code))
+        scores = torch.where(torch.isfinite(actions).all(-1).all(-1), best.values, -torch.inf)
+        subgoals = State(
+            first.at(0, lambda segment: segment.rollout.states.centers),
+            first.at(0, lambda segment: segment.rollout.states.features),
+            first.plans.mask,
+        )
+        what = state, subgoals, scores, actions, -RETURN_WEIGHT * scores, generators
+        chosen = sequential_halving(robustness, self.model, self.reward, *what, backend=self.backend)
+        return best.indices.gather(1, chosen.unsqueeze(-1)).squeeze(1)
+
+
+class CascadeSpace(NamedTuple):
+    """Effect and motion codes of the cascade, the pushes that g generates from both, and the states that f predicts."""
+
+    model: PlanningModel
+
+    @property
+    def dimension(self) -> int:
+        """C + Z."""
+        return self.model.effect_dimension + self.model.motion_dimension
+
+    def extend(
+        self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
+    ) -> SegmentRollout:
+        """See `planning.rollout.SearchSpace`."""
+        sizes = self.model.effect_dimension, self.model.motion_dimension
+        effect_noise, motion_noise = (None, None) if noise is None else noise.split(sizes, -1)
+        c = sample_codes(self.model.effect_prior, [plans], effect_noise, generators)
+        z = sample_codes(self.model.motion_prior, [plans, c], motion_noise, generators)
+        a = self.model.actions(here, c, z)
+        states, path = predict_states(self.model, here, a)
+        return SegmentRollout(torch.cat([c, z], -1), a, states, path)
+
+
+class CavinWithoutEffectsPlanner(PushSearch):
+    """Sequences of K pairs of codes c ~ p(c | s), z ~ p(z | s, c), T pushes g(s, c, z) for each, and f's prediction.
+
+    The same generative model as `CavinPlanner`, but planned like CVAE-MPC: no subgoals, and whole sequences ranked by
+    cumulative reward. A plan's motion codes are the pairs, `[B, K, C + Z]`.
+
+    model: the cascade, without h. For the options and errors see `PushSearch`.
+    """
+
+    requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "actions", "next_state"))
+    has_codes = True
+
+    def __init__(self, model: PlanningModel, reward: RewardFunction, **options: Any) -> None:
+        """`options` are those of `PushSearch`."""
+        super().__init__(CascadeSpace(model), model, reward, **options)
+
+
+class RandomPlanner:
+    """Uniform random pushes: each coordinate of start and motion ~ Uniform(-1, 1), normalised.
+
+    `segment_length`: T, the number of pushes per plan. Raises ValueError if it is less than 1.
+    """
+
+    def __init__(self, segment_length: int = 3) -> None:
+        check_positive("segment_length", segment_length)
+        self.segment_length = segment_length
+
+    @torch.inference_mode()
+    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+        """Sample `[B, T, 4]` pushes for the scenes `state: [B]`; without prediction or choice.
+
+        Raises ValueError unless there is one generator per environment.
+        """
+        check_scenes(state, generators)
+        environments, objects = state.mask.shape
+        empty = state.centers.new_empty
+        samples = [
+            torch.rand(
+                self.segment_length,
+                4,
+                generator=generator,
+                dtype=state.centers.dtype,
+                device=generator.device,
+            )
+            for generator in generators
+        ]
+        actions = 2 * torch.stack(samples).to(state.centers.device) - 1 if samples else empty(0, self.segment_length, 4)
+        return Plan(
+            actions=actions,
+            planned_actions=actions,
+            effect_codes=empty(environments, 0, 0),
+            motion_codes=empty(environments, 0, 0),
+            subgoals=state.map(lambda field: field[:, None][:, :0]),
+            segments=torch.zeros(environments, dtype=torch.int64, device=actions.device),
+            predicted_centers=empty(environments, 0, objects, 3),
+            expected_return=state.centers.new_full((environments,), torch.nan),
+            expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
+            candidate_centers=empty(environments, 0, 0, objects, 3),
+            candidate_returns=empty(environments, 0),
+        )

@@ -1,0 +1,59 @@
+"""The interface of optimizers, one method, and what several of them share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from torch import Tensor
+
+from planning import records
+from planning.checks import OptimizerError
+from planning.rollout import Candidates, SearchProblem
+
+
+@runtime_checkable
+class Optimizer(Protocol):
+    """Searches candidates; docs/how-to/your-own-optimizer.md shows an example of 30 lines."""
+
+    def optimize(self, problem: SearchProblem, samples: int) -> None:
+        """Search for candidates of high return, with the budget of N = `samples` whole candidates.
+
+        `problem(noise)` takes candidates, standard normal noise `[B, n, K, D]`, and returns their returns `[B, n]`;
+        -inf means that a prediction was not finite. `problem.noise(n)` samples the prior, `problem.generators` are the
+        only randomness to use. The planner chooses the best of all candidates that were evaluated, so this method
+        returns nothing.
+        """
+
+
+def search(optimizer: Optimizer, problem: SearchProblem, samples: int) -> Candidates:
+    """All whole candidates `[B, n]` that the optimizer has evaluated.
+
+    Raises OptimizerError, naming the optimizer's class, for candidates of a wrong shape and if it has evaluated none.
+    """
+    try:
+        optimizer.optimize(problem, samples)
+        return problem.pop_candidates()
+    except OptimizerError as error:
+        raise OptimizerError(f"optimizer {type(optimizer).__name__}: {error}") from error
+
+
+class Population(NamedTuple):
+    """Candidates and their returns."""
+
+    noise: Tensor  # [B, n, K, D]
+    returns: Tensor  # [B, n]
+
+
+def best(population: Population, count: int) -> Population:
+    """The `count` with the highest returns, best first: `[B, n] -> [B, count]`."""
+    return records.take(population, population.returns.topk(min(count, population.returns.shape[-1]), -1).indices)
+
+
+def samples_of_iteration(samples: int, iterations: int, number: int) -> int:
+    """The number of the N = `samples` for iteration `number` of `iterations`; the first iterations take the remainder.
+
+    Raises ValueError if there are fewer samples than iterations.
+    """
+    if samples < iterations:
+        raise ValueError(f"{iterations} iterations need at least as many samples, not {samples}")
+    return samples // iterations + (number < samples % iterations)

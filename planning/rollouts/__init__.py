@@ -1,1 +1,0 @@
-"""Rollouts of candidates: segments, termination, replacement and returns."""

@@ -1,0 +1,167 @@
+"""Guidance beyond the horizon: the remaining distance decides among plans that miss the goal, and among no others."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from envs.layouts import parse_task
+from envs.tasks import TaskReward
+from envs.workspace import tile_center
+from models.state import State
+from planning import CavinPlanner, CvaeMpcPlanner
+from planning.additions.guidance import GuidedReturn, GuidedTracking
+from planning.cavin import TrackingState
+from planning.returns import CumulativeReward, Progress
+from planning.rollout import SegmentRollout
+
+ARM = [[1, column] for column in range(1, 6)]
+U = [*ARM, [2, 5], *[[3, column] for column in range(5, 0, -1)]]  # eleven tiles from (1, 1) round to (3, 1)
+
+
+def bridge(**options: Any) -> TaskReward:
+    tiles = {"region": U, "goal": [[3, 1]], "target_start": [[1, 1]], "obstacle_start": [[0, 0]]}
+    return TaskReward(parse_task("crossing", tiles), **options)
+
+
+class StraightDistance:
+    """The straight distance of the target to the middle of a disc, at most 2 metres."""
+
+    def __init__(self, disc: Any) -> None:
+        self.disc = disc
+
+    def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
+        return (self.disc.distance(centers) - self.disc.radius).clamp(0.0, 2.0)
+
+    def longest(self, mask: Tensor) -> Tensor:
+        return torch.full_like(mask[..., 0], 2, dtype=torch.float32)
+
+
+def guided_disc(toy: SimpleNamespace, **options: Any) -> Any:
+    disc = toy.GoalDisc(**options)
+    disc.distance_to_goal = StraightDistance(disc)
+    return disc
+
+
+def episode(planner: CavinPlanner, model: Any, state: State, plans: int) -> list[Tensor]:
+    """Centres of the target [2] after each of so many first pushes, executed as f predicts them."""
+    sources, seen = [torch.Generator().manual_seed(1)], []
+    for _ in range(plans):
+        state = model.next_state(state, planner.plan(state, sources).actions[:, 0])
+        seen.append(state.centers[0, 0, :2])
+    return seen
+
+
+def test_a_goal_round_a_bend_beyond_the_horizon_is_found_with_guidance_and_not_without(toy: SimpleNamespace) -> None:
+    reward, model = bridge(margin=0.02), toy.PointMass(noise=0.005)
+    arrived = {}
+    for guidance in ("none", "layout"):
+        planner = toy.plain(model, reward, 256, 12, guidance=guidance)
+        start = toy.scenes([[tile_center((1, 1))]])
+        assert not planner.plan(start, toy.generators(0)).expected_success.any()  # 1.1 metres, at most 0.6 in a plan
+        targets = torch.stack(episode(planner, model, start, 60))
+        arrived[guidance] = bool(reward.task.goal.contains(targets).any())
+        if guidance == "layout":
+            on_bridge = reward.task.region.contains(targets)
+            first = int(reward.task.goal.contains(targets).int().argmax())
+            assert on_bridge[: first + 1].all()
+    assert arrived == {"none": False, "layout": True}
+
+
+def test_the_baselines_are_guided_too(toy: SimpleNamespace) -> None:
+    reward = guided_disc(toy, goal=(2.0, 0.0))
+    moved = {}
+    for guidance in ("none", "layout"):
+        planner = CvaeMpcPlanner(toy.Flat(), reward, samples=256, horizon=6, robustness=None, guidance=guidance)
+        plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(3))
+        moved[guidance] = float(plan.predicted_centers[0, -1, 0, 0])
+        assert plan.expected_return == -6.0  # the cumulative reward, without the value that guides
+    assert moved["layout"] > max(0.25, moved["none"])
+
+
+def test_complete_plans_keep_their_order_and_their_lead_and_failed_ones_gain_on_nobody(toy: SimpleNamespace) -> None:
+    disc = guided_disc(toy, goal=(0.0, 0.0))
+    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
+    torch.manual_seed(0)
+    plans = toy.scenes([[(x, y)] for x, y in torch.empty(300, 2).uniform_(-1.2, 1.2).tolist()])
+    ends = torch.arange(300) % 3  # succeeded, failed, active
+    steps = torch.randint(1, 60, (300,)).float()
+    earned = torch.where(ends == 0, 100 - steps, torch.where(ends == 1, -100 - steps, torch.full_like(steps, -60.0)))
+    progress = Progress(earned, ends == 0, ends == 1, torch.ones(300, dtype=torch.int64))
+    potential = objective.potential(plans.centers, plans.mask)
+    returns = objective.valued(progress, potential, potential, plans.mask).returns
+    success, failed, active = (ends == kind for kind in range(3))
+    assert torch.equal(returns[success], earned[success])
+    assert returns[success].min() > returns[active].max() > returns[active].min() > returns[failed].max()
+    assert torch.equal(returns[failed].argsort(), earned[failed].argsort())
+    # Every failed plan loses at least as much as any other plan.
+    assert ((earned - returns)[failed].min() >= (earned - returns)[active].max()).all()
+    left = disc.distance_to_goal(plans.centers, plans.mask)[active]
+    assert returns[active].argmax() == left.argmin() and returns[active].argmin() == left.argmax()
+
+
+def test_of_two_plans_to_one_place_the_one_that_is_there_earlier_leads(toy: SimpleNamespace) -> None:
+    disc = guided_disc(toy, goal=(1.0, 0.0), radius=0.0)
+    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
+    places = {"early": [0.5, 0.5, 0.5], "late": [0.0, 0.0, 0.5], "astray": [0.5, 0.5, 0.0], "still": [0.0] * 3}
+    returns = {}
+    for name, path in places.items():
+        here = toy.scenes([[(0.0, 0.0)]]).map(lambda field: field.unsqueeze(1))
+        state = objective.start(here)
+        assert state.returns == -20.0  # one metre
+        for segment, x in enumerate(path):
+            there = toy.scenes([[(x, 0.0)]]).map(lambda field: field.unsqueeze(1))
+            rollout = SegmentRollout(torch.zeros(1, 1, 1), None, there, there.centers.unsqueeze(2))
+            state, here = objective.advance(state, segment, here, rollout), there
+        returns[name] = float(state.returns)
+    weights = torch.tensor([0.1, 0.09, 0.81])  # of the states after the three segments
+    assert returns["late"] == pytest.approx(-3 - 20 * float(weights @ torch.tensor([1.0, 1.0, 0.5])))
+    assert returns["early"] == pytest.approx(-3 - 10.0) and returns["still"] == pytest.approx(-3 - 20.0)
+    assert returns["early"] > returns["late"] > returns["astray"] > returns["still"]
+
+
+class Tracked:
+    """A tracking cost of 0."""
+
+    def __init__(self, subgoals: State) -> None:
+        self.subgoals, self.segments = subgoals, torch.tensor([1, 1, 0])
+
+    def start(self, plans: State) -> Any:
+        return None
+
+    def advance(self, state: Any, segment: int, before: State, rollout: SegmentRollout) -> Any:
+        nothing = torch.zeros(rollout.states.batch_shape)
+        return TrackingState(nothing, nothing, nothing == 0)
+
+
+def test_motions_that_fall_behind_their_subgoal_cost_more_and_those_beyond_it_do_not(toy: SimpleNamespace) -> None:
+    disc = guided_disc(toy, goal=(1.0, 0.0))
+    subgoals = toy.scenes([[(0.5, 0.0)]] * 3).map(lambda field: field.unsqueeze(1))
+    reached = toy.scenes([[(0.4, 0.0)], [(0.5, 0.0)], [(0.6, 0.0)]] * 3).map(lambda field: field.unflatten(0, (3, 3)))
+    rollout = SegmentRollout(torch.zeros(3, 3, 1), None, reached, reached.centers.unsqueeze(2))
+    # Guided; its plan reaches the goal; its plan has ended before this segment.
+    cost: Any = GuidedTracking(Tracked(subgoals), disc.distance_to_goal, torch.tensor([True, False, True]))
+    after = cost.advance(cost.start(reached), 0, reached, rollout)
+    torch.testing.assert_close(after.cost, torch.tensor([[0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3]))
+    assert not after.executed_cost.any()
+
+
+def test_an_environment_is_guided_as_it_would_be_alone(toy: SimpleNamespace) -> None:
+    reward, model = bridge(), toy.PointMass()
+    places = [tile_center((1, 2)), tile_center((2, 5)), tile_center((3, 3))]
+    planner = toy.plain(model, reward, 64, 6, guidance="layout")
+    together = planner.plan(toy.scenes([[place] for place in places]), toy.generators(1, 2, 3))
+    for number, place in enumerate(places):
+        alone = planner.plan(toy.scenes([[place]]), toy.generators(number + 1))
+        torch.testing.assert_close(together.actions[number], alone.actions[0])
+
+
+def test_what_cannot_guide_is_refused_in_one_line(toy: SimpleNamespace) -> None:
+    with pytest.raises(ValueError, match=r"^unknown guidance 'roadmap': choose none or layout$"):
+        CavinPlanner(toy.PointMass(), toy.Line(), guidance="roadmap")
+    with pytest.raises(ValueError, match=r"^guidance='layout' needs a reward function with a `distance_to_goal`"):
+        CavinPlanner(toy.PointMass(), toy.Line(), guidance="layout")

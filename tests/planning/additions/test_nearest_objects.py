@@ -1,0 +1,127 @@
+"""Plans about the target and the objects nearest to it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from envs.layouts import load_task
+from envs.tasks import TaskReward
+from models.state import State
+from planning import CavinPlanner
+from planning.additions.nearest_objects import NearestObjects, nearest_objects
+
+PLACES = [(0.0, 0.0), (0.9, 0.0), (0.1, 0.1), (0.8, 0.0), (0.2, 0.0), (0.0, 0.3)]  # metres; 0, 2, 4, 5 are nearest
+
+
+def about(reward: object, objects: str = "target") -> object:
+    """The same reward, which says what its goal is about."""
+    reward.about = objects  # type: ignore[attr-defined]
+    return reward
+
+
+def scene(*, real: int = 6) -> State:
+    planar = torch.tensor([PLACES])
+    features = torch.arange(6.0).view(1, 6, 1)
+    mask = (torch.arange(6) < real).unsqueeze(0)
+    return State(torch.cat([planar, torch.zeros(1, 6, 1)], -1), features, mask)
+
+
+def target_reward(toy: SimpleNamespace, **options: object) -> object:
+    return about(toy.GoalDisc(goal=(0.2, 0.0), **options))
+
+
+def test_the_target_comes_first_and_then_the_nearest_in_their_order(toy: SimpleNamespace) -> None:
+    near = nearest_objects(scene(), 4, target_reward(toy))
+    assert near.indices.tolist() == [[0, 2, 4, 5]]
+    assert near.of(scene()).features.flatten().tolist() == [0.0, 2.0, 4.0, 5.0]
+
+
+def test_padding_is_never_nearer_than_an_object(toy: SimpleNamespace) -> None:
+    near = nearest_objects(scene(real=4), 3, target_reward(toy))  # 4 and 5, which are padding, lie near
+    assert near.indices.tolist() == [[0, 2, 3]]
+
+
+def test_all_objects_count_where_the_goal_is_about_them(toy: SimpleNamespace) -> None:
+    assert nearest_objects(scene(), 4, about(toy.GoalDisc(goal=(0.2, 0.0)), "all")).indices is None
+    assert nearest_objects(scene(), 4, toy.GoalDisc(goal=(0.2, 0.0))).indices is None  # it does not say
+    found = {name: nearest_objects(scene(), 4, TaskReward(load_task(name))) for name in ("clearing", "crossing")}
+    assert found["clearing"].indices is None
+    assert found["crossing"].indices is not None
+
+
+@given(st.permutations(range(1, 6)), st.integers(1, 5))
+def test_objects_go_back_to_their_places(order: list[int], most: int) -> None:
+    state, indices = scene(), torch.tensor([sorted([0, *order[:most]])])
+    near = NearestObjects(indices)
+    part = near.of(state.expand_plans(2))
+    moved = part._replace(centers=part.centers + 1.0)
+    whole = near.among(state, moved)
+    expected = state.centers.clone()
+    expected[0, indices[0]] += 1.0
+    assert torch.equal(whole.centers, expected.unsqueeze(1).expand(1, 2, 6, 3))
+    assert torch.equal(whole.features[:, 0], state.features)
+    assert torch.equal(whole.mask[:, 1], state.mask)
+
+
+class Watched:
+    """How many objects each of the model's functions reads."""
+
+    def __init__(self, model: object) -> None:
+        self.model, self.read = model, {}  # type: ignore[var-annotated]
+
+    def __getattr__(self, name: str) -> object:
+        value = getattr(self.model, name)
+        if not callable(value):
+            return value
+
+        def call(state: State, *codes: Tensor) -> object:
+            self.read.setdefault(name, set()).add(state.objects)
+            return value(state, *codes)
+
+        return call
+
+
+def test_h_and_g_read_the_nearest_and_f_reads_all(toy: SimpleNamespace) -> None:
+    model = Watched(toy.PointMass())
+    planner = CavinPlanner(model, target_reward(toy), 32, 6, nearest_objects=4)  # type: ignore[arg-type]
+    plan = planner.plan(toy.scenes([PLACES]), toy.generators(0))
+    assert model.read == {
+        "effect_prior": {4},
+        "subgoal": {4},
+        "motion_prior": {4},
+        "actions": {4},
+        "next_state": {6},
+    }
+    assert plan.subgoals.centers.shape == (1, 2, 6, 3)
+    assert plan.predicted_centers.shape[2] == 6
+    left_out = plan.subgoals.centers[0, :, [1, 3]] - toy.scenes([PLACES]).centers[0, [1, 3]]
+    assert left_out.abs().max() == 0.0
+    assert (plan.subgoals.centers[0, 0, 0] - toy.scenes([PLACES]).centers[0, 0]).abs().max() > 0.0
+
+
+def test_an_object_that_is_left_out_still_counts_for_the_rules(toy: SimpleNamespace) -> None:
+    # All objects move alike. Object 1, which is left out, may not go down by more than 4 mm.
+    places = [(0.0, 0.3), (0.9, 0.004), *PLACES[2:]]
+    reward = about(toy.GoalDisc(goal=(0.1, 0.3), forbidden_below=0.0))
+
+    def lowest(**options: object) -> list[float]:
+        planner = toy.plain(toy.PointMass(), reward, samples=256, horizon=3, nearest_objects=4, **options)
+        plans = [planner.plan(toy.scenes([places]), toy.generators(seed)) for seed in range(8)]
+        return [plan.predicted_centers[0, :, 1, 1].min().item() for plan in plans]
+
+    assert min(lowest()) >= 0.0
+    assert min(lowest(avoid_failures=False)) < 0.0
+
+
+def test_each_environment_has_its_own_nearest(toy: SimpleNamespace) -> None:
+    mirrored = [PLACES[0], *PLACES[:0:-1]]
+    planner = CavinPlanner(toy.PointMass(), target_reward(toy), 64, 6, nearest_objects=4)
+    both = planner.plan(toy.scenes([PLACES, mirrored]), toy.generators(0, 1))
+    alone = planner.plan(toy.scenes([mirrored]), toy.generators(1))
+    assert torch.equal(both.actions[1:], alone.actions)
+    assert torch.equal(both.subgoals.centers[1:], alone.subgoals.centers)

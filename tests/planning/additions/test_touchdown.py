@@ -1,0 +1,146 @@
+"""No push touches down where the camera sees an object."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cavin_pyro.data.observed import observed_points
+from envs.pushing import PushingEnv
+from envs.workspace import push_endpoints
+from models.state import State
+from planning import CavinPlanner, CvaeMpcPlanner, SectarPlanner
+from planning.additions.touchdown import ObservedPoints, prefer_free
+
+LOW, HIGH = torch.tensor([[0.0, -1.0]]), torch.tensor([[1.0, 1.0]])  # metres
+
+
+def seen(*points: tuple[float, float]) -> ObservedPoints:
+    return ObservedPoints(torch.tensor([points]).reshape(1, -1, 2), LOW, HIGH)
+
+
+def pushes(*starts: tuple[float, float]) -> torch.Tensor:
+    """[1, N, 4], from normalised starts."""
+    return torch.tensor([[[*start, 0.0, 0.0] for start in starts]])
+
+
+def test_a_start_is_blocked_within_the_distance_in_metres() -> None:
+    # The box is 1 m by 2 m around (0.5, 0): the normalised start (0, 0.5) is (0.5, 0.5) in metres.
+    found = seen((0.5, 0.5)).blocked(pushes((0.0, 0.5), (0.019, 0.5), (0.021, 0.5), (0.0, 0.509), (0.0, 0.511)), 0.01)
+    assert found.tolist() == [[True, True, False, True, False]]
+
+
+def test_infinite_points_stand_for_none_among_many() -> None:
+    starts, many = pushes((0.0, 0.5), (0.5, 0.5)), seen((0.5, 0.5), *(30 * [(0.1, -0.9)]))
+    padded = ObservedPoints(torch.cat([many.points, torch.full((1, 40, 2), torch.inf)], 1), LOW, HIGH)
+    assert many.blocked(starts, 0.01).tolist() == padded.blocked(starts, 0.01).tolist() == [[True, False]]
+
+
+@given(st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=2))
+def test_starts_are_where_the_environment_puts_them(start: list[float]) -> None:
+    place, _ = push_endpoints(np.array([*start, 0.0, 0.0]))
+    low, high = (torch.from_numpy(np.array([push_endpoints(np.array([c, c, 0.0, 0.0]))[0]])) for c in (-1.0, 1.0))
+    points = ObservedPoints(torch.from_numpy(place).reshape(1, 1, 2), low, high)
+    push = torch.tensor([[[*start, 0.0, 0.0]]], dtype=torch.float64)
+    assert points.blocked(push, 1e-6).item()
+
+
+def test_a_blocked_motion_loses_unless_all_are_blocked() -> None:
+    scores = torch.tensor([[3.0, 2.0, 1.0]])
+    first = pushes((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0))
+    assert prefer_free(scores, first, seen((0.5, 0.0)), 0.02).tolist() == [[-torch.inf, 2.0, 1.0]]
+    everywhere = seen((0.5, 0.0), (0.75, 0.0), (0.25, 0.0))
+    assert torch.equal(prefer_free(scores, first, everywhere, 0.02), scores)
+
+
+@pytest.mark.parametrize("observed", [None, seen(), seen((0.5, 0.0))])
+def test_nothing_is_left_out_without_points_or_without_a_distance(observed: ObservedPoints | None) -> None:
+    scores, first = torch.tensor([[3.0, 2.0]]), pushes((0.0, 0.0), (0.5, 0.0))
+    distance = 0.0 if observed is not None and observed.points.numel() else 0.02
+    assert prefer_free(scores, first, observed, distance) is scores
+
+
+class Scattered:
+    """Mixed into a toy model: g's pushes start where the motion code says, not at 0."""
+
+    def spread(self, actions: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
+        starts = code[..., :2].tanh().unsqueeze(-2).expand_as(actions[..., :2])
+        return torch.cat([starts, actions[..., 2:]], -1)
+
+
+def planners(toy: SimpleNamespace, distance: float) -> list[CavinPlanner | CvaeMpcPlanner | SectarPlanner]:
+    class Cascade(toy.PointMass, Scattered):
+        def actions(self, state: State, effect_code: torch.Tensor, motion_code: torch.Tensor) -> torch.Tensor:
+            return self.spread(super().actions(state, effect_code, motion_code), motion_code)
+
+    class Flat(toy.Flat, Scattered):
+        def actions(self, state: State, *, motion_code: torch.Tensor) -> torch.Tensor:
+            return self.spread(super().actions(state, motion_code=motion_code), motion_code[..., 8:])
+
+    class Single(Scattered):
+        segment_length, effect_dimension = 3, 16
+        effect_prior, subgoal, next_state = (
+            getattr(toy.PointMass(), name) for name in ("effect_prior", "subgoal", "next_state")
+        )
+
+        def actions(self, state: State, effect_code: torch.Tensor) -> torch.Tensor:
+            whole = toy.PointMass().actions(state, effect_code, torch.zeros_like(effect_code))
+            return self.spread(whole, effect_code[..., 8:])
+
+    reward, options = toy.GoalDisc(goal=(0.2, 0.0)), {"samples": 128, "horizon": 6, "touchdown_distance": distance}
+    return [
+        CavinPlanner(Cascade(), reward, **options),
+        CvaeMpcPlanner(Flat(), reward, **options),
+        SectarPlanner(Single(), reward, **options),
+    ]
+
+
+def test_no_planner_begins_on_an_object(toy: SimpleNamespace) -> None:
+    points = torch.cartesian_prod(torch.linspace(0.2, 0.8, 61), torch.linspace(-0.6, 0.6, 121)).unsqueeze(0)
+    table = ObservedPoints(points, LOW, HIGH)
+    state = toy.scenes([[(0.0, 0.0)]])
+    for careful, careless in zip(planners(toy, 0.02), planners(toy, 0.0), strict=True):
+        blocked = [
+            [
+                table.blocked(planner.plan(state, toy.generators(seed), table).actions[:, :1], 0.02).item()
+                for seed in range(16)
+            ]
+            for planner in (careful, careless)
+        ]
+        assert not any(blocked[0])
+        assert any(blocked[1])
+
+
+def test_each_environment_has_its_own_points(toy: SimpleNamespace) -> None:
+    planner, scene = planners(toy, 0.05)[0], toy.scenes([[(0.0, 0.0)]])
+    wanted = planner.plan(scene, toy.generators(0)).actions[0, 0, :2].tolist()
+    apart = [seen(((wanted[0] + 1.0) / 2.0, wanted[1])), seen((9.0, 9.0))]
+    both = ObservedPoints(*(torch.cat(fields) for fields in zip(*apart, strict=True)))
+    together = planner.plan(toy.scenes([[(0.0, 0.0)], [(0.0, 0.0)]]), toy.generators(0, 0), both).actions
+    alone = [planner.plan(scene, toy.generators(0), one).actions for one in apart]
+    assert torch.equal(together, torch.cat(alone))
+    assert alone[0][0, 0, :2].tolist() != wanted == alone[1][0, 0, :2].tolist()
+
+
+def test_the_camera_sees_where_pushes_are_unsafe() -> None:
+    """Starts on an object's seen points are not begun; those beside all objects are."""
+    env = PushingEnv(task="crossing", objects=3)
+    try:
+        observation, _ = env.reset(seed=3)
+        points = observed_points(observation)
+        assert points.points.shape == (1, 3 * observation["clouds"].shape[1], 2)
+        candidates = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 4)).astype(np.float32)
+        candidates[:, 2:] = 0.0
+        near = points.blocked(torch.from_numpy(candidates)[None], 0.005)[0].numpy()
+        far = ~points.blocked(torch.from_numpy(candidates)[None], 0.03)[0].numpy()
+        assert near.any()
+        for push, unsafe in [(candidates[near][0], True), (candidates[far][0], False)]:
+            env.reset(seed=3)
+            assert env.step(push)[4]["unsafe"] is unsafe
+    finally:
+        env.close()

@@ -1,0 +1,364 @@
+"""SeCTAR, CVAE-MPC, MPC and the ablation against replays by hand and by brute force; random pushes.
+
+For the numbers see test_cavin_replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from models.state import State
+from planning import (
+    CavinWithoutEffectsPlanner,
+    CvaeMpcPlanner,
+    MpcPlanner,
+    PerturbedRollouts,
+    Plan,
+    RandomPlanner,
+    SectarPlanner,
+)
+from planning.optimizers import Shooting
+from planning.searching import SearchingPlanner
+
+EFFECTS = [[-0.75, 0.5, -2.0], [0.5, 0.25, 1.0]]
+RETURNS = [-2.0 - 1.0 + 99.0, -4.0, -2.0 + 99.0]
+WITHOUT_REPLACEMENT = [-102.0, -4.0, -101.0]
+NO_REPLACEMENT: dict[str, Any] = {"optimizer": Shooting(replacement=False)}
+PLAIN: dict[str, Any] = {"early_stopping": False, "robustness": None}  # the paper's
+
+
+def sectar_plan(toy: SimpleNamespace, effects: Sequence[Sequence[float]], **options: Any) -> Plan:
+    class Single(toy.Tabled):  # type: ignore[name-defined]
+        def actions(self, state: State, effect_code: Tensor) -> Tensor:
+            return super().actions(state, effect_code, 0.125 * torch.eye(16)[0].expand_as(effect_code))
+
+    planner = SectarPlanner(Single(effects, []), toy.Line(), samples=3, horizon=4, **PLAIN, **options)
+    return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+
+
+def cvae_mpc_plan(toy: SimpleNamespace, motions: Sequence[Sequence[float]], **options: Any) -> Plan:
+    class Flat(toy.Tabled):  # type: ignore[name-defined]
+        def motion_prior(self, state: State) -> Any:
+            return super().motion_prior(state, state.centers)
+
+        def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
+            return super().actions(state, torch.zeros_like(motion_code), motion_code)
+
+    planner = CvaeMpcPlanner(Flat([], motions), toy.Line(), samples=3, horizon=4, **PLAIN, **options)
+    return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+
+
+def line(centers: Tensor) -> list[float]:
+    return centers[..., 0, 0].flatten().tolist()
+
+
+def test_sectar_executes_what_g_makes_of_the_best_effect_code(toy: SimpleNamespace) -> None:
+    plan = sectar_plan(toy, EFFECTS)
+    assert plan.candidate_returns.tolist() == [RETURNS]
+    assert plan.effect_codes[0, :, 0].tolist() == [0.5, 1.0]
+    assert line(plan.subgoals.centers) == [0.5, 1.5]
+    assert plan.actions.tolist() == plan.planned_actions.tolist() == [[[0, 0, 0.375, 0]] * 2]
+    assert line(plan.predicted_centers) == [0.375, 0.75]
+    assert plan.motion_codes.shape == (1, 0, 0)
+
+
+def test_sectar_without_replacement(toy: SimpleNamespace) -> None:
+    plan = sectar_plan(toy, EFFECTS, **NO_REPLACEMENT)
+    assert plan.candidate_returns.tolist() == [WITHOUT_REPLACEMENT]
+    assert line(plan.subgoals.centers) == [0.5, 0.75]
+
+
+def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> None:
+    class Broken(toy.Tabled):  # type: ignore[name-defined]
+        def actions(self, state: State, effect_code: Tensor) -> Tensor:
+            return torch.full((1, 1, 2, 4), torch.nan)
+
+    planner = SectarPlanner(Broken(EFFECTS, []), toy.Line(), samples=3, horizon=4, early_stopping=False)
+    with pytest.raises(ValueError, match="^environment 0: the pushes of the chosen effect are not finite"):
+        planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+
+
+def test_cvae_mpc_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
+    # T = 2 pushes by z each: the same positions as those of the effects.
+    plan = cvae_mpc_plan(toy, [[code / 2 for code in row] for row in EFFECTS])
+    assert plan.candidate_returns.tolist() == [RETURNS]
+    assert plan.motion_codes[0, :, 0].tolist() == [0.25, 0.5]
+    assert plan.planned_actions[0].tolist() == [[0, 0, 0.25, 0]] * 2 + [[0, 0, 0.5, 0]] * 2
+    assert plan.actions.tolist() == plan.planned_actions[:, :2].tolist()
+    assert line(plan.predicted_centers) == [0.25, 0.5, 1.0, 1.5]
+    assert plan.segments.tolist() == [2]
+    assert plan.expected_success.tolist() == [True]
+    assert plan.subgoals.centers.shape == (1, 0, 1, 3)
+    assert plan.candidate_centers[0, :, :, 0, 0].tolist() == [[0.5, 1.0], [0.5, 0.75], [0.5, 1.5]]
+
+
+def test_cvae_mpc_without_replacement(toy: SimpleNamespace) -> None:
+    plan = cvae_mpc_plan(toy, [[code / 2 for code in row] for row in EFFECTS], **NO_REPLACEMENT)
+    assert plan.candidate_returns.tolist() == [WITHOUT_REPLACEMENT]
+    assert line(plan.predicted_centers) == [0.25, 0.5, 0.625, 0.75]
+
+
+def test_pushes_that_are_not_finite_never_win_even_if_the_dynamics_ignore_it(toy: SimpleNamespace) -> None:
+    class Careless(toy.Flat):  # type: ignore[name-defined]
+        def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
+            pushes = super().actions(state, motion_code=motion_code)
+            return pushes.masked_fill((motion_code[..., 0] > 0)[..., None, None], torch.nan)
+
+        def next_state(self, state: State, action: Tensor) -> State:
+            return super().next_state(state, action.nan_to_num(1.0))
+
+    planner = CvaeMpcPlanner(Careless(), toy.GoalDisc((9.0, 9.0), dense=True), samples=64, horizon=6)
+    assert planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0)).planned_actions.isfinite().all()
+
+
+def test_mpc_agrees_with_brute_force(toy: SimpleNamespace) -> None:
+    model, reward, start = toy.PointMass(), toy.GoalDisc((0.3, 0.05), forbidden_below=-0.05, dense=True), (0.0, 0.0)
+    planner = MpcPlanner(model, reward, samples=50, horizon=6, **PLAIN, **NO_REPLACEMENT)
+    plan = planner.plan(toy.scenes([[start]]), toy.generators(4))
+    source = toy.generators(4)[0]
+    draws = [torch.randn(50, 12, generator=source) for _ in range(2)]  # a segment at a time
+    normal = torch.distributions.Normal(0.0, 1.0)
+    pushes = (2 * normal.cdf(torch.cat(draws, -1)) - 1).unflatten(-1, (6, 4))
+    totals = []
+    for sequence in pushes:
+        state, total = toy.scenes([[start]]), 0.0
+        for push in sequence:
+            before, state = state, model.next_state(state, push)
+            outcome = reward(before.centers, state.centers, state.mask)
+            total += outcome.reward.item()
+            if outcome.success or outcome.failure:
+                break
+        totals.append(total)
+    torch.testing.assert_close(plan.candidate_returns[0], torch.tensor(totals))
+    torch.testing.assert_close(plan.planned_actions[0], pushes[int(torch.tensor(totals).argmax())])
+    assert len({round(total) for total in totals}) > 2  # some die, and at different times
+
+
+def test_mpc_replaces_the_dead_and_repeats_with_its_seed(toy: SimpleNamespace) -> None:
+    reward = toy.GoalDisc((9.0, 9.0), forbidden_below=0.0)
+    planner = MpcPlanner(toy.PointMass(), reward, samples=64, horizon=12)
+    state = toy.scenes([[(0.0, 0.02)], [(0.1, 0.3)]])
+    plan, again = (planner.plan(state, toy.generators(1, 2)) for _ in range(2))
+    assert torch.equal(plan.planned_actions, again.planned_actions)
+    alone = planner.plan(state.scene(slice(1, 2)), toy.generators(2))
+    assert torch.equal(plan.candidate_returns[1], alone.candidate_returns[0])
+    firsts = plan.candidate_centers[0, :, 0, 0]
+    assert (firsts[:, 1] >= 0).all()
+    assert len(firsts.unique(dim=0)) < 64
+
+
+ALL = PerturbedRollouts(candidates=64, rollouts=4)
+
+
+def single(toy: SimpleNamespace) -> type:
+    class Single(toy.PointMass):  # type: ignore[name-defined]
+        """One code for effects and pushes, which do what h says."""
+
+        def actions(self, state: State, effect_code: Tensor) -> Tensor:
+            return super().actions(state, effect_code, torch.zeros_like(effect_code))
+
+    return Single
+
+
+def sectar(toy: SimpleNamespace, reward: object, **options: Any) -> SectarPlanner:
+    return SectarPlanner(single(toy)(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
+
+
+def cvae_mpc(toy: SimpleNamespace, reward: object, **options: Any) -> CvaeMpcPlanner:
+    return CvaeMpcPlanner(toy.Flat(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
+
+
+def mpc(toy: SimpleNamespace, reward: object, **options: Any) -> MpcPlanner:
+    return MpcPlanner(toy.PointMass(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
+
+
+def without_effects(toy: SimpleNamespace, reward: object, **options: Any) -> CavinWithoutEffectsPlanner:
+    return CavinWithoutEffectsPlanner(toy.PointMass(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
+
+
+FACTORIES: list[Callable[..., SearchingPlanner]] = [sectar, cvae_mpc, mpc, without_effects]
+
+
+@pytest.mark.parametrize("make", FACTORIES)
+def test_without_additions_the_first_of_the_highest_returns_wins(make: Callable, toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(0.0, 0.0)], [(0.1, 0.0)]])
+    plan = make(toy, toy.GoalDisc((0.25, 0.0), dense=True), **PLAIN).plan(state, toy.generators(1, 2))
+    best = plan.candidate_returns.argmax(-1)
+    assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
+    ends = plan.candidate_centers[[0, 1], best]
+    found = plan.subgoals.centers if make is sectar else plan.predicted_centers[:, [2, 5]]
+    torch.testing.assert_close(found, ends)
+
+
+@pytest.mark.parametrize("make", FACTORIES)
+def test_a_plan_with_additions_does_not_depend_on_its_neighbours(make: Callable, toy: SimpleNamespace) -> None:
+    planner = make(toy, toy.GoalDisc((0.25, 0.0), forbidden_below=-0.05))
+    assert planner.robustness == PerturbedRollouts()
+    state = toy.scenes([[(0.0, 0.0)], [(0.1, 0.0)]])
+    both, alone = (
+        planner.plan(state, toy.generators(1, 2)),
+        planner.plan(state.scene(slice(1, 2)), toy.generators(2)),
+    )
+    torch.testing.assert_close(both.planned_actions[1], alone.planned_actions[0])
+
+
+@pytest.mark.parametrize("make", FACTORIES)
+def test_the_first_segment_stays_farther_from_forbidden_places(make: Callable, toy: SimpleNamespace) -> None:
+    # Where a push starts moves objects as its motion does, and starts are perturbed by 0.2, 2 cm.
+    reward, state = toy.GoalDisc((0.2, 0.0), radius=0.1, forbidden_below=-0.01), toy.scenes([[(0.0, 0.0)]] * 8)
+    perturbed = PerturbedRollouts(candidates=64, rollouts=8, start_noise=0.2)
+    noise = 0.2 * torch.randn(500, 8, 3, 2, generator=toy.generators(0)[0])
+    shares = []
+    for robustness in (None, perturbed):
+        planner = make(toy, reward, **{**PLAIN, "robustness": robustness})
+        planner.model.next_state = lambda state, action: toy.move(state, 0.1 * (action[..., 2:] + action[..., :2]))
+        pushes = planner.plan(state, toy.generators(*range(8))).actions
+        starts = (pushes[..., :2] + noise).clamp(-1.0, 1.0)
+        path = 0.1 * (starts + pushes[..., 2:]).cumsum(-2)
+        shares.append((path[..., 1] < -0.01).any(-1).float().mean())
+    assert shares[1] < 0.8 * shares[0]
+
+
+@pytest.mark.parametrize("make", FACTORIES)
+def test_where_nothing_fails_the_highest_return_wins(make: Callable, toy: SimpleNamespace) -> None:
+    # Not the pushes that do least: they never fail, and come closest to their own subgoals.
+    state, reward = toy.scenes([[(0.0, 0.0)]] * 8), toy.GoalDisc((0.25, 0.0), radius=0.15)
+    reward.maximum_return = torch.inf  # no rollout stops early
+    plan = make(toy, reward, horizon=15).plan(state, toy.generators(*range(8)))
+    assert plan.expected_success.all() and len(plan.candidate_returns.unique()) > 4
+    assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
+
+
+@pytest.mark.parametrize("make", FACTORIES)
+def test_a_risky_way_to_the_goal_comes_before_doing_nothing(make: Callable, toy: SimpleNamespace) -> None:
+    state, reward = toy.scenes([[(0.0, 0.02)]] * 8), toy.GoalDisc((0.2, 0.02), radius=0.1, forbidden_below=0.0)
+    plan = make(toy, reward).plan(state, toy.generators(*range(8)))
+    assert torch.equal(plan.expected_success, plan.candidate_returns.amax(-1) > 0) and plan.expected_success.any()
+
+
+def test_sectar_takes_the_best_return_where_no_plan_reaches_the_goal(toy: SimpleNamespace) -> None:
+    reward, state = toy.GoalDisc((9.0, 9.0), dense=True), toy.scenes([[(0.0, 0.0)]])
+    plain, ours = (
+        sectar(toy, reward, **{**PLAIN, "robustness": robustness}).plan(state, toy.generators(1))
+        for robustness in (None, ALL)
+    )
+    assert torch.equal(plain.actions, ours.actions)
+
+
+def test_sectar_prefers_effects_that_its_pushes_reach(toy: SimpleNamespace) -> None:
+    class Imprecise(single(toy)):  # type: ignore[misc]
+        """Effects with a positive second code end 5 cm farther than their pushes."""
+
+        def subgoal(self, state: State, effect_code: Tensor) -> State:
+            reached = super().subgoal(state, effect_code)
+            error = 0.05 * (effect_code[..., 1] > 0)[..., None, None] * torch.tensor([0.0, 1.0, 0.0])
+            return reached._replace(centers=reached.centers + error)
+
+    reward, state = toy.GoalDisc((0.1, 0.0), radius=0.2), toy.scenes([[(-0.15, 0.0)]] * 8)
+    signs = []
+    for robustness in (None, ALL):
+        planner = SectarPlanner(Imprecise(), reward, samples=64, horizon=6, **{**PLAIN, "robustness": robustness})
+        signs.append((planner.plan(state, toy.generators(*range(8))).effect_codes[:, 0, 1] > 0).sum())
+    assert signs[0] > 0 and signs[1] == 0
+
+
+@pytest.mark.parametrize("make", [cvae_mpc, sectar])
+def test_pushes_that_are_not_finite_never_win(make: Callable, toy: SimpleNamespace) -> None:
+    reward = toy.GoalDisc((0.2, 0.0), radius=0.15)
+    planner = make(toy, reward, **{**PLAIN, "robustness": ALL})
+    whole, model = planner.model.actions, planner.model
+
+    def broken(state: State, *codes: Tensor, **named: Tensor) -> Tensor:
+        code = codes[0] if codes else named["motion_code"]
+        return whole(state, *codes, **named).masked_fill((code[..., 1] > 0)[..., None, None], torch.nan)
+
+    model.actions, model.next_state = broken, lambda state, action: toy.move(state, 0.1 * action[..., 2:].nan_to_num())
+    if make is sectar:
+        planner._actions = broken
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), toy.generators(*range(4)))
+    assert plan.actions.isfinite().all()
+
+
+def test_codes_are_sampled_as_the_cascade_generates_them(toy: SimpleNamespace) -> None:
+    # Two segments of three samples: a row of each table per segment, and T = 2 pushes by c / 2 + z.
+    effects, motions = [[-0.5, 0.5, -2.0], [0.25, 0.5, 0.0]], [[0.0, 0.125, 0.0], [0.0, 0.25, 0.0]]
+    planner = CavinWithoutEffectsPlanner(toy.Tabled(effects, motions), toy.Line(), samples=3, horizon=4, **PLAIN)
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+    # The second one goes to 0.75, where a copy of it takes the first one's place, and succeeds with its third push.
+    assert plan.candidate_returns[0, 1] == -2.0 + 99.0 == plan.expected_return
+    assert plan.motion_codes[0, :, [0, 16]].tolist() == [[0.5, 0.125], [0.5, 0.25]]
+    assert plan.planned_actions[0, :, 2].tolist() == [0.375, 0.375, 0.5, 0.5]
+    assert plan.predicted_centers[0, :2, 0, 0].tolist() == [0.375, 0.75]
+    assert plan.motion_codes.shape == (1, 2, 32) and plan.effect_codes.shape == (1, 0, 0)
+    assert plan.subgoals.centers.shape == (1, 0, 1, 3)
+
+
+def test_h_is_not_asked(toy: SimpleNamespace) -> None:
+    class WithoutSubgoals(toy.PointMass):  # type: ignore[name-defined]
+        def subgoal(self, state: State, effect_code: Tensor) -> State:
+            raise AssertionError
+
+    planner = CavinWithoutEffectsPlanner(WithoutSubgoals(), toy.GoalDisc((0.2, 0.0)), samples=64, horizon=6)
+    assert planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(1)).actions.isfinite().all()
+
+
+@pytest.mark.parametrize("horizon", ["full_horizon", "first_segment"])
+def test_one_motion_is_the_one_that_is_drawn(horizon: str, toy: SimpleNamespace) -> None:
+    asked = []
+
+    class Counting(toy.PointMass):  # type: ignore[name-defined]
+        def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
+            asked.append(motion_code)
+            return super().actions(state, effect_code, motion_code)
+
+    state, reward = toy.scenes([[(0.0, 0.0)]]), toy.GoalDisc((0.3, 0.0))
+    planner = toy.plain(Counting(), reward, samples=64, horizon=6, motion_horizon=horizon, motion_samples=1)
+    plan = planner.plan(state, toy.generators(1))
+    assert [code.shape for code in asked] == [(1, 1, 16)] * (2 if horizon == "full_horizon" else 1)
+    assert torch.equal(plan.motion_codes[:, :1], asked[0])
+    many = toy.plain(toy.PointMass(), reward, samples=64, horizon=6, motion_horizon=horizon).plan(
+        state, toy.generators(1)
+    )
+    assert torch.equal(plan.effect_codes, many.effect_codes)
+
+
+def test_pushes_are_uniform_in_the_normalised_box(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(0.0, 0.0)]])
+    actions = RandomPlanner(segment_length=20000).plan(state, toy.generators(0)).actions[0]
+    assert actions.abs().max() <= 1.0
+    for quantile in (0.1, 0.5, 0.9):
+        torch.testing.assert_close(
+            actions.quantile(quantile, dim=0), torch.full((4,), 2 * quantile - 1), rtol=0, atol=0.03
+        )
+
+
+def test_pushes_depend_on_the_environments_own_generator_only(toy: SimpleNamespace) -> None:
+    planner = RandomPlanner()
+    together = planner.plan(toy.scenes([[(0.0, 0.0)]] * 2), toy.generators(3, 4))
+    alone = planner.plan(toy.scenes([[(0.7, 0.7)]]), toy.generators(4))
+    assert torch.equal(together.actions[1], alone.actions[0])
+    assert not torch.equal(together.actions[0], together.actions[1])
+
+
+def test_a_random_plan_has_pushes_and_nothing_else(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(0.0, 0.0), (0.1, 0.1)]] * 3, gains=(1.0, 1.0))
+    plan = RandomPlanner().plan(state, toy.generators(0, 1, 2))
+    assert plan.actions.shape == plan.planned_actions.shape == (3, 3, 4)
+    assert plan.subgoals.centers.shape == (3, 0, 2, 3)
+    assert plan.predicted_centers.shape == (3, 0, 2, 3)
+    assert plan.candidate_centers.shape == (3, 0, 0, 2, 3)
+    assert plan.candidate_returns.shape == (3, 0)
+    assert plan.expected_return.isnan().all()
+
+
+def test_bad_input_is_one_clear_line(toy: SimpleNamespace) -> None:
+    with pytest.raises(ValueError, match=r"^segment_length must be at least 1, not 0$"):
+        RandomPlanner(segment_length=0)
+    with pytest.raises(ValueError, match=r"^one generator per environment: 1 needed, 2 given$"):
+        RandomPlanner().plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0, 1))

@@ -1,0 +1,129 @@
+"""Samples of whatever prior the model has, one source of randomness per environment."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+from torch.distributions import Distribution, ExpTransform, Independent, Normal, TransformedDistribution, Uniform
+
+from models.cascaded import CascadedModel
+from models.priors.conditional import ConditionalPrior
+from models.priors.flow import FlowPrior
+from models.priors.mixture import ObjectMixturePrior
+from models.priors.standard import StandardPrior
+from models.state import State
+from planning import CavinPlanner
+from planning.sampling import noise_each, reparameterize, reparameterize_each, sample_each
+
+each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior, ObjectMixturePrior])
+
+
+def model_with(kind: type) -> CascadedModel:
+    torch.manual_seed(0)
+    model = CascadedModel(
+        effect_dimension=5,
+        motion_dimension=4,
+        feature_dimension=1,
+        width=8,
+        effect_prior=kind(dimension=5, feature_dimension=1),
+        motion_prior=kind(dimension=4, feature_dimension=1, effect_dimension=5),
+    )
+    for name, parameter in model.named_parameters():
+        if name.startswith("prior"):
+            nn.init.normal_(parameter, std=0.1)
+    return model
+
+
+def scenes(toy: SimpleNamespace) -> State:
+    return toy.scenes([[(0.5, 0.1), (0.7, -0.1)], [(0.4, -0.2), (0.6, 0.3)]], [1.0, 1.0])
+
+
+def planner(toy: SimpleNamespace, kind: type, horizon: str = "first_segment") -> CavinPlanner:
+    reward = toy.GoalDisc((0.8, 0.0))
+    return toy.plain(model_with(kind), reward, samples=32, horizon=9, motion_horizon=horizon)
+
+
+@each_prior
+@pytest.mark.parametrize("horizon", ["first_segment", "full_horizon"])
+def test_a_plan_comes_out_and_again_from_the_same_seed(kind: type, horizon: str, toy: SimpleNamespace) -> None:
+    planners = [planner(toy, kind, horizon) for _ in range(2)]
+    global_state = torch.get_rng_state()
+    plans = [one.plan(scenes(toy), toy.generators(3, 4)) for one in planners]
+    assert torch.equal(torch.get_rng_state(), global_state)
+    assert plans[0].actions.shape == (2, 3, 4)
+    assert plans[0].effect_codes.shape == (2, 3, 5)
+    assert plans[0].actions.isfinite().all()
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+@each_prior
+def test_noise_stands_for_the_code_that_the_prior_draws_with_it(kind: type, toy: SimpleNamespace) -> None:
+    model, state = model_with(kind), scenes(toy).expand_plans(6)
+    effects = reparameterize_each(model.effect_prior, [state], noise_each((6, 5), toy.generators(3, 4)))
+    torch.testing.assert_close(effects, sample_each(model.effect_prior, [state], toy.generators(3, 4)))
+    motions = reparameterize_each(model.motion_prior, [state, effects], noise_each((6, 4), toy.generators(5, 6)))
+    torch.testing.assert_close(motions, sample_each(model.motion_prior, [state, effects], toy.generators(5, 6)))
+
+
+@each_prior
+def test_an_environment_does_not_see_the_others(kind: type, toy: SimpleNamespace) -> None:
+    both = planner(toy, kind).plan(scenes(toy), toy.generators(3, 4))
+    alone = planner(toy, kind).plan(scenes(toy).scene(slice(1, 2)), toy.generators(4))
+    assert torch.allclose(both.candidate_returns[1], alone.candidate_returns[0], atol=1e-5)
+    assert torch.allclose(both.actions[1], alone.actions[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior, ObjectMixturePrior])
+def test_what_the_prior_has_learned_is_what_is_considered(kind: type, toy: SimpleNamespace) -> None:
+    """A prior trained on codes near 2 proposes codes near 2."""
+    plan = planner(toy, kind)
+    prior, state = plan.model.prior_of_effects, scenes(toy).scene(slice(0, 1)).expand((64,))
+    optimizer = torch.optim.Adam(prior.parameters(), 3e-2)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (-prior(state).log_prob(2 + 0.1 * torch.randn(64, 5))).mean().backward()
+        optimizer.step()
+    first = plan.plan(scenes(toy), toy.generators(3, 4)).effect_codes[0, 0]
+    assert (first - 2).abs().max() < 1
+
+
+def learned_prior(state: State, effect_code: torch.Tensor) -> Distribution:
+    """A prior that reads what it is given."""
+    mean = state.centers[..., 0, :1] + effect_code
+    return Independent(Normal(mean, 0.1), 1)
+
+
+def test_an_environment_draws_the_same_whoever_else_is_in_the_batch(toy: SimpleNamespace) -> None:
+    state = toy.scenes([[(0.1, 0.0)], [(50.0, 0.0)], [(-50.0, 0.0)]]).expand_plans(8)
+    codes = torch.randn(3, 8, 16)
+    together = sample_each(learned_prior, [state, codes], toy.generators(5, 6, 7))
+    for index, seed in enumerate((5, 6, 7)):
+        scene = slice(index, index + 1)
+        alone = sample_each(learned_prior, [state.scene(scene), codes[scene]], toy.generators(seed))
+        assert torch.equal(alone[0], together[index])
+    assert (together[1] > 40).all()
+    assert (together[2] < -40).all()
+
+
+def test_draws_equal_those_of_the_global_generator_with_the_same_seed(toy: SimpleNamespace) -> None:
+    model, state = toy.PointMass(), toy.scenes([[(0.0, 0.0)]]).expand_plans(32)
+    drawn = sample_each(model.effect_prior, [state], toy.generators(11))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(11)
+        expected = torch.randn(32, 16)
+    assert torch.equal(drawn[0], expected)
+
+
+def test_transformed_normals_are_searched_through_their_transforms() -> None:
+    base = Independent(Normal(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 3.0])), 1)
+    prior = TransformedDistribution(base, [ExpTransform()])
+    noise = torch.tensor([[0.0, 1.0], [-1.0, 2.0]])
+    torch.testing.assert_close(reparameterize(prior, noise), torch.tensor([[1.0, 5.0], [0.5, 8.0]]).exp())
+
+
+def test_a_prior_that_cannot_be_searched_is_named() -> None:
+    with pytest.raises(ValueError, match="^codes of a prior of type Uniform can .* shooting and early_stopping=false$"):
+        reparameterize(Uniform(0.0, 1.0), torch.zeros(3))

@@ -1,0 +1,232 @@
+"""Returns, where rewards are taken, stride limits, and the choice among candidates."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from planning import returns
+from planning.protocol import Outcome
+from planning.returns import StrideLimits
+
+POSITIONS = st.floats(-2.0, 2.0, width=32)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    start=st.lists(POSITIONS, min_size=6, max_size=6),
+    end=st.lists(POSITIONS, min_size=6, max_size=6),
+    steps=st.integers(1, 7),
+)
+def test_interpolation_is_linear_and_hits_the_subgoal(start: list, end: list, steps: int) -> None:
+    first, last = torch.tensor(start).view(2, 3), torch.tensor(end).view(2, 3)
+    path = returns.interpolate(first, last, steps)
+    assert path.shape == (steps, 2, 3)
+    assert torch.equal(path[-1], last)
+    moves = torch.diff(torch.cat([first[None], path]), dim=0)
+    torch.testing.assert_close(moves, ((last - first) / steps).expand_as(moves), rtol=0, atol=2e-6)
+
+
+def walk(toy: SimpleNamespace, *positions: float) -> torch.Tensor:
+    """States [T, M = 1, 3] of one object on a line."""
+    return torch.tensor([[[x, 0.0, 0.0]] for x in positions])
+
+
+def advance(toy: SimpleNamespace, *segments: torch.Tensor, mask: bool = True) -> returns.Progress:
+    before = torch.zeros(1, 3)
+    progress = returns.start(before)
+    for path in segments:
+        progress = returns.advance(progress, toy.Line(), before, path, torch.tensor([mask]))
+        before = path[-1]
+    return progress
+
+
+def test_every_step_of_an_active_plan_counts(toy: SimpleNamespace) -> None:
+    progress = advance(toy, walk(toy, 0.1, 0.2, 0.3), walk(toy, 0.4, 0.5, 0.6))
+    assert progress.returns == -6.0
+    assert progress.active
+    assert progress.segments == 2
+
+
+def test_rewards_after_a_success_do_not_count(toy: SimpleNamespace) -> None:
+    ended = advance(toy, walk(toy, 0.5, 1.0, 1.5), walk(toy, -1.0, -1.0, -1.0))
+    assert ended.returns == -1.0 + 99.0
+    assert ended.succeeded
+    assert not ended.failed
+    assert ended.segments == 1
+
+
+def test_rewards_after_a_failure_do_not_count(toy: SimpleNamespace) -> None:
+    ended = advance(toy, walk(toy, -0.2, -0.4, -0.6), walk(toy, 1.0, 1.0, 1.0))
+    assert ended.returns == -2.0 - 101.0
+    assert ended.failed
+    assert not ended.succeeded
+    assert ended.segments == 1
+
+
+def test_a_step_that_succeeds_and_fails_is_a_failure(toy: SimpleNamespace) -> None:
+    def contradictory(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+        both = torch.ones(centers.shape[:-2], dtype=torch.bool)
+        return toy.StepOutcome(torch.zeros(both.shape), both, both)
+
+    path = walk(toy, 0.0)
+    ended = returns.advance(returns.start(path[0]), contradictory, path[0], path, torch.ones(1, dtype=torch.bool))
+    assert ended.failed
+    assert not ended.succeeded
+
+
+def test_the_reward_sees_each_step_with_the_state_before_it(toy: SimpleNamespace) -> None:
+    def distance_moved(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+        moved = (centers - previous)[..., 0, 0]
+        seen.append(moved)
+        never = torch.zeros(moved.shape, dtype=torch.bool)
+        return toy.StepOutcome(moved, never, never)
+
+    seen: list[torch.Tensor] = []
+    path = walk(toy, 0.5, 0.75, 2.0)
+    mask = torch.ones(1, dtype=torch.bool)
+    progress = returns.advance(returns.start(path[0]), distance_moved, torch.zeros(1, 3), path, mask)
+    assert seen[0].tolist() == [0.5, 0.25, 1.25]
+    assert progress.returns == 2.0
+
+
+def test_a_reward_that_judges_whole_paths_is_asked_once_for_each(toy: SimpleNamespace) -> None:
+    asked = []
+
+    class Whole(toy.Line):
+        def along(self, states: torch.Tensor, mask: torch.Tensor) -> Outcome:
+            asked.append(states.shape)
+            return self(states[..., :-1, :, :], states[..., 1:, :, :], mask.unsqueeze(-2).expand(5, 3, 1))
+
+    before, path, mask = torch.zeros(5, 1, 3), torch.randn(5, 3, 1, 3), torch.ones(5, 1, dtype=torch.bool)
+    found = returns.advance(returns.start(before), Whole(), before, path, mask)
+    assert asked == [(5, 4, 1, 3)]
+    for ours, theirs in zip(found, returns.advance(returns.start(before), toy.Line(), before, path, mask), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_a_plan_that_leaves_the_numbers_fails_whatever_the_reward_says(toy: SimpleNamespace) -> None:
+    def cheerful(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+        always = torch.ones(centers.shape[:-2], dtype=torch.bool)
+        return toy.StepOutcome(torch.full(always.shape, 99.0), always, ~always)
+
+    def endless(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+        never = torch.zeros(centers.shape[:-2], dtype=torch.bool)
+        return toy.StepOutcome(torch.full(never.shape, torch.inf), never, never)
+
+    mask = torch.ones(1, dtype=torch.bool)
+    for reward, position in ((cheerful, torch.nan), (cheerful, torch.inf), (endless, 0.0)):
+        path = walk(toy, position)
+        lost = returns.advance(returns.start(path[0]), reward, torch.zeros(1, 3), path, mask)
+        assert lost.returns == -torch.inf
+        assert lost.failed
+        assert not lost.succeeded
+
+
+def test_padding_may_hold_anything(toy: SimpleNamespace) -> None:
+    path = torch.stack([torch.tensor([[0.1, 0.0, 0.0], [torch.nan] * 3])] * 2)
+    mask = torch.tensor([True, False])
+    progress = returns.advance(returns.start(path[0]), toy.Line(), path[0], path, mask)
+    assert progress.returns == -2.0
+    assert progress.active
+
+
+def way(*x: float, objects: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    """States before and after T steps of objects of which the first goes along x and the others stay."""
+    centers = torch.zeros(len(x), objects, 3)
+    centers[:, 0, 0] = torch.tensor(x)
+    return centers[:-1], centers[1:], torch.ones(len(x) - 1, objects, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    ("x", "failures"),
+    [
+        ((0.0, 0.1, 0.2, 0.3), [False, False, False]),
+        ((0.0, 0.01, 0.02, 0.03), [True, False, False]),  # all objects less than 0.1 m
+        ((0.0, 0.2, 0.4, 0.6), [True, False, False]),  # an object more than 0.5 m
+        ((0.0, 0.4, 0.8, 0.2), [False, False, False]),  # only the ends of the segment matter
+    ],
+)
+def test_strides_of_segments(toy: SimpleNamespace, x: tuple[float, ...], failures: list[bool]) -> None:
+    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.1, 0.5], of="segments")
+    outcome = limited(*way(*x))
+    assert outcome.failure.tolist() == failures
+    assert (outcome.reward[outcome.failure] == -100.0).all()
+    assert torch.equal(outcome.reward[1:], toy.Hill((0.0, 0.0))(*way(*x)).reward[1:])
+
+
+def test_strides_of_pushes(toy: SimpleNamespace) -> None:
+    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.01, 0.15], of="pushes")
+    assert limited(*way(0.0, 0.005, 0.105, 0.305)).failure.tolist() == [True, False, True]
+
+
+def test_one_object_that_moves_is_enough_and_one_that_flies_too_much(toy: SimpleNamespace) -> None:
+    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.1, 0.5], of="segments")
+    assert not limited(*way(0.0, 0.1, 0.2, 0.3, objects=3)).failure.any()
+    assert limited(*way(0.0, 0.3, 0.6, 0.9, objects=3)).failure.any()
+    previous, centers, mask = way(0.0, 0.3, 0.6, 0.9, objects=2)
+    mask[:, 0] = False  # padding flies, what is real stays: too short a stride
+    assert limited(previous, centers, mask).failure.any()
+
+
+def test_no_success_outside_the_limits(toy: SimpleNamespace) -> None:
+    reward = toy.GoalDisc(goal=(0.9, 0.0))
+    plain, limited = (
+        returns.advance(returns.start(before[:1][0]), judge, before[:1][0], after, mask[0])
+        for judge in (reward, StrideLimits(reward, [0.1, 0.5], of="segments"))
+        for before, after, mask in [way(0.0, 0.3, 0.6, 0.9)]
+    )
+    assert plain.succeeded
+    assert limited.failed
+    assert not limited.succeeded
+    assert limited.returns == -100.0
+
+
+@pytest.mark.parametrize("limits", [[0.3], [0.3, 0.1], [-0.1, 0.3], 3, ["a", "b"]])
+def test_bad_limits_are_one_clear_line(toy: SimpleNamespace, limits: object) -> None:
+    with pytest.raises(ValueError, match="^stride_limits must be two distances in metres, low then high, not "):
+        StrideLimits(toy.Line(), limits, of="segments")  # type: ignore[arg-type]
+
+
+NAN, INF = torch.nan, torch.inf
+
+
+def test_scores_that_are_not_finite_never_win() -> None:
+    scores = torch.tensor([[NAN, -7.0, INF], [-INF, NAN, -1e30], [3.0, 3.0, 1.0]])
+    assert returns.best_of(scores, "scores").tolist() == [1, 2, 0]
+
+
+def test_nothing_is_chosen_where_no_score_is_finite() -> None:
+    with pytest.raises(ValueError, match=r"^environment 1: none of the 2 returns is finite; check .*$"):
+        returns.best_of(torch.tensor([[0.0, 1.0], [NAN, INF]]), "returns")
+
+
+def test_a_preferred_plan_beats_a_better_score() -> None:
+    scores = torch.tensor([[5.0, 1.0, 2.0]]).expand(3, 3)
+    preferred = torch.tensor([[False, True, True], [False, True, False], [False, False, False]])
+    chosen = returns.best_of(returns.prefer(scores, preferred), "scores")
+    assert chosen.tolist() == [2, 1, 0]
+
+
+def test_distance_adds_squares_over_real_objects_and_weighs_features(toy: SimpleNamespace) -> None:
+    goal = toy.scenes([[(0.0, 0.0), (1.0, 1.0), (9.0, 9.0)]], gains=(1.0, 1.0, 1.0))
+    goal.mask[0, 2] = False
+    state = toy.scenes([[(3.0, 4.0), (1.0, 2.0), (NAN, 0.0)]], gains=(1.0, 3.0, NAN))
+    assert returns.squared_distance(state, goal).tolist() == [25.0 + 1.0]
+    assert returns.squared_distance(state, goal, feature_weight=0.5).tolist() == [26.0 + 0.5 * 4.0]
+
+
+def test_a_segment_is_compared_at_its_end_or_after_its_first_push(toy: SimpleNamespace) -> None:
+    subgoal = toy.scenes([[(0.0, 0.0), (9.0, 9.0)]])
+    subgoal.mask[0, 1] = False
+    end = toy.scenes([[(0.0, 1.0), (5.0, 5.0)]])._replace(features=subgoal.features + 1.0)
+    path = subgoal.centers.unsqueeze(1).repeat(1, 3, 1, 1)
+    path[0, :, 0, 0], path[0, :, 1, 0] = torch.tensor([3.0, NAN, NAN]), NAN  # only the first is read, of real objects
+    assert returns.SubgoalDistance()(end, path, subgoal).tolist() == [1.0]
+    assert returns.SubgoalDistance(at="first_push")(end, path, subgoal).tolist() == [9.0]
+    assert returns.SubgoalDistance(2.0, "first_push")(end, path, subgoal).tolist() == [9.0 + 2.0]
