@@ -10,13 +10,12 @@ from pyro.infer import Trace_ELBO
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.parts import build_guide, build_model, check_sizes, construct
+from cavin_pyro.config.parts import build_guide, build_model, construct
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
-from cavin_pyro.storage.geometry import check_fit, load_pointnet
+from cavin_pyro.storage.geometry import check_fit
 from cavin_pyro.training.run import build_objective
 from models.likelihoods import PredictedScales
 from models.model import Model
-from models.networks.contact.dynamics import ContactDynamics
 from models.networks.outline import Outline
 from models.networks.pointnet import PointNet
 
@@ -79,12 +78,6 @@ def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNam
     )
 
 
-def test_the_guide_of_a_model_has_its_dimensions(small: SimpleNamespace) -> None:
-    config = small.config()
-    guide = build_guide(config, build_model(config))
-    assert guide.effect_inference.code.head.out_features == 2 * 4
-
-
 @pytest.mark.parametrize(
     ("part", "said"),
     [
@@ -106,13 +99,6 @@ def test_parts_that_cannot_be_built_are_named(part: dict, said: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_sizes_are_counts() -> None:
-    check_sizes("model", {"width": 1, "scale": 0.0, "flag": False, "name": "x", "nothing": None})
-    for value in (0, -3):
-        with pytest.raises(UserError, match=f"^model.width must be at least 1, not {value}$"):
-            check_sizes("model", {"width": value})
-
-
 def test_an_objective_is_any_elbo_of_pyro(small: SimpleNamespace) -> None:
     config = {"objective": {"_target_": "pyro.infer.Trace_ELBO", "num_particles": 3, "vectorize_particles": True}}
     objective = build_objective(config, build_model(small.config()))
@@ -127,13 +113,6 @@ def test_a_model_must_take_the_features_and_the_objects_that_there_are(small: Si
         check_fit(model, PointNet(32), 5)
     with pytest.raises(UserError, match="maximum_objects=5, but datasets have room for 6"):
         check_fit(model, PointNet(), 6)
-
-
-def test_a_file_without_pointnet_is_refused(small: SimpleNamespace, tmp_path: Path) -> None:
-    path = tmp_path / "a.safetensors"
-    save_checkpoint(path, parts={"model": small.parts()["model"]}, config={}, provenance={})
-    with pytest.raises(UserError, match=r"a\.safetensors holds no PointNet"):
-        load_pointnet(path)
 
 
 def test_an_f_that_reads_outlines_needs_them(small: SimpleNamespace) -> None:
@@ -154,14 +133,6 @@ def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> N
         build_model(config)
     contact = {"dynamics": {"_target_": "models.networks.contact.dynamics.ContactDynamics"}}
     assert isinstance(build_model(config | contact).scales, PredictedScales)
-
-
-@pytest.mark.parametrize("margin", [0, 0.0, None])
-def test_the_reach_margin_of_f_may_be_zero_or_none(small: SimpleNamespace, margin: float | None) -> None:
-    contact = {"_target_": "models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
-    dynamics = build_model(small.config() | {"dynamics": contact}).dynamics
-    assert isinstance(dynamics, ContactDynamics)
-    assert dynamics.reach_margin == margin
 
 
 @pytest.mark.parametrize("margin", [-1, -0.01])
