@@ -94,7 +94,7 @@ FARTHER = [
     Row("3 objects", "gathering"),
 ]
 LEFT_OUT = {  # an addition, and the options without it
-    "all": (),
+    "nothing": (),
     "one push per plan": ("pushes_per_plan=null",),
     "perturbed rollouts": ("planner.robustness=null",),
     "failure avoidance": ("planner.avoid_failures=false",),

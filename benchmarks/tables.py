@@ -125,10 +125,11 @@ def additions() -> str:
     """Each addition left out, beside all of them in the same scenes; a star where McNemar's p is below 0.05."""
     rows = read("additions")
     cells = groups(rows, "task", "objects")
-    everything = groups([row for row in rows if row["row"] == "all"], "task", "objects")
+    everything = groups([row for row in rows if row["row"] == "nothing"], "task", "objects")
     lines = []
     for (name,), of_row in groups(rows, "row").items():
-        by_cell, line = groups(of_row, "task", "objects"), [name]
+        by_cell = groups(of_row, "task", "objects")
+        line: list[object] = [name, ", ".join(str(len(by_cell.get(cell, []))) for cell in cells)]
         for cell in cells:
             found = by_cell.get(cell, [])
             if not found:
@@ -137,15 +138,13 @@ def additions() -> str:
             without, complete, p = paired(found, everything[cell])
             successes = sum(row["outcome"] == "success" for row in found)
             text = f"{100 * successes / len(found):.1f} %"
-            line.append(text if name == "all" else f"{text} ({without}, {complete}){'*' * (p < 0.05)}")
+            line.append(text if name == "nothing" else f"{text} ({without}, {complete}){'*' * (p < 0.05)}")
             violations = sum(row["outcome"] in ("violation", "fall") for row in found)
             steps = statistics.mean(row["steps"] for row in found if row["outcome"] == "success")
-            ms = statistics.median(value for row in found for value in row["planning_ms"])
-            line.append(f"{violations}, {steps:.1f}, {ms:.0f}")
+            line.append(f"{violations}, {steps:.1f}")
         lines.append(line)
-    counts = {cell: len(found) for cell, found in everything.items()}
-    head = [text for task, objects in cells for text in (f"{task}, {objects}: {counts[task, objects]} scenes", "...")]
-    table = markdown(["left out", *head], lines)
+    head = [text for task, objects in cells for text in (f"{task}, {objects}", "violations and falls, pushes")]
+    table = markdown(["left out", "scenes", *head], lines)
     return f"{table}\nSeeds {seeds(rows)}, commit {', '.join(sorted({row['commit'] for row in rows}))}.\n"
 
 
