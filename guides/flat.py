@@ -5,10 +5,9 @@ from __future__ import annotations
 import pyro
 from torch import Tensor
 
-from guides.guide import Guide
-from guides.networks import MotionInference
+from guides.guide import Guide, MotionInference
 from models.flat import FlatModel
-from models.program import sequence_mask, windows_plate
+from models.model import sequence_mask, windows_plate
 from models.state import Window
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pyro
 from torch import Tensor
 
-from guides.guide import Guide
-from guides.networks import EffectInference
-from models.program import sequence_mask, windows_plate
+from guides.guide import EffectInference, Guide
+from models.model import sequence_mask, windows_plate
 from models.single_latent import SingleLatentModel
 from models.state import Window
 

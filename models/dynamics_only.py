@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from models.model import Model
-from models.program import windows_plate
+from models.model import Model, windows_plate
 from models.state import Window
 
 

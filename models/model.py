@@ -1,22 +1,35 @@
-"""Base class of model programs."""
+"""Base classes of programs and of models, the plate over windows, and the mask of sites with codes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pyro
 import torch
+from pyro import poutine
 from pyro.distributions import TorchDistribution
-from torch import Tensor
+from torch import Tensor, nn
 
 from models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from models.networks.dynamics import Dynamics, PushOutcome
-from models.networks.encoder import StateEncoder
-from models.networks.layers import fixed_shapes, unit
-from models.program import Program
+from models.networks.layers import StateEncoder, fixed_shapes, unit
 from models.state import State, Window, stack_steps
+
+
+class Program(nn.Module):
+    """A Pyro program whose networks are its submodules.
+
+    Each call registers the parameters with `pyro.module`, because `SVI` and Pyro's optimizers find them in Pyro's
+    parameter store. `pyro.settings.set(module_local_params=True)` disables the store: `Trace_ELBO()(model, guide)` is
+    then an ordinary module for a torch optimizer, and calls skip the registration, about a tenth of a training step.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        if not pyro.settings.get("module_local_params"):
+            pyro.module(type(self).__name__, self)
+        return super().__call__(*args, **kwargs)
 
 
 class Model(Program):
@@ -182,3 +195,13 @@ class Model(Program):
     def _outcome(self, state: State, action: Tensor) -> tuple[State, Tensor | None]:
         """Mean of f, and the scales that it predicts, if it does."""
         return self.dynamics.outcome(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
+
+
+def windows_plate(window: Window) -> AbstractContextManager:
+    """The plate over the independent windows of a batch `window: [B]`."""
+    return pyro.plate("windows", len(window.actions))
+
+
+def sequence_mask(window: Window) -> AbstractContextManager:
+    """Masks sites by `window.sequence_mask: [B]`."""
+    return poutine.mask(mask=window.sequence_mask)  # type: ignore[call-overload]

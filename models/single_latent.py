@@ -10,11 +10,10 @@ from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from models.model import Model
+from models.model import Model, sequence_mask, windows_plate
 from models.networks.dynamics import ActionGenerator, MetaDynamics
 from models.priors.prior import Prior
 from models.priors.standard import StandardPrior
-from models.program import sequence_mask, windows_plate
 from models.state import State, Window
 
 

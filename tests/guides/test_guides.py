@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from guides.cascaded import CascadedGuide
 from guides.flow import FlowGuide
-from guides.guide import Guide
-from guides.networks import MotionInference
+from guides.guide import Guide, MotionInference
 from models.model import Model
 from models.state import State, Window
 from tests.guides.programs import DIMENSION, GUIDES, MISFITS, MODELS, PAIRS, make, make_model

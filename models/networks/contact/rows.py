@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.networks.encoder import nearest_pairs
+from models.networks.layers import nearest_pairs
 
 
 class Pairs(NamedTuple):

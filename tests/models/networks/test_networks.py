@@ -21,8 +21,7 @@ from models.networks.dynamics import (
     MetaDynamics,
     StateChange,
 )
-from models.networks.encoder import StateEncoder, neighbours
-from models.networks.layers import TABLE_CENTER
+from models.networks.layers import TABLE_CENTER, StateEncoder, neighbours
 from models.networks.pointnet import PointNet, PointNetAutoencoder, chamfer_distance
 from models.state import State
 
