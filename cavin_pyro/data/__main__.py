@@ -18,24 +18,21 @@ def _run() -> None:
     check_packages()
     arguments = _parser().parse_args()
     folders = [Path(folder) for folder in arguments.folders]
-    if arguments.action == "info":
-        from cavin_pyro.data.maintenance import describe
-
-        print("\n\n".join(describe(folder) for folder in folders))
-    elif arguments.action == "verify":
-        from cavin_pyro.data.maintenance import verify
-
-        for folder in folders:
-            verify(folder)
-    elif arguments.action == "merge":
-        from cavin_pyro.data.maintenance import merge
-
-        metadata = merge(folders, arguments.to)
-        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
-    else:
+    if arguments.action == "export":
         from cavin_pyro.data.export import export
 
         print(f"{export(folders[0], arguments.to)} episodes in {arguments.to}")
+        return
+    from cavin_pyro.data.maintenance import describe, merge, verify
+
+    if arguments.action == "info":
+        print("\n\n".join(describe(folder) for folder in folders))
+    elif arguments.action == "verify":
+        for folder in folders:
+            verify(folder)
+    else:
+        metadata = merge(folders, arguments.to)
+        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
 
 
 def _parser() -> Parser:
@@ -51,9 +48,7 @@ def _parser() -> Parser:
         action = actions.add_parser(name, help=said, description=said)
         action.add_argument("folders", nargs=how_many, metavar="DIR", help="dataset folder from collect")
         if name in ("merge", "export"):
-            where = (
-                "folder for the result" if name == "merge" else "folder for the result, named as Minari wants: NAME-v0"
-            )
+            where = "folder for the result; Minari wants a name such as NAME-v0"
             action.add_argument("--to", type=Path, required=True, metavar="DIR", help=where)
     return parser
 

@@ -9,9 +9,10 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
@@ -29,10 +30,6 @@ from cavin_pyro.data.dataset import (
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
 from envs.workspace import POINTS_PER_OBJECT
-
-if TYPE_CHECKING:
-    from gymnasium.spaces import Dict
-    from minari.data_collector import EpisodeBuffer
 
 OBSERVED = ("centers", "clouds", "visible")  # of every state; `mask` is the same in all states of an episode
 TOLD = ("moved", "unsafe", "ineffective", "fallen", "target", "angle")  # of every push, as `infos`
@@ -71,7 +68,7 @@ def export(folder: Path, target: Path) -> int:
             storage = MinariStorage.new(
                 partial.resolve(),  # because Minari takes the size of what it has written from a relative path twice
                 observation_space=observation_space(slots_of(metadata)),
-                action_space=_box((4,), np.float32, 1.0),
+                action_space=spaces.Box(-1.0, 1.0, (4,), np.float32),
                 data_format="hdf5",
             )
             storage.update_metadata(
@@ -92,28 +89,15 @@ def export(folder: Path, target: Path) -> int:
     return int(metadata["episodes"])
 
 
-def observation_space(slots: int) -> Dict:
+def observation_space(slots: int) -> spaces.Dict:
     """What an observation is, M = `slots` objects and P points each."""
-    from gymnasium import spaces
-
-    flags = spaces.MultiBinary(slots)
-    return spaces.Dict(
-        {
-            "centers": _box((slots, 3), np.float32),
-            "clouds": _box((slots, POINTS_PER_OBJECT, 3), np.float16),
-            "visible": flags,
-            "mask": flags,
-        }
-    )
+    infinite, flags = np.inf, spaces.MultiBinary(slots)
+    centers = spaces.Box(-infinite, infinite, (slots, 3), np.float32)
+    clouds = spaces.Box(-infinite, infinite, (slots, POINTS_PER_OBJECT, 3), np.float16)
+    return spaces.Dict({"centers": centers, "clouds": clouds, "visible": flags, "mask": flags})
 
 
-def _box(shape: tuple[int, ...], dtype: Any, limit: float = np.inf) -> Any:
-    from gymnasium.spaces import Box
-
-    return Box(-limit, limit, shape, dtype)
-
-
-def _episodes(folder: Path) -> Iterator[EpisodeBuffer]:
+def _episodes(folder: Path) -> Iterator[Any]:
     """The episodes of a dataset without their padding, a shard in memory at a time."""
     from minari.data_collector import EpisodeBuffer
 

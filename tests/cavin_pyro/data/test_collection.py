@@ -133,13 +133,6 @@ def test_a_full_disk_leaves_whole_files_that_count_and_room_to_go_on(
     assert data_of(tmp_path) == data_of(pushes)
 
 
-def test_a_scene_without_room_is_a_user_error(small: SimpleNamespace, tmp_path: Path) -> None:
-    crowded = replace(small.pushes, minimum_objects=5, ranges=replace(small.pushes.ranges, clearance=2.0))
-    with pytest.raises(UserError, match="no room for 5 objects at least 2 m apart"):
-        collect(crowded, tmp_path, transitions=1, workers=1)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_dataset_is_drawn(pushes: Path, tmp_path: Path) -> None:
     draw_data(tmp_path / "statistics.png", summarize_data(pushes))
     assert imageio.imread(tmp_path / "statistics.png").std() > 10

@@ -56,7 +56,7 @@ def test_features_that_do_not_fit_their_shard_are_made_again(what: str, own_push
     pointnet = PointNet()
     fingerprint = geometry_fingerprint(pointnet)
     good, other = (shard_features(own_pushes, number, pointnet, fingerprint) for number in (0, 1))
-    path, digest = own_pushes / f"features-{fingerprint}" / "episodes-00000.h5", None
+    path = own_pushes / f"features-{fingerprint}" / "episodes-00000.h5"
     digest = read_shard(path)["shard_digest"]
     if what == "cut":
         path.write_bytes(path.read_bytes()[:200])
@@ -79,20 +79,6 @@ def test_a_dataset_that_cannot_be_written_to_can_be_read(own_pushes: Path, monke
     found = shard_features(own_pushes, 0, pointnet, geometry_fingerprint(pointnet))
     np.testing.assert_array_equal(found, cloud_features(pointnet, read_shard(shard_path(own_pushes, 0))["clouds"]))
     assert not list(own_pushes.glob("features-*/*"))
-
-
-def test_half_written_features_are_cleared_away_when_no_training_can_be_writing_them(own_pushes: Path) -> None:
-    geometry = PointNet()
-    fingerprint = geometry_fingerprint(geometry)
-    folder = own_pushes / f"features-{fingerprint}"
-    folder.mkdir()
-    old, young = (folder / f".episodes-00000.cavin-{digits}.partial.h5" for digits in ("00000000", "11111111"))
-    for path in (old, young):
-        path.touch()
-    past = young.stat().st_mtime - features.ABANDONED_SECONDS - 60
-    os.utime(old, (past, past))
-    shard_features(own_pushes, 0, geometry, fingerprint)
-    assert {path.name for path in folder.iterdir()} == {"episodes-00000.h5", young.name}
 
 
 def test_real_clouds_of_all_shards_are_sampled_for_pretraining(pushes: Path, own_pushes: Path) -> None:

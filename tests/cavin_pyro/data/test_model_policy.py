@@ -78,18 +78,6 @@ def test_no_segment_begins_on_an_object(pusher: tuple[Model, Geometry], observat
     assert not observed_points(vars(observation)).blocked(first[None], 0.015).any()
 
 
-def test_pushes_lie_in_the_box_and_the_intent_names_an_object(
-    pusher: tuple[Model, Geometry], observation: Observation
-) -> None:
-    policy = ModelPushingPolicy(np.random.default_rng(2), *pusher, motions=MOTIONS)
-    for _ in range(9):
-        push = policy.act(observation)
-        assert push.shape == (4,)
-        assert (np.abs(push) <= 1).all()
-        assert observation.mask[policy.intent.target]
-        assert -np.pi <= policy.intent.angle <= np.pi
-
-
 def test_the_seed_determines_the_pushes_whatever_the_number_of_threads(
     pusher: tuple[Model, Geometry], observation: Observation
 ) -> None:

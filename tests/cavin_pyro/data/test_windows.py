@@ -138,13 +138,6 @@ def test_a_batch_holds_what_the_arrays_hold_from_a_file_without_a_name(tmp_path:
     assert len(set(table.batch(bucket).states.mask.sum(-1).flatten().tolist())) == 1
 
 
-@pytest.mark.parametrize("length", [1, 2, 5])
-def test_segments_of_any_length_that_an_episode_holds(length: int, tmp_path: Path) -> None:
-    table = load(tmp_path, made_up_episodes(), replace(EVERY, minimum_move=0.04), segment_length=length)
-    assert len(table.starts) == 12 * (POSITIONS - length)
-    assert table.batch(torch.arange(2)).segment_length == length
-
-
 def test_datasets_can_be_joined_if_their_episodes_have_equal_length(tmp_path: Path) -> None:
     others = made_up_episodes(5, first=70)
     first, second = write_dataset(tmp_path / "a", made_up_episodes()), write_dataset(tmp_path / "b", others)
