@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import pyro
@@ -22,41 +22,30 @@ Codes = dict[str, Tensor]
 
 @torch.no_grad()
 def log_weights(
-    model: Program,
-    guide: Program,
-    window: Window,
-    particles: int,
-    *,
-    fixed: Mapping[str, Tensor] | None = None,
-    excluded: Collection[str] = (),
-    rows: int = ROWS,
+    model: Program, guide: Program, window: Window, particles: int, *, fixed: Mapping[str, Tensor] | None = None
 ) -> Tensor:
     """Logarithms of p(observed, codes) / q(codes) for K samples of the codes of each window `[B]`, in nats.
 
     Args:
-        fixed: values of codes that are not sampled: `[B, D]` for all particles, or `[K, B, D]`. Their densities stay
-            in the weight. excluded: sites that are left out of the weight.
-        rows: bounds the memory: so many particles times windows are computed at once.
+        fixed: values of codes `[K, B, D]` that are not sampled. Their densities stay in the weight.
 
     Returns:
         `[K, B]`, float64.
     """
-    batch, found = len(window.actions), []
-    step = max(1, rows // max(1, batch))
-    wide = {name: value.expand(particles, *value.shape[-2:]) for name, value in (fixed or {}).items()}
+    found = []
+    step = max(1, ROWS // max(1, len(window.actions)))
     for start in range(0, particles, step):
-        here = {name: value[start : start + step] for name, value in wide.items()}
+        here = {name: value[start : start + step] for name, value in (fixed or {}).items()}
         terms = window_terms(model, guide, window, particles=min(step, particles - start), fixed=here)
-        counted = [term.double() for name, term in terms.items() if name.partition("_")[2] not in excluded]
-        found.append(-torch.stack(counted).sum(0))
+        found.append(-torch.stack([term.double() for term in terms.values()]).sum(0))
     return torch.cat(found)
 
 
 @torch.no_grad()
-def sample_guide(guide: Program, window: Window, samples: int, *, rows: int = ROWS) -> Codes:
+def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
     """Codes `[samples, B, D]` of each window `[B]` from the guide; from the prior, if the model takes its place."""
     pieces: dict[str, list[Tensor]] = {}
-    step = max(1, rows // max(1, len(window.actions)))
+    step = max(1, ROWS // max(1, len(window.actions)))
     for start in range(0, samples, step):
         with pyro.plate("particles", min(step, samples - start), dim=-2):
             trace = poutine.trace(guide).get_trace(window)
@@ -66,20 +55,17 @@ def sample_guide(guide: Program, window: Window, samples: int, *, rows: int = RO
 
 
 @torch.no_grad()
-def sample_prior(model: Program, window: Window, *, fixed: Codes | None = None) -> Codes:
-    """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first.
-
-    Codes in `fixed` are not sampled.
-    """
-    codes = _codes(poutine.trace(substitute(model, fixed or {})).get_trace(window))
+def sample_prior(model: Program, window: Window) -> Codes:
+    """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first."""
+    codes = _codes(poutine.trace(model).get_trace(window))
     return {name: site["value"] for name, site in codes.items()}
 
 
 @torch.no_grad()
-def guide_density(guide: Program, window: Window, values: Codes, site: str, *, rows: int = ROWS) -> Tensor:
+def guide_density(guide: Program, window: Window, values: Codes, site: str) -> Tensor:
     """log q(value | window) at one site for `values: [K, B, D]` of all sites: `[K, B]` float64."""
     particles, found = len(values[site]), []
-    step = max(1, rows // max(1, len(window.actions)))
+    step = max(1, ROWS // max(1, len(window.actions)))
     for start in range(0, particles, step):
         here = {name: value[start : start + step] for name, value in values.items()}
         with pyro.plate("particles", len(here[site]), dim=-2):

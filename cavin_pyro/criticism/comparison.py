@@ -12,10 +12,17 @@ from torch import Tensor
 
 from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.elbo import terms_by_window
 from cavin_pyro.criticism.estimates import Interval, mean_interval
-from cavin_pyro.criticism.loading import Accept, Loaded, compare_data, context_of, load_trained, unmasked_windows
+from cavin_pyro.criticism.loading import (
+    Accept,
+    CheckContext,
+    Loaded,
+    compare_data,
+    context_of,
+    load_trained,
+    unmasked_windows,
+)
 from cavin_pyro.criticism.report import Part, render, write_report
 from cavin_pyro.criticism.section import NONE, Section, Table, Verdict, conclude
 from cavin_pyro.criticism.sections import fingerprint_of, run_sections
@@ -111,29 +118,23 @@ def write_pair(config: DictConfig, names: Sequence[str], folder: Path, accept: A
     }
     pair = assess_pair({name: context for name, (context, _) in loaded.items()})
     joined = [render(verdicts_side_by_side(parts)), render(pair)]
-    write_report(folder, {**abouts["a"], **both, "objective": None, "trained": {}}, joined)
+    write_report(folder, {**abouts["a"], **both, "trained": {}}, joined)
     return joined
 
 
 def verdicts_side_by_side(parts: Mapping[str, Sequence[Part]]) -> Section:
-    """A row for each section: the verdicts of `a` and `b`, and what they found."""
+    """A row for each section: the verdicts of `a` and `b`."""
     pairs = list(zip(parts["a"], parts["b"], strict=True))
     levels = {one["name"]: {"a": one["verdict"]["level"], "b": other["verdict"]["level"]} for one, other in pairs}
     differing = [one["title"] for one, _ in pairs if levels[one["name"]]["a"] != levels[one["name"]]["b"]]
     return Section(
         "verdicts",
-        "Verdicts and findings side by side",
+        "Verdicts side by side",
         "The whole report of each stands in the folders a and b, with each verdict's rule.",
         Verdict(NONE, "A comparison of verdicts has none of its own."),
         [f"The verdicts differ in: {'; '.join(differing)}." if differing else "All verdicts are the same."],
         levels,
-        tables=[
-            Table(["section", "a", "b"], [[one["title"], *levels[one["name"]].values()] for one, _ in pairs]),
-            Table(
-                ["section", "a found", "b found"],
-                [[one["title"], *("\n".join(part["findings"]) for part in (one, other))] for one, other in pairs],
-            ),
-        ],
+        tables=[Table(["section", "a", "b"], [[one["title"], *levels[one["name"]].values()] for one, _ in pairs])],
     )
 
 

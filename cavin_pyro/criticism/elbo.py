@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from cavin_pyro.criticism.codes import SYMBOLS, sample_guide
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.estimates import Interval, clustered_interval, mean_interval
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, Table, conclude, grade
 from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.training.elbo import Program, window_terms
@@ -31,13 +31,11 @@ ACTIVE = 0.01  # variance of the posterior mean, of codes whose prior has a vari
 SAMPLES_FOR_MEANS = 64  # of each window's codes, to find the active dimensions
 
 EXPLANATION = (
-    "Nats per window; every term is minus a log density (or a KL), so smaller is better. Densities are of metres and "
-    "unit vectors, so likelihood terms may be negative: read their differences. The last state of a window is scored "
-    "twice, by h as the subgoal and by f as the last transition: so the sum is a bound on the density of the "
-    "program's sites, with two observations of that state, and no log density of a window. The difference is taken at "
-    "equal numbers of objects (by linear regression), which density terms grow with. A dimension of a code is active "
-    "where its posterior mean varies by more than {active} over windows. {training} training and {validation} "
-    "held-out windows."
+    "Nats per window of {training} training and {validation} held-out windows; every term is minus a log density (or "
+    "a KL), so smaller is better. Densities are of metres and unit vectors, so likelihood terms may be negative. The "
+    "last state of a window is scored twice, by h as the subgoal and by f as the last transition, so the sum is no "
+    "log density of a window. Differences are taken at equal numbers of objects, by linear regression. A dimension "
+    "of a code is active where its posterior mean varies by more than {active} over windows."
 )
 
 

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.codes import log_weights
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.estimates import arviz
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.storage.files import atomic_write
 
@@ -124,9 +124,8 @@ def sample_groups(context: CheckContext, *, windows: int, samples: int) -> dict[
 
 def predictions(values: Mapping[str, Tensor], mask: Tensor, steps: Tensor | None = None) -> dict[str, Tensor]:
     """The predicted variables among `values`; `mask: [B, M]`, `steps: [B, T, M]` for each push where that varies."""
-    every = mask.unsqueeze(-2) if steps is None else steps
+    masks = {"subgoal_centers": mask, "next_centers": mask.unsqueeze(-2) if steps is None else steps}
     found = {name: values[name] for name in PREDICTED if name in values}
-    masks = {"subgoal_centers": mask, "next_centers": every}
     return {name: without_padding(value, masks[name]) if name in masks else value for name, value in found.items()}
 
 

@@ -14,8 +14,8 @@ from pyro import poutine
 from torch import Tensor
 
 from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS, Codes, guide_density, log_weights, sample_guide
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.estimates import Interval, arviz, covered, draw_ranks, mean_interval, rank
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
 from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.training.elbo import Program
@@ -32,13 +32,12 @@ JOINT_COLOR = "#009E73"
 
 EXPLANATION = (
     "Codes are sampled from the prior at the first states of {windows} held-out windows of {episodes} episodes, the "
-    "model's program generates a window from each, and {samples} codes are sampled from the guide for each. If the "
-    "guide were the posterior, its 90 % intervals would cover the true code in 90 % of the windows, whatever the "
-    "model. The joint region has the codes at which the guide's density is highest. A dimension is informed where the "
-    "posterior takes more than {informed:.0%} of the prior's variance, given s; others are right without merit. "
-    "On real windows, importance weights p(window, codes) / q(codes) tell how far the guide is from the posterior: "
-    "k-hat is the shape of their tail; above {limit:.2f}, the limit for so many samples (Vehtari and others, 2024), "
-    "the guide misses parts of the posterior that matter."
+    "program generates a window from each, and {samples} codes are sampled from the guide for each. If the guide "
+    "were the posterior, its 90 % intervals would cover the true code in 90 % of the windows, whatever the model. "
+    "The joint region has the codes at which the guide's density is highest. A dimension is informed where the "
+    "posterior takes more than {informed:.0%} of the prior's variance, given s. On real windows, importance weights "
+    "p(window, codes) / q(codes) tell how far the guide is from the posterior: above {limit:.2f}, k-hat of their "
+    "tail says that the guide misses parts of the posterior that matter (Vehtari and others, 2024)."
 )
 
 

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from pyro import poutine
 from torch import Tensor
 
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.estimates import Interval, covered, draw_ranks, rank, ratio_interval
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import MOVED
-from cavin_pyro.criticism.section import Section, Table, conclude, within, worst
+from cavin_pyro.criticism.section import Section, conclude, within, worst
 from cavin_pyro.criticism.windows import repeated, seeded
 from guides.guide import Guide
 from models.model import Model
@@ -42,13 +42,13 @@ PREDICTORS = {
 }
 
 EXPLANATION = (
-    "{samples} samples of each prediction of {windows} held-out windows, in all of which some object moved more than "
-    "{minimum:g} m and none more than {maximum:g} m, as in training. f predicts the state after each push from the "
-    "state before it; h the state after the segment, with codes from the prior (its mixture p(s' | s) over p(c | s), "
-    "what can be known before acting) or from the guide, which knows the result; g the pushes. Objects that moved more "
-    "than 1 cm are shown apart, and no verdict rests on them: that group is chosen by the truth, so that a right model "
-    "need not cover 90 % of it. The stated scale is the spread of the samples, the RMS error of their mean what is "
-    "right. Scales are the weights of the loss: one four times too wide weighs its term sixteen times too little."
+    "{samples} samples of each prediction of {windows} held-out windows, in which some object moved more than "
+    "{minimum:g} m and none more than {maximum:g} m, as in training. f predicts the state after each push; h the "
+    "state after the segment, with codes from the prior (what can be known before acting) or from the guide, which "
+    "knows the result; g the pushes. No verdict rests on the objects that moved more than 1 cm: that group is chosen "
+    "by the truth, so that a right model need not cover 90 % of it. The stated scale is the spread of the samples, "
+    "the RMS error of their mean what is right. Scales are the weights of the loss: one four times too wide weighs "
+    "its term sixteen times too little."
 )
 
 
@@ -101,19 +101,9 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
         },
         "coverage of 90 % intervals of f, x and y of all objects",
         found["f centres"]["90"],
-        [
-            Table(
-                ["intervals of", "50 % cover", "90 % cover", "stated scale", "RMS error"],
-                [
-                    [texts[name], one["50"].percent(1), one["90"].percent(1), one["stated"], one["error"]]
-                    for name, one in found.items()
-                ],
-                digits=4,
-            )
-        ],
-        _figure(predictions, ranks),
-        "Distribution of the PIT (where the truth lies among the samples) minus the uniform one, with a pointwise 95 % "
-        "band: zero if the prediction is right; rising, then falling if its intervals are too narrow.",
+        figure=_figure(predictions, ranks),
+        caption="Distribution of the PIT (where the truth lies among the samples) minus the uniform one, with a "
+        "pointwise 95 % band: zero if the prediction is right; rising, then falling if its intervals are too narrow.",
     )
 
 

@@ -1,20 +1,21 @@
-"""Load the input of checks from a checkpoint and datasets."""
+"""The input of every check: a trained model, its guide, and windows, from a checkpoint and datasets."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.dataset import content_records, read_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
@@ -28,11 +29,56 @@ from cavin_pyro.training.run import data_folders
 from guides.guide import Guide
 from models.model import Model
 from models.networks.geometry import Geometry
+from models.state import Window
 
 # Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
 ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum_move", "negative_fraction")
 
 Accept = Callable[[Model], None]
+
+
+@dataclass(frozen=True)
+class CheckContext:
+    """The input of a check.
+
+    Attributes:
+        model, guide: trained, in evaluation mode, without gradients. geometry: makes the features of new clouds.
+        training: windows `[B]` that the model was trained on. validation: windows `[B]` of held-out episodes. In
+            both every window counts for all terms (`sequence_mask` is set everywhere).
+        seed: of everything random. world: in which new episodes are made.
+        training_episodes, validation_episodes: number of each window's episode `[B]`, by which intervals are clustered;
+            without it every window stands for an episode of its own.
+        selection: the options by which training selected windows, such as how far an object had to move.
+    """
+
+    model: Model
+    guide: Guide
+    geometry: Geometry
+    training: Window
+    validation: Window
+    seed: int = 0
+    world: CollectionConfig = field(default_factory=CollectionConfig)
+    training_episodes: Tensor | None = None
+    validation_episodes: Tensor | None = None
+    selection: WindowConfig = field(default_factory=WindowConfig)
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Names of the model's latent sites: effect_code, motion_code, one of them, or none."""
+        return self.model.codes
+
+    def held_out(self, number: int) -> tuple[Window, Tensor]:
+        """At most `number` of the held-out windows, the same ones each time, and the episode of each `[B]`."""
+        return self._some(self.validation, self.validation_episodes, number)
+
+    def trained_on(self, number: int) -> tuple[Window, Tensor]:
+        """The same of the training windows."""
+        return self._some(self.training, self.training_episodes, number)
+
+    def _some(self, windows: Window, episodes: Tensor | None, number: int) -> tuple[Window, Tensor]:
+        count = len(windows.actions)
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(self.seed))[:number]
+        return windows.map(lambda field: field[order]), (torch.arange(count) if episodes is None else episodes)[order]
 
 
 class Loaded(NamedTuple):
@@ -98,7 +144,7 @@ def load_trained(config: DictConfig, name: str, accept: Accept | None = None) ->
 
 
 def context_of(
-    config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: torch.Tensor
+    config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: Tensor
 ) -> tuple[CheckContext, dict[str, Any]]:
     """The context of a checkpoint and its data, and `about`; `held_out`: indices of windows for validation."""
     path, checkpoint, model, guide, geometry, selection, table, folders = loaded
@@ -126,7 +172,6 @@ def context_of(
         "model": type(model).__name__,
         "guide": type(guide).__name__,
         "prior": _last(own_prior or checkpoint.config["prior"].get("_target_")),
-        "objective": _objective(checkpoint.config),
         "trained": checkpoint.provenance,
         "data": [compare_data(folder, checkpoint.provenance) for folder in folders],
         "windows": {name: len(indices) for name, indices in chosen.items()},
@@ -142,8 +187,8 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     """Whether a checkpoint was trained on a dataset, by the fingerprints in its provenance.
 
     Returns:
-        `folder`, `transitions`, `seed`, `fingerprint` (lists of a merged dataset); `same`: true or false, None where it
-        cannot be told; `verdict`.
+        `folder`, `transitions`, `seed`, `fingerprint` (several of a merged dataset); `same`: true or false, None where
+        it cannot be told; `verdict`.
 
     Raises:
         UserError: no dataset.
@@ -160,14 +205,11 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
         same, verdict = None, "the model was trained on some of these"
     else:
         same, verdict = False, "the model was trained on other data, on none of these episodes"
-    seeds = [record["configuration"].get("seed") for record in records]
-    fingerprints = [record["fingerprint"] for record in records]
-    merged = len(records) > 1
     return {
         "folder": str(folder),
         "transitions": read_metadata(folder)["transitions"],
-        "seed": seeds if merged else seeds[0],
-        "fingerprint": fingerprints if merged else fingerprints[0],
+        "seed": ", ".join(str(record["configuration"].get("seed")) for record in records),
+        "fingerprint": ", ".join(record["fingerprint"] for record in records),
         "same": same,
         "verdict": verdict,
     }
@@ -210,22 +252,16 @@ def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowCo
         ) from error
 
 
-def sample_windows(table: WindowTable, indices: torch.Tensor, count: int, *, seed: Sequence[int]) -> torch.Tensor:
+def sample_windows(table: WindowTable, indices: Tensor, count: int, *, seed: Sequence[int]) -> Tensor:
     """Indices of at most `count` of the windows `indices: [N]` int64, among those that `sequence_mask` keeps."""
     unmasked = unmasked_windows(table, indices)
     order = np.random.default_rng(list(seed)).permutation(len(unmasked))[:count]
     return unmasked[torch.from_numpy(np.sort(order))]
 
 
-def unmasked_windows(table: WindowTable, indices: torch.Tensor) -> torch.Tensor:
+def unmasked_windows(table: WindowTable, indices: Tensor) -> Tensor:
     """Those of the windows `indices: [N]` int64 that `sequence_mask` keeps."""
     return indices[table.sequence_mask[indices]]
-
-
-def _objective(config: Mapping[str, Any]) -> str | None:
-    """The bound that was trained on, for people: the name of its class."""
-    objective = config.get("objective") or {}
-    return _last((objective.get("elbo") or objective).get("_target_"))
 
 
 def _last(target: str | None) -> str | None:

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.estimates import Interval, mean_interval
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import Nearness, Statistic, statistics_of
-from cavin_pyro.criticism.section import Section, Table, conclude, grade, worst
+from cavin_pyro.criticism.section import Section, conclude, within, worst
 from cavin_pyro.criticism.windows import generated, observed, repeated, seeded
 from guides.guide import Guide
 from models.model import Model
@@ -29,22 +29,19 @@ SOURCES = {
     "guide_means": "guide, means",
     "guide": "guide, as sampled",
 }
-SMALL_EFFECT, LARGE_EFFECT = 0.2, 0.8  # small and large by Cohen's (1988) convention
+SMALL_EFFECT, LARGE_EFFECT = (-0.2, 0.2), (-0.8, 0.8)  # by Cohen's (1988) convention
 COLORS = {"prior_means": "#0072B2", "prior": "#56B4E9", "guide_means": "#D55E00", "guide": "#E69F00"}
 COLUMNS = 4
 
 EXPLANATION = (
-    "{replicates} replicated datasets were generated, each with one sample for each of {windows} held-out windows, "
-    "from their first states alone. The windows are a selection, as in training: some object moved more than "
-    "{minimum:g} m, none more than {maximum:g} m, and every push was safe. Codes come from the prior, as in planning "
-    "(prior predictive), or from the guide, which infers from the whole window (posterior predictive). "
-    '"As sampled" is the program with the noise of its likelihoods; "means" and "as planned" have codes '
-    "sampled and all else at the likelihoods' means, as a planner has it. The tail probability is the share of "
-    "replicated datasets whose mean is at least the observed one (ties count half): near 0 the model makes too little "
-    "of it, near 1 too much. Only centres are predicted, so objects stand for discs: two are taken to be inside each "
-    "other where their centres are nearer than {pair:.1f} cm, nearer than in all but 1 % of the training windows; a "
-    "push touches where its path comes within {tool:.1f} cm of a centre, a distance that as many pushes in training "
-    "windows come within as move an object by 1 cm."
+    "{replicates} datasets were generated from the first states of {windows} held-out windows. These are a "
+    "selection, as in training: some object moved more than {minimum:g} m, none more than {maximum:g} m. Codes come "
+    "from the prior (prior predictive) or from the guide, which infers from the whole window (posterior predictive). "
+    '"As sampled" has the noise of the likelihoods; "means" and "as planned" have all but the codes at their means, '
+    "as a planner has it. The tail probability is the share of datasets whose mean is at least the observed one: "
+    "near 0 the model makes too little of it, near 1 too much. Two objects are inside each other where their centres "
+    "are nearer than {pair:.1f} cm, nearer than in all but 1 % of the training windows; a push touches where its "
+    "path comes within {tool:.1f} cm of a centre, as often in training windows as pushes move an object by 1 cm."
 )
 
 
@@ -82,7 +79,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     sizes = {name: effect for name, effect in effects.items() if effect.mean == effect.mean}
     largest = max(sizes, key=lambda name: abs(sizes[name].mean), default=None)
     labels = {one.name: one.label for one in statistics}
-    level = worst(grade(*_magnitude(one), good=SMALL_EFFECT, bad=LARGE_EFFECT) for one in sizes.values())
+    level = worst(within(one.low, one.high, good=SMALL_EFFECT, bad=LARGE_EFFECT) for one in sizes.values())
     return Section(
         NAME,
         TITLE,
@@ -97,8 +94,8 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         conclude(
             level,
             "The difference of each statistic, as planned, from the observed one, in standard deviations of single "
-            f"windows: good if every 95 % interval over episodes lies within {SMALL_EFFECT:g}, bad if one lies beyond "
-            f"{LARGE_EFFECT:g}." + (f" Largest: {labels[largest]}." if largest else ""),
+            f"windows: good if every 95 % interval over episodes lies within {SMALL_EFFECT[1]:g}, bad if one is beyond "
+            f"{LARGE_EFFECT[1]:g}." + (f" Largest: {labels[largest]}." if largest else ""),
             "See which part (h, f or g) the statistic belongs to, and whether codes from the guide have it too.",
             episodes,
         ),
@@ -115,23 +112,8 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         },
         f"{labels[largest]}, as planned minus observed (standard deviations)" if largest else "",
         sizes[largest] if largest else None,
-        [
-            Table(
-                ["mean of", "observed", *(SOURCES[source] for source in sources), "tail as planned", "effect"],
-                [
-                    [
-                        f"{one.label} {f'({one.unit})' if one.unit else ''}",
-                        real[one.name].mean().item(),
-                        *(compared[one.name][source]["mean"] for source in sources),
-                        compared[one.name]["prior_means"]["tail"],
-                        effects[one.name].text(),
-                    ]
-                    for one in statistics
-                ],
-            )
-        ],
-        draw_statistics(statistics, real, replicated),
-        "Distribution of each statistic in observed windows (grey) and generated ones.",
+        figure=draw_statistics(statistics, real, replicated),
+        caption="Distribution of each statistic in observed windows (grey) and generated ones.",
     )
 
 
@@ -177,12 +159,6 @@ def effect_size(replicated: Tensor, real: Tensor, episodes: Tensor) -> Interval:
     observed = real.double().reshape(count, -1).mean(-1)
     spread = observed.std() if count > 1 else torch.tensor(0.0)
     return mean_interval((expected - observed) / spread.where(spread > 0, torch.nan), episodes)
-
-
-def _magnitude(effect: Interval) -> tuple[float, float]:
-    """The ends of the interval of an effect's absolute value."""
-    inside = effect.low <= 0 <= effect.high
-    return (0.0 if inside else min(abs(effect.low), abs(effect.high))), max(abs(effect.low), abs(effect.high))
 
 
 def _finding(statistic: Statistic, real: Tensor, compared: Mapping[str, Mapping[str, float]]) -> str:

@@ -14,10 +14,10 @@ from pyro import poutine
 from torch import Tensor, nn
 
 from cavin_pyro.criticism.codes import NO_CODES, Codes, sample_guide, sample_prior
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.estimates import Interval, mean_interval
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
-from cavin_pyro.criticism.section import INSPECT, Section, Table, conclude, grade, not_applicable
+from cavin_pyro.criticism.section import INSPECT, Section, conclude, grade, not_applicable
 from cavin_pyro.criticism.windows import Outcome, generated, seeded
 from cavin_pyro.training.elbo import Program, substitute
 from models.model import Model
@@ -37,13 +37,12 @@ DECAY = 1.0  # of AdamW
 DROPOUT = 0.5  # of the inputs, against overfitting
 
 EXPLANATION = (
-    "A planner samples codes from the prior at the state that it sees. So the prior must agree with the codes that the "
-    "guide infers from what really happened, state by state. For each of {windows} held-out windows of {episodes} "
-    "episodes, one pair (c, z) is taken from the guide and one from the prior at the same first state. A network, "
-    "cross-validated by episode, reads the state, the codes, their place in the prior, and the subgoal and pushes that "
-    "they decode to. Its AUC is the share of held-out pairs that it orders correctly: 0.5 if prior and guide agree. "
-    "The control takes the prior's codes of another scene: a test that cannot see that, cannot see a prior that "
-    "ignores the state."
+    "A planner samples codes from the prior at the state that it sees, so the prior must agree with the codes that "
+    "the guide infers from what really happened, state by state. For each of {windows} held-out windows of "
+    "{episodes} episodes, one pair (c, z) is taken from either. A network, cross-validated by episode, reads the "
+    "state, the codes, their place in the prior, and the subgoal and pushes that they decode to. Its AUC is the "
+    "share of held-out pairs that it orders correctly. The control takes the prior's codes of another scene: a test "
+    "that cannot see that, cannot see a prior that ignores the state."
 )
 
 
@@ -87,14 +86,9 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
         {"windows": len(episodes), "auc": {source: one._asdict() for source, one in found.items()}},
         "AUC of a classifier, guide against prior",
         auc,
-        [
-            Table(
-                ["codes of the guide against", "AUC", "low", "high"], [[SOURCES[name], *found[name]] for name in found]
-            )
-        ],
-        _figure(logits),
-        "Held-out log odds that a pair (c, z) is the guide's, for codes of either source: the further the two curves "
-        "of one colour are apart, the easier they are told apart.",
+        figure=_figure(logits),
+        caption="Held-out log odds that a pair (c, z) is the guide's, for codes of either source: the further the two "
+        "curves of one colour are apart, the easier they are told apart.",
     )
 
 

@@ -67,20 +67,22 @@ def statistics_of(nearness: Nearness) -> list[Statistic]:
             Statistic(f"moved_objects_{part}", moved, partial(_moved_objects, part), part),
             Statistic(f"close_pairs_{part}", near, partial(_close_pairs, part, nearness.pair), part),
         ]
-    touching = f"share of pushes that pass within {tool:.1f} cm of a centre"
+    start, touching = (
+        "from a push's start to the nearest centre",
+        f"share of pushes that pass within {tool:.1f} cm of a centre",
+    )
     return [
         *found,
-        Statistic("start_to_nearest", "from a push's start to the nearest centre", _start_to_nearest, "g", "m"),
+        Statistic("start_to_nearest", start, lambda outcome: start_distances(outcome).amin(-1), "g", "m"),
         Statistic("touching", touching, partial(_touching, nearness.tool), "g"),
     ]
 
 
 def _end(part: str, outcome: Outcome) -> Tensor:
     """Centres `[B, M, 3]` after the segment, as h or f has them."""
-    if part == "f":
-        return outcome.steps[:, -1]
-    assert outcome.subgoal is not None
-    return outcome.subgoal
+    end = outcome.steps[:, -1] if part == "f" else outcome.subgoal
+    assert end is not None
+    return end
 
 
 def _moves(part: str, outcome: Outcome) -> Tensor:
@@ -142,7 +144,3 @@ def start_distances(outcome: Outcome) -> Tensor:
     start, _ = _endpoints(outcome.actions)
     distances = (_before(outcome)[..., :2] - start.unsqueeze(-2)).norm(dim=-1)
     return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
-
-
-def _start_to_nearest(outcome: Outcome) -> Tensor:
-    return start_distances(outcome).amin(-1)

@@ -26,10 +26,9 @@ from torch import Tensor, nn
 from cavin_pyro.config.commands.criticism import CALIBRATED
 from cavin_pyro.config.commands.training import TrainerConfig
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.guide import LEVEL, simulate
 from cavin_pyro.criticism.intervals import assess_intervals
-from cavin_pyro.criticism.loading import Loaded, context_of, load_trained
+from cavin_pyro.criticism.loading import CheckContext, Loaded, context_of, load_trained
 from cavin_pyro.criticism.pushing import MOVED
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.data.collection import CollectionConfig
@@ -135,11 +134,6 @@ def sleep_loss(model: Program, guide: Program, window: Window) -> Tensor:
     return -torch.as_tensor(trace.log_prob_sum()) / len(window.actions)
 
 
-def wake_loss(model: Program, guide: Program, window: Window) -> Tensor:
-    """-ELBO of windows `[B]`, in nats, mean over windows."""
-    return torch.stack(list(elbo_terms(model, guide, window).values())).sum() / len(window.actions)
-
-
 def sleep(
     model: nn.Module,
     guide: nn.Module,
@@ -156,7 +150,7 @@ def sleep(
             loss on windows that are simulated from their first states.
 
     Returns:
-        Mean losses of each tenth of the run: step, sleep, and wake if it counts.
+        The losses after each tenth of the run: step, sleep, and wake if it counts.
 
     Raises:
         UserError: a loss that is not finite.
@@ -166,7 +160,6 @@ def sleep(
     optimizer = torch.optim.Adam(guide.parameters(), lr=learning_rate)
     as_training = TrainerConfig(steps=steps, learning_rate=learning_rate, schedule="cosine")
     rows: list[dict[str, float]] = []
-    sums, since = {"sleep": 0.0, "wake": 0.0}, 0
     with progress_bar("sleeping", total=steps) as bar:
         for step in range(steps):
             for group in optimizer.param_groups:
@@ -174,7 +167,8 @@ def sleep(
             window = batch()
             losses = {"sleep": sleep_loss(model, guide, window)}
             if wake_weight:
-                losses["wake"] = wake_loss(model, guide, window)
+                terms = elbo_terms(model, guide, window).values()
+                losses["wake"] = torch.stack(list(terms)).sum() / len(window.actions)
             total = losses["sleep"] + wake_weight * losses.get("wake", 0.0)
             if not math.isfinite(total.item()):
                 raise UserError(f"calibration stopped after step {step}: the loss is not finite: lower learning_rate")
@@ -182,11 +176,9 @@ def sleep(
             total.backward()
             nn.utils.clip_grad_norm_(guide.parameters(), as_training.clip_norm)
             optimizer.step()
-            sums = {name: sums[name] + loss.item() for name, loss in losses.items()}
             bar.update()
             if (step + 1) * REPORTS // steps > step * REPORTS // steps:
-                rows.append({"step": step + 1} | {name: value / (step + 1 - since) for name, value in sums.items()})
-                sums, since = dict.fromkeys(sums, 0.0), step + 1
+                rows.append({"step": step + 1} | {name: loss.item() for name, loss in losses.items()})
     guide.requires_grad_(False)
     return rows
 

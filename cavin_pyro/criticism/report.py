@@ -2,8 +2,8 @@
 
 Keys of report.json:
 
-    about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`,
-                `prior` and `objective` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
+    about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`
+                and `prior` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `windows_digest` (hash
                 of which ones), `run` (of this check), `graph` of the program (see `cavin_pyro.criticism.graph`)
     sections    by name: `title`, `verdict` (`level`: good, inspect, bad, too few or none; `rule`; `advice`, what to do
@@ -30,11 +30,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavin_pyro.criticism.section import Section, Table
+from cavin_pyro.criticism.section import Section
 from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6
-MISSING = "–"
 IN_JSON = ("title", "verdict", "measure", "number", "findings", "values")
 
 Part = dict[str, Any]
@@ -52,7 +51,7 @@ def render(section: Section) -> Part:
         "number": plain(section.number._asdict()) if section.number else None,
         "findings": list(section.findings),
         "values": plain(section.values),
-        "tables": [_table(table) for table in section.tables],
+        "tables": [asdict(table) for table in section.tables],
         "image": image(section.figure) if section.figure else None,
         "caption": section.caption,
     }
@@ -104,21 +103,3 @@ def image(figure: Figure) -> str:
     with matplotlib.rc_context({"svg.hashsalt": "cavin_pyro"}):
         figure.savefig(drawing, format="svg", metadata={"Date": None})
     return f"data:image/svg+xml;base64,{base64.b64encode(drawing.getvalue()).decode()}"
-
-
-def _table(table: Table) -> dict[str, Any]:
-    """Header, rows of text, and which columns [n] hold numbers."""
-    rows = [[_cell(entry, table.digits) for entry in row] for row in table.rows]
-    numeric = [all(not isinstance(row[column], str) for row in table.rows) for column in range(len(table.header))]
-    return {"header": list(table.header), "rows": rows, "numeric": numeric}
-
-
-def _cell(entry: Any, digits: int) -> str:
-    if isinstance(entry, bool | np.bool_):
-        return "yes" if entry else "no"
-    if isinstance(entry, int | np.integer):
-        return f"{entry:,}".replace(",", "\u202f")
-    if entry is None or isinstance(entry, str):
-        return MISSING if entry is None else entry
-    number = float(entry)
-    return MISSING if math.isnan(number) else f"{number:.{digits}f}".replace("-", "−").replace("inf", "∞")

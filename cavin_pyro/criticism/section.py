@@ -38,11 +38,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers to read: `rows`, each with one entry per column of `header`; floats are shown with `digits`."""
+    """Text in `rows`, each with one entry per column of `header`."""
 
     header: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-    digits: int = 3
+    rows: Sequence[Sequence[str]]
 
 
 @dataclass(frozen=True)

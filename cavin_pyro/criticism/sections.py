@@ -11,10 +11,10 @@ from omegaconf import ListConfig
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import check_sizes
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.elbo import assess_elbo
 from cavin_pyro.criticism.guide import assess_guide
 from cavin_pyro.criticism.intervals import assess_intervals
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.predictive import assess_predictive
 from cavin_pyro.criticism.prior import assess_prior
 from cavin_pyro.criticism.report import Part, render

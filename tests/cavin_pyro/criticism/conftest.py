@@ -11,8 +11,8 @@ from pyro import distributions, poutine
 from pyro.nn import PyroModule
 from torch import Tensor
 
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.guide import simulate
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import seeded
 from guides.cascaded import CascadedGuide
 from models.cascaded import CascadedModel

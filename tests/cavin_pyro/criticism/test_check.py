@@ -19,12 +19,11 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
 from cavin_pyro.criticism.comparison import assess_pair, check_pair, write_pair
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.loading import (
+    CheckContext,
     compare_data,
     load_context,
     load_programs,
-    sample_windows,
     trained_windows,
 )
 from cavin_pyro.criticism.section import Section, Verdict
@@ -109,15 +108,6 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
     assert load_context(check_config("windows=1000"))[1]["windows_digest"] == about["windows_digest"]
     for other in ("windows=2", "seed=1"):
         assert load_context(check_config("windows=3", other))[1]["windows_digest"] != about["windows_digest"]
-
-
-def test_sampled_windows_depend_on_their_seed() -> None:
-    numbers = torch.arange(40)
-    table: Any = SimpleNamespace(sequence_mask=numbers % 2 == 0)
-    first, again, other = (sample_windows(table, numbers, 6, seed=[seed, 0]) for seed in (0, 0, 1))
-    assert len(set(first.tolist())) == 6 and first.equal(again) and not first.equal(other)
-    assert (first % 2 == 0).all()
-    assert sample_windows(table, numbers[:7], 1000, seed=[0]).tolist() == [0, 2, 4, 6]
 
 
 def test_a_report_says_whether_the_model_was_trained_on_the_data(pushes: Path) -> None:

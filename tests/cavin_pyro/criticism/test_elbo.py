@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.elbo import TOTAL, adjusted_difference, assess_elbo, posterior_mean_variance, scene_sizes
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.training.elbo import elbo_terms, window_terms
 

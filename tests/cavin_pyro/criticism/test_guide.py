@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from cavin_pyro.criticism.context import CheckContext
 from cavin_pyro.criticism.guide import assess_guide, importance, simulate
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import seeded
 
 FEW = {"samples": 60, "weighted": 10, "particles": 50}

@@ -9,16 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 from pyro import poutine
 from torch import Tensor
 
 from cavin_pyro.config.commands.training import WindowConfig
 from cavin_pyro.criticism.predictive import assess_predictive, compare, effect_size, replicate
 from cavin_pyro.criticism.pushing import Nearness, statistics_of
-from cavin_pyro.criticism.windows import Outcome, generated, observed, repeated, seeded
+from cavin_pyro.criticism.windows import Outcome, generated, observed, seeded
 from envs.workspace import normalised_push
 from models.cascaded import CascadedModel
 from models.state import State, Window
@@ -103,24 +100,6 @@ def test_nearness_is_what_real_windows_show() -> None:
     assert near.tool == pytest.approx(0.1 * 51 / 101, abs=1e-3)
 
 
-@given(
-    points=arrays.arrays(np.float32, (3, 3), elements=st.floats(0.0, 0.75, width=32)),
-    push=arrays.arrays(np.float32, (4,), elements=st.floats(-1.0, 1.0, width=32)),
-    order=st.permutations(range(3)),
-)
-def test_the_order_of_objects_and_their_padding_do_not_matter(
-    points: np.ndarray, push: np.ndarray, order: list[int]
-) -> None:
-    def made(which: list[int], junk: float) -> Outcome:
-        centers = torch.from_numpy(points)[which][None]
-        centers = torch.cat((centers, torch.full((1, 1, 3), junk)), 1)
-        first = State(centers, torch.zeros(1, 4, 4), torch.tensor([[True] * 3 + [False]]))
-        return Outcome(first, torch.from_numpy(push)[None, None], (centers * 1.05)[:, None], centers * 0.9)
-
-    for name, value in values(made([0, 1, 2], 0.0)).items():
-        assert torch.allclose(value, values(made(order, 0.3))[name], atol=1e-6), name
-
-
 def tails(model: CascadedModel, window: Window, part: str) -> dict[str, float]:
     """Tail probabilities of the means of all statistics that part has to do with, codes from the prior."""
     chosen = [one for one in statistics_of(Nearness.of(observed(window))) if one.part in (part, "g")]
@@ -146,13 +125,6 @@ def test_where_nothing_ever_happens_the_tail_is_a_half_and_the_effect_unknown() 
     assert math.isnan(effect_size(torch.zeros(20, 5), torch.zeros(5), torch.arange(5)).mean)
     observed = torch.tensor([0.0, 2.0])
     assert effect_size(torch.full((3, 2), 2.0), observed, torch.arange(2)).mean == pytest.approx(1 / 2**0.5)
-
-
-def test_copies_add_up_to_as_many_as_asked_for(right: SimpleNamespace) -> None:
-    window = right.windows["f"]
-    batches = list(repeated(window, 25))
-    assert sum(count for count, _ in batches) == 25
-    assert all(torch.equal(copies.actions[-len(window.actions) :], window.actions) for _, copies in batches)
 
 
 def test_means_leave_only_the_codes_to_chance(right: SimpleNamespace) -> None:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from cavin_pyro.criticism.context import CheckContext
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.prior import area_under_curve, assess_prior, held_out_logits, other_episodes
 
 
