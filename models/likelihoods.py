@@ -55,19 +55,6 @@ class Scales:
     def _around_features(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
         return IsotropicNormal(mean, self.feature)
 
-    def planar_errors(self, uniform: Tensor, predicted: Tensor | None = None) -> Tensor:
-        """Errors of centres in x and y, metres, as in `centers`: the sample that `uniform: [..., M, 2]` determines.
-
-        `predicted: [..., M]`, scales of centres. Of two numbers in [0, 1), the first is the probability of a smaller
-        error, the second tells its direction (Box and Muller 1958; for Student's t, Bailey 1994).
-        """
-        radius, angle = self._radius(1.0 - uniform[..., 0], predicted), 2 * math.pi * uniform[..., 1]
-        return torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
-
-    def _radius(self, exceeding: Tensor, predicted: Tensor | None) -> Tensor:
-        """The error in the plane that a sample exceeds with probability `exceeding`."""
-        return self.center * (-2.0 * exceeding.log()).sqrt()
-
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
         # Filled where the means are: a copy from the CPU would let a GPU wait in every step.
@@ -117,12 +104,6 @@ class PredictedScales(LikelihoodScales):
         if predicted is None:
             return super()._around_features(mean, predicted)
         return IsotropicStudentT(self.degrees_of_freedom, mean, predicted)
-
-    def _radius(self, exceeding: Tensor, predicted: Tensor | None) -> Tensor:
-        if predicted is None:
-            return super()._radius(exceeding, predicted)
-        freedom = self.degrees_of_freedom
-        return predicted * (freedom * (exceeding ** (-2.0 / freedom) - 1.0)).sqrt()
 
 
 class LearnedScales(Scales, nn.Module):

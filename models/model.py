@@ -110,16 +110,6 @@ class Model(Program):
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
-    def sampled_next_state(self, state: State, action: Tensor, uniform: Tensor) -> State:
-        """A sample of f in x and y of the centres, which `uniform: [..., M, 2]` in [0, 1) determines; else its mean.
-
-        `state: [...]`, `action: [..., 4]` -> the state after one push.
-        """
-        mean, predicted = self._outcome(state, action)
-        errors = self.scales.planar_errors(uniform, None if predicted is None else predicted[..., 0])
-        errors = errors * mean.mask.unsqueeze(-1)
-        return mean._replace(centers=torch.cat((mean.centers[..., :2] + errors, mean.centers[..., 2:]), -1))
-
     def encode(self, window: Window, generate: bool = False) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 
@@ -178,7 +168,8 @@ class Model(Program):
         """
         samples = []
         for step, action in enumerate(actions.unbind(-2), start=1):
-            mean, predicted = self._outcome(state, action)
+            encoded = self.encoder(state) if self.dynamics.reads_encoding else None
+            mean, predicted = self.dynamics.outcome(state, encoded, action)
             centers = pyro.sample(f"next_centers_{step}", self.scales.centers(mean, state.mask, predicted=predicted))
             features = pyro.sample(f"next_features_{step}", self.scales.features(mean, state.mask, predicted=predicted))
             samples.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
@@ -191,10 +182,6 @@ class Model(Program):
                     f"{name} only records what generation has sampled, so it cannot be conditioned or intervened on: "
                     f"use {name}_1, ..., {name}_{len(samples)}"
                 )
-
-    def _outcome(self, state: State, action: Tensor) -> tuple[State, Tensor | None]:
-        """Mean of f, and the scales that it predicts, if it does."""
-        return self.dynamics.outcome(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
 
 def windows_plate(window: Window) -> AbstractContextManager:

@@ -8,7 +8,7 @@ import torch
 from pyro import distributions
 from torch import Tensor
 
-from models.likelihoods import IsotropicNormal, IsotropicStudentT, LikelihoodScales, PredictedScales
+from models.likelihoods import IsotropicNormal, IsotropicStudentT, LikelihoodScales
 from models.state import State
 
 
@@ -78,18 +78,3 @@ def test_objects_that_do_not_count_add_nothing_and_starts_weigh_more_than_motion
     for push in (one, other):
         below = pushes.log_prob(torch.zeros(3, 4)) - pushes.log_prob(push)
         assert torch.allclose(below, torch.full((2,), 0.5), atol=1e-5)
-
-
-@pytest.mark.parametrize("scales", [LikelihoodScales(), PredictedScales()], ids=["fixed", "predicted"])
-def test_errors_in_the_plane_are_distributed_as_the_likelihood_of_centres(scales: LikelihoodScales) -> None:
-    torch.manual_seed(0)
-    count, own = 100_000, torch.full((100_000, 1), 0.02)
-    mean = State(torch.zeros(count, 1, 3), torch.zeros(count, 1, 4), torch.ones(count, 1, dtype=torch.bool))
-    likelihood = scales.centers(mean, mean.mask, predicted=own.unsqueeze(-1).expand(-1, -1, 2))
-    parts = torch.tensor([0.1, 0.5, 0.9, 0.99])
-    expected = likelihood.sample()[:, 0, :2].norm(dim=-1).quantile(parts)
-    errors = scales.planar_errors(torch.rand(count, 1, 2), own)
-    assert torch.allclose(errors.norm(dim=-1)[:, 0].quantile(parts), expected, rtol=0.05)
-    other = LikelihoodScales(center=0.02) if isinstance(scales, PredictedScales) else PredictedScales()
-    wrong = other.planar_errors(torch.rand(count, 1, 2), own).norm(dim=-1)[:, 0].quantile(parts)
-    assert not torch.allclose(wrong, expected, rtol=0.2)
