@@ -11,10 +11,11 @@ from cavin_pyro.config.application import command
 def main(config: DictConfig) -> None:
     """Run seeded episodes and report rates with their intervals; resumes an interrupted run."""
     import copy
+    from dataclasses import asdict
     from pathlib import Path
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.evaluation.comparison import compare, earlier_rows, record, sentences
+    from cavin_pyro.evaluation.comparison import compare, earlier_rows, sentences
     from cavin_pyro.evaluation.evaluation import NOT_COMPARED, evaluate, merge, seeds_of
     from cavin_pyro.evaluation.factory import make_runner, planner_name
     from cavin_pyro.evaluation.statistics import plan_summary, summarize, table
@@ -39,7 +40,7 @@ def main(config: DictConfig) -> None:
             text += f"\n{said}"
         if others:
             comparison = compare(results["per_episode"], others)
-            results["comparison"] = record(comparison, Path(config.compare))
+            results["comparison"] = {"against": config.compare, **asdict(comparison)}
             text += "\n" + sentences(comparison, Path(config.compare))
         write_json(folder / "results.json", {**results, "provenance": provenance()})
         with atomic_write(folder / "results.txt") as temporary:

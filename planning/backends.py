@@ -84,6 +84,7 @@ class CudaGraphs:
 
     def __init__(self, fixed_shapes: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
         """`fixed_shapes`: opened while functions are captured, to tell models that shapes must not depend on values."""
+        Distribution.set_default_validate_args(False)  # its checks branch on values, which no graph can
         self._graphs: dict[Any, _Graph | None] = {}  # None runs eagerly; the one that was used last comes last
         self._fixed_shapes = fixed_shapes
         self._stream: Any = None  # one for all captures: graphs of other streams would share no memory
@@ -116,7 +117,7 @@ class CudaGraphs:
         if self._stream is None:
             self._stream, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
         try:
-            with self._fixed_shapes(), _unchecked_distributions():
+            with self._fixed_shapes():
                 return _Graph(function, arguments, device, self._stream, self._pool)
         except RuntimeError as error:  # the base class of CUDA's errors
             why = (str(error).splitlines() or [repr(error)])[0]
@@ -171,17 +172,6 @@ def _kind(value: Any, tensors: list[Tensor]) -> Any:
         tensors.append(value)
         return value.dtype, value.shape, value.stride()
     return value
-
-
-@contextmanager
-def _unchecked_distributions() -> Iterator[None]:
-    """Disable torch's validation of distributions: it branches on values, which no graph can."""
-    before = Distribution._validate_args
-    Distribution.set_default_validate_args(False)
-    try:
-        yield
-    finally:
-        Distribution.set_default_validate_args(before)
 
 
 @contextmanager

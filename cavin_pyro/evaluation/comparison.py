@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +14,12 @@ from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import flat_options
-from cavin_pyro.evaluation.rows import violation, with_current_names
+from cavin_pyro.evaluation.rows import violation
 from cavin_pyro.evaluation.statistics import mcnemar
 from cavin_pyro.storage.run_directory import stored_options
 
-SAME_SCENES = (
-    "task",
-    "layout",
-    "tiles",
-    "generated",
-    "criterion",
-    "objects",
-    "maximum_steps",
-    "env",
-)  # options, or sections of them
+# Options, or sections of them.
+SAME_SCENES = ("task", "layout", "tiles", "generated", "criterion", "objects", "maximum_steps", "env")
 
 
 @dataclass(frozen=True)
@@ -83,7 +75,6 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
         ) from error
     except (ValueError, KeyError, TypeError, RecursionError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
-    rows = [with_current_names(row) for row in rows] if isinstance(rows, list) else rows
     if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):
         why = "no list of episodes" if not isinstance(rows, list) else wrong
         raise UserError(f"compare={folder} holds damaged results ({why}): evaluate it again")
@@ -102,8 +93,3 @@ def sentences(result: Comparison, other: Path) -> str:
         f"both solve {result.both}, this one alone {result.one_alone}, the other alone {result.other_alone}, "
         f"neither {result.neither}; exact McNemar test p = {result.p_value:.3g}"
     )
-
-
-def record(result: Comparison, other: Path) -> dict[str, Any]:
-    """The comparison for `results.json`."""
-    return {"against": str(other), **asdict(result)}

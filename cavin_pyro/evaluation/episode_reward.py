@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
+from envs.pushing import PushingEnv
 from envs.tasks import Outcome, Task, TaskReward
-
-
-class TaskSource(Protocol):
-    """The part of `envs.pushing.PushingEnv` that a planner may use: its tasks, without the world."""
-
-    @property
-    def tasks(self) -> Sequence[Task]:
-        """The tasks that an episode may have, each in its layout."""
-
-    @property
-    def task(self) -> Task:
-        """The task of the episode: one of `tasks`, or what its `of_episode` returned."""
 
 
 class EpisodeReward:
@@ -36,7 +22,7 @@ class EpisodeReward:
         ValueError: as `TaskReward` does.
     """
 
-    def __init__(self, env: TaskSource, *, reward: str, margin: float, device: str | torch.device = "cpu") -> None:
+    def __init__(self, env: PushingEnv, *, reward: str, margin: float, device: str | torch.device = "cpu") -> None:
         self._env, self._kind, self._device = env, reward, device
         self.dense, self.margin = reward == "dense", margin
         # With each reward its task, which must live as long: another one could get its number.

@@ -30,51 +30,34 @@ def _shares(value: Any) -> bool:
     return isinstance(value, list) and all(one is None or (_number(one) and 0.0 <= one <= 1.0) for one in value)
 
 
-ALWAYS: dict[str, Callable[[Any], bool]] = {
+FIELDS: dict[str, Callable[[Any], bool]] = {
     "seed": _count,
     "outcome": _outcome,
     "steps": _count,
     "return": _number,
-    "unsafe": _count,
-    "ineffective": _count,
-    "subgoal_distance": lambda value: value is None or _number(value),
-    "planning_ms": lambda value: isinstance(value, list) and all(_number(one) for one in value),
-}
-LATER: dict[str, Callable[[Any], bool]] = {  # which older versions did not write
     "strict_outcome": _outcome,
     "strict_steps": _count,
     "strict_return": _number,
+    "unsafe": _count,
+    "ineffective": _count,
     "plans": _count,
     "plans_reaching_goal": _count,
     "shares_reaching_goal": _shares,
+    "subgoal_distance": lambda value: value is None or _number(value),
+    "planning_ms": lambda value: isinstance(value, list) and all(_number(one) for one in value),
 }
-RENAMED = {"hopeful_plans": "plans_reaching_goal"}  # in the files of older versions: old name, new name
-DROPPED = {"prospects", "success_predictors", "success_probability"}  # of older versions
-
-
-def with_current_names(row: Any) -> Any:
-    """A stored row under the names of this version, without what it no longer has; anything else as it is."""
-    if not isinstance(row, Mapping):
-        return row
-    return {
-        name if RENAMED.get(name, name) in row else RENAMED[name]: value
-        for name, value in row.items()
-        if name not in DROPPED
-    }
 
 
 def violation(row: Any) -> str | None:
     """What makes a value no row of an episode; None if it is one."""
     if not isinstance(row, Mapping):
         return "it is no section"
-    if unknown := sorted(set(row) - {*ALWAYS, *LATER}):
+    if unknown := sorted(set(row) - set(FIELDS)):
         return f"{unknown[0]!r} is unknown"
-    if missing := [name for name in ALWAYS if name not in row]:
+    if missing := [name for name in FIELDS if name not in row]:
         return f"{missing[0]!r} is missing"
-    for name, value in row.items():
-        if not {**ALWAYS, **LATER}[name](value):
-            return f"{name} cannot be {json.dumps(value)[:40]}"
-    return None
+    wrong = next((name for name, fits in FIELDS.items() if not fits(row[name])), None)
+    return None if wrong is None else f"{wrong} cannot be {json.dumps(row[wrong])[:40]}"
 
 
 def finished_episodes(path: Path) -> dict[int, Row]:
@@ -92,7 +75,7 @@ def finished_episodes(path: Path) -> dict[int, Row]:
         raise UserError(f"{path} is damaged ({error}): move it away to run its episodes again") from error
     for number, line in enumerate(lines, 1):
         try:
-            row = with_current_names(json.loads(line))
+            row = json.loads(line)
         except (ValueError, RecursionError):
             continue  # cut off by a kill: its episode is run again
         wrong = violation(row)

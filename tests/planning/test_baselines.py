@@ -68,12 +68,6 @@ def test_sectar_executes_what_g_makes_of_the_best_effect_code(toy: SimpleNamespa
     assert plan.motion_codes.shape == (1, 0, 0)
 
 
-def test_sectar_without_replacement(toy: SimpleNamespace) -> None:
-    plan = sectar_plan(toy, EFFECTS, **NO_REPLACEMENT)
-    assert plan.candidate_returns.tolist() == [WITHOUT_REPLACEMENT]
-    assert line(plan.subgoals.centers) == [0.5, 0.75]
-
-
 def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> None:
     class Broken(toy.Tabled):  # type: ignore[name-defined]
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
@@ -96,25 +90,6 @@ def test_cvae_mpc_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
     assert plan.expected_success.tolist() == [True]
     assert plan.subgoals.centers.shape == (1, 0, 1, 3)
     assert plan.candidate_centers[0, :, :, 0, 0].tolist() == [[0.5, 1.0], [0.5, 0.75], [0.5, 1.5]]
-
-
-def test_cvae_mpc_without_replacement(toy: SimpleNamespace) -> None:
-    plan = cvae_mpc_plan(toy, [[code / 2 for code in row] for row in EFFECTS], **NO_REPLACEMENT)
-    assert plan.candidate_returns.tolist() == [WITHOUT_REPLACEMENT]
-    assert line(plan.predicted_centers) == [0.25, 0.5, 0.625, 0.75]
-
-
-def test_pushes_that_are_not_finite_never_win_even_if_the_dynamics_ignore_it(toy: SimpleNamespace) -> None:
-    class Careless(toy.Flat):  # type: ignore[name-defined]
-        def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
-            pushes = super().actions(state, motion_code=motion_code)
-            return pushes.masked_fill((motion_code[..., 0] > 0)[..., None, None], torch.nan)
-
-        def next_state(self, state: State, action: Tensor) -> State:
-            return super().next_state(state, action.nan_to_num(1.0))
-
-    planner = CvaeMpcPlanner(Careless(), toy.GoalDisc((9.0, 9.0), dense=True), samples=64, horizon=6)
-    assert planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0)).planned_actions.isfinite().all()
 
 
 def test_mpc_agrees_with_brute_force(toy: SimpleNamespace) -> None:
@@ -235,22 +210,6 @@ def test_where_nothing_fails_the_highest_return_wins(make: Callable, toy: Simple
     assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
 
 
-@pytest.mark.parametrize("make", FACTORIES)
-def test_a_risky_way_to_the_goal_comes_before_doing_nothing(make: Callable, toy: SimpleNamespace) -> None:
-    state, reward = toy.scenes([[(0.0, 0.02)]] * 8), toy.GoalDisc((0.2, 0.02), radius=0.1, forbidden_below=0.0)
-    plan = make(toy, reward).plan(state, toy.generators(*range(8)))
-    assert torch.equal(plan.expected_success, plan.candidate_returns.amax(-1) > 0) and plan.expected_success.any()
-
-
-def test_sectar_takes_the_best_return_where_no_plan_reaches_the_goal(toy: SimpleNamespace) -> None:
-    reward, state = toy.GoalDisc((9.0, 9.0), dense=True), toy.scenes([[(0.0, 0.0)]])
-    plain, ours = (
-        sectar(toy, reward, **{**PLAIN, "robustness": robustness}).plan(state, toy.generators(1))
-        for robustness in (None, ALL)
-    )
-    assert torch.equal(plain.actions, ours.actions)
-
-
 def test_sectar_prefers_effects_that_its_pushes_reach(toy: SimpleNamespace) -> None:
     class Imprecise(single(toy)):  # type: ignore[misc]
         """Effects with a positive second code end 5 cm farther than their pushes."""
@@ -299,15 +258,6 @@ def test_codes_are_sampled_as_the_cascade_generates_them(toy: SimpleNamespace) -
     assert plan.subgoals.centers.shape == (1, 0, 1, 3)
 
 
-def test_h_is_not_asked(toy: SimpleNamespace) -> None:
-    class WithoutSubgoals(toy.PointMass):  # type: ignore[name-defined]
-        def subgoal(self, state: State, effect_code: Tensor) -> State:
-            raise AssertionError
-
-    planner = CavinWithoutEffectsPlanner(WithoutSubgoals(), toy.GoalDisc((0.2, 0.0)), samples=64, horizon=6)
-    assert planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(1)).actions.isfinite().all()
-
-
 @pytest.mark.parametrize("horizon", ["full_horizon", "first_segment"])
 def test_one_motion_is_the_one_that_is_drawn(horizon: str, toy: SimpleNamespace) -> None:
     asked = []
@@ -344,21 +294,3 @@ def test_pushes_depend_on_the_environments_own_generator_only(toy: SimpleNamespa
     alone = planner.plan(toy.scenes([[(0.7, 0.7)]]), toy.generators(4))
     assert torch.equal(together.actions[1], alone.actions[0])
     assert not torch.equal(together.actions[0], together.actions[1])
-
-
-def test_a_random_plan_has_pushes_and_nothing_else(toy: SimpleNamespace) -> None:
-    state = toy.scenes([[(0.0, 0.0), (0.1, 0.1)]] * 3, gains=(1.0, 1.0))
-    plan = RandomPlanner().plan(state, toy.generators(0, 1, 2))
-    assert plan.actions.shape == plan.planned_actions.shape == (3, 3, 4)
-    assert plan.subgoals.centers.shape == (3, 0, 2, 3)
-    assert plan.predicted_centers.shape == (3, 0, 2, 3)
-    assert plan.candidate_centers.shape == (3, 0, 0, 2, 3)
-    assert plan.candidate_returns.shape == (3, 0)
-    assert plan.expected_return.isnan().all()
-
-
-def test_bad_input_is_one_clear_line(toy: SimpleNamespace) -> None:
-    with pytest.raises(ValueError, match=r"^segment_length must be at least 1, not 0$"):
-        RandomPlanner(segment_length=0)
-    with pytest.raises(ValueError, match=r"^one generator per environment: 1 needed, 2 given$"):
-        RandomPlanner().plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0, 1))

@@ -154,18 +154,6 @@ def test_fewer_samples_than_iterations_are_refused(name: str) -> None:
         make_optimizer(name, samples=3)
 
 
-@pytest.mark.parametrize("name", sorted(OPTIMIZERS.keys() - {"smc", "evolution"}))
-def test_failed_candidates_are_replaced_on_request(toy: SimpleNamespace, name: str) -> None:
-    reward = CumulativeReward(toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=0.0))
-    for replacement in (False, True):
-        problem = replace(problem_of(toy, 0, 1, segments=4), objective=reward)
-        found = search(OPTIMIZERS[name](replacement=replacement), problem, 100)
-        failed_before = (found.history(lambda segment: segment.rollout.states.centers)[:, :, :3, 0, 1] < 0).any(-1)
-        assert failed_before.any() != replacement
-        if name != "shooting":  # what has become of plans is what their noise says
-            assert torch.equal(problem.evaluate(found.noise).returns, found.returns)
-
-
 @pytest.mark.parametrize("segments", [1, 2, 5])
 @pytest.mark.parametrize("exponent", [0.5, 2.0])
 def test_every_number_keeps_mean_zero_and_variance_one(segments: int, exponent: float) -> None:
@@ -173,9 +161,3 @@ def test_every_number_keeps_mean_zero_and_variance_one(segments: int, exponent: 
     noise = coloured(white, exponent)[0, ..., 0]
     torch.testing.assert_close(noise.mean(0), torch.zeros(segments), rtol=0, atol=0.03)
     torch.testing.assert_close(noise.var(0), torch.ones(segments), rtol=0, atol=0.04)
-
-
-def test_power_falls_with_the_frequency_as_the_exponent_says() -> None:
-    white = torch.randn(1, 40_000, 10, 1, generator=torch.Generator().manual_seed(0))
-    power = torch.fft.rfft(coloured(white, 2.0)[0, ..., 0], dim=1).abs().square().mean(0)
-    torch.testing.assert_close(power[1] / power[2:5], torch.tensor([4.0, 9.0, 16.0]), rtol=0.1, atol=0)

@@ -108,15 +108,6 @@ def test_an_environment_draws_the_same_whoever_else_is_in_the_batch(toy: SimpleN
     assert (together[2] < -40).all()
 
 
-def test_draws_equal_those_of_the_global_generator_with_the_same_seed(toy: SimpleNamespace) -> None:
-    model, state = toy.PointMass(), toy.scenes([[(0.0, 0.0)]]).expand_plans(32)
-    drawn = sample_each(model.effect_prior, [state], toy.generators(11))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(11)
-        expected = torch.randn(32, 16)
-    assert torch.equal(drawn[0], expected)
-
-
 def test_transformed_normals_are_searched_through_their_transforms() -> None:
     base = Independent(Normal(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 3.0])), 1)
     prior = TransformedDistribution(base, [ExpTransform()])

@@ -95,21 +95,6 @@ def test_the_reward_sees_each_step_with_the_state_before_it(toy: SimpleNamespace
     assert progress.returns == 2.0
 
 
-def test_a_reward_that_judges_whole_paths_is_asked_once_for_each(toy: SimpleNamespace) -> None:
-    asked = []
-
-    class Whole(toy.Line):
-        def along(self, states: torch.Tensor, mask: torch.Tensor) -> Outcome:
-            asked.append(states.shape)
-            return self(states[..., :-1, :, :], states[..., 1:, :, :], mask.unsqueeze(-2).expand(5, 3, 1))
-
-    before, path, mask = torch.zeros(5, 1, 3), torch.randn(5, 3, 1, 3), torch.ones(5, 1, dtype=torch.bool)
-    found = returns.advance(returns.start(before), Whole(), before, path, mask)
-    assert asked == [(5, 4, 1, 3)]
-    for ours, theirs in zip(found, returns.advance(returns.start(before), toy.Line(), before, path, mask), strict=True):
-        assert torch.equal(ours, theirs)
-
-
 def test_a_plan_that_leaves_the_numbers_fails_whatever_the_reward_says(toy: SimpleNamespace) -> None:
     def cheerful(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
         always = torch.ones(centers.shape[:-2], dtype=torch.bool)
@@ -126,14 +111,6 @@ def test_a_plan_that_leaves_the_numbers_fails_whatever_the_reward_says(toy: Simp
         assert lost.returns == -torch.inf
         assert lost.failed
         assert not lost.succeeded
-
-
-def test_padding_may_hold_anything(toy: SimpleNamespace) -> None:
-    path = torch.stack([torch.tensor([[0.1, 0.0, 0.0], [torch.nan] * 3])] * 2)
-    mask = torch.tensor([True, False])
-    progress = returns.advance(returns.start(path[0]), toy.Line(), path[0], path, mask)
-    assert progress.returns == -2.0
-    assert progress.active
 
 
 def way(*x: float, objects: int = 1) -> tuple[Tensor, Tensor, Tensor]:
@@ -163,28 +140,6 @@ def test_strides_of_segments(toy: SimpleNamespace, x: tuple[float, ...], failure
 def test_strides_of_pushes(toy: SimpleNamespace) -> None:
     limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.01, 0.15], of="pushes")
     assert limited(*way(0.0, 0.005, 0.105, 0.305)).failure.tolist() == [True, False, True]
-
-
-def test_one_object_that_moves_is_enough_and_one_that_flies_too_much(toy: SimpleNamespace) -> None:
-    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.1, 0.5], of="segments")
-    assert not limited(*way(0.0, 0.1, 0.2, 0.3, objects=3)).failure.any()
-    assert limited(*way(0.0, 0.3, 0.6, 0.9, objects=3)).failure.any()
-    previous, centers, mask = way(0.0, 0.3, 0.6, 0.9, objects=2)
-    mask[:, 0] = False  # padding flies, what is real stays: too short a stride
-    assert limited(previous, centers, mask).failure.any()
-
-
-def test_no_success_outside_the_limits(toy: SimpleNamespace) -> None:
-    reward = toy.GoalDisc(goal=(0.9, 0.0))
-    plain, limited = (
-        returns.advance(returns.start(before[:1][0]), judge, before[:1][0], after, mask[0])
-        for judge in (reward, StrideLimits(reward, [0.1, 0.5], of="segments"))
-        for before, after, mask in [way(0.0, 0.3, 0.6, 0.9)]
-    )
-    assert plain.succeeded
-    assert limited.failed
-    assert not limited.succeeded
-    assert limited.returns == -100.0
 
 
 @pytest.mark.parametrize("limits", [[0.3], [0.3, 0.1], [-0.1, 0.3], 3, ["a", "b"]])

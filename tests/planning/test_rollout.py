@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -108,18 +107,6 @@ def test_what_an_environment_finds_does_not_depend_on_when_others_stop_early(toy
             assert torch.equal(alone.history(read), both.history(read)[own])
 
 
-def test_a_search_that_has_stopped_asks_the_model_nothing_more(
-    toy: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, extend = [], toy.Placed.extend
-    monkeypatch.setattr(toy.Placed, "extend", lambda *given: asked.append(given[1]) or extend(*given))
-    search(toy, dense=False).evaluate(places((0, 1)), early_stopping=True)
-    assert asked == [0, 1]
-    asked.clear()
-    search(toy, dense=False).evaluate(places((3, 0)), early_stopping=True)
-    assert asked == [0, 1, 2, 3]
-
-
 def test_without_an_upper_bound_no_search_stops_before_all_candidates_have_terminated(
     toy: SimpleNamespace,
 ) -> None:
@@ -152,13 +139,6 @@ def test_a_uniform_number_says_which_of_the_living() -> None:
     failed, active = flags("x.x.xx.x"), flags(".x.x..x.")
     uniform = torch.tensor([[0.0, 0.9, 0.3333, 0.0, 0.334, 0.6667, 0.5, 1.0]])  # 1.0: uniform numbers, rounded up
     assert choose_ancestors(failed, active, uniform).tolist() == [[1, 1, 1, 3, 3, 6, 6, 6]]
-
-
-def test_every_living_plan_is_copied_equally_often() -> None:
-    failed = torch.arange(9000)[None] >= 3
-    parents = choose_ancestors(failed, ~failed, uniforms(1, 9000))
-    shares = torch.bincount(parents[failed], minlength=3) / 8997
-    torch.testing.assert_close(shares, torch.full((3,), 1 / 3), rtol=0, atol=0.02)
 
 
 def test_an_environment_without_a_living_plan_keeps_its_plans() -> None:

@@ -86,24 +86,6 @@ def test_the_estimate_of_z_is_unbiased(toy: SimpleNamespace, case: str) -> None:
     assert abs(deviation(evidence.log_evidence, log_z(1.2))[0]) > 10  # another Z is found out
 
 
-def test_an_adaptive_temperature_is_reported_and_its_estimate_is_near_the_z_of_that_temperature(
-    toy: SimpleNamespace,
-) -> None:
-    evidence = estimate(problem_of(toy, runs=20), 4000, temperature=None)
-    assert len(evidence.temperature.unique()) > 1  # every run has its own, so Z differs as well
-    known = torch.tensor([log_z(1 / temperature) for temperature in evidence.temperature.tolist()])
-    torch.testing.assert_close(evidence.log_evidence.float(), known, rtol=0, atol=0.3)
-
-
-@pytest.mark.parametrize("inverse", [0.2, 1.0])
-def test_the_effective_sample_size_is_that_of_the_known_weights(toy: SimpleNamespace, inverse: float) -> None:
-    # n E[w]^2 / E[w^2] with w = exp(inverse * return)
-    evidence = estimate(problem_of(toy, runs=20, segments=1), 20_000, temperature=1 / inverse, moves=0)
-    expected = 20_000 * math.exp(2 * log_z(inverse, 1) - log_z(2 * inverse, 1))
-    assert evidence.effective_samples.shape == (20, 1)
-    torch.testing.assert_close(evidence.effective_samples.mean().item(), expected, rtol=0.02, atol=0)
-
-
 def test_where_no_return_is_finite_z_is_zero(toy: SimpleNamespace) -> None:
     class Nothing(toy.Hill):  # type: ignore[name-defined]
         def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> object:
@@ -167,19 +149,6 @@ def test_moves_lead_to_the_posterior(toy: SimpleNamespace, block: int) -> None:
     torch.testing.assert_close(last.var(0), torch.full((block, 2), 0.2), rtol=0, atol=0.02)
     if block == 1:
         assert torch.equal(particles.noise[:, :, 0], begun(toy, 10_000).noise[:, :, 0])
-
-
-def test_resampling_and_moves_together_draw_from_the_posterior_of_some_temperature(toy: SimpleNamespace) -> None:
-    # With inverse temperature b each number is N(2 b / (1 + 2 b) top, 1 / (1 + 2 b)): mean / top = 1 - variance.
-    problem = SearchProblem(
-        toy.Placed(), CumulativeReward(toy.Hill(TOP)), toy.scenes([[(0.0, 0.0)]]), toy.generators(0), 2
-    )
-    step = 0.5
-    found = search(SequentialMonteCarlo(effective_sample_size=0.5, moves=10, step=step), problem, 20_000 * 16)
-    proposed = found.noise[0, -20_000:]  # by the last move, from x: sqrt(1 - step^2) x + step N(0, 1)
-    mean, variance = proposed.mean(0) / (1 - step**2) ** 0.5, (proposed.var(0) - step**2) / (1 - step**2)
-    assert ((variance > 0.2) & (variance < 0.8)).all()
-    torch.testing.assert_close(mean / torch.tensor(TOP), 1 - variance, rtol=0, atol=0.05)
 
 
 def test_failed_particles_are_replaced_by_copies_of_active_ones(toy: SimpleNamespace) -> None:

@@ -50,21 +50,6 @@ def test_the_temperature_keeps_the_fraction_of_the_living_and_hardly_more(
     torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
 
 
-def test_earlier_sampling_weights_are_divided_out() -> None:
-    returns = torch.tensor([[0.0, -1.0, -2.0, -3.0]])
-    before = 0.7 * returns
-    inverse, logarithms = adapt_temperature(returns, 0.5, before=before)
-    expected = torch.softmax(inverse * returns - before.double(), -1)
-    torch.testing.assert_close(torch.softmax(logarithms, -1), expected)
-
-
-def test_where_many_share_the_highest_return_the_temperature_is_no_lower_than_it_takes() -> None:
-    returns = torch.cat([torch.full((1, 50), 95.0), torch.full((1, 50), -6.0)], -1)
-    inverse, logarithms = adapt_temperature(returns, 0.3)
-    assert 50 <= effective_sample_size(logarithms) <= 55
-    assert inverse < 10 / 101
-
-
 def test_where_nothing_counts_there_are_no_weights() -> None:
     inverse, logarithms = adapt_temperature(torch.full((1, 5), -INFINITE), 0.3)
     assert inverse.isfinite().all()

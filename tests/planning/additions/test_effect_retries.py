@@ -61,16 +61,6 @@ def test_the_other_effect_reaches_the_goal_though_the_search_has_stopped_at_the_
         assert tried.expected_success.item() and tried.segments.item() > 1
 
 
-def test_another_effect_keeps_the_evidence_of_the_search(toy: SimpleNamespace) -> None:
-    own = planner(toy, 3, optimizer="smc", motion_optimizer="shooting")
-    scenes, seeds = [[(0.01, 0.0)], [(-0.4, 0.0)]], (3, 4)  # the first is stuck
-    together = own.plan(toy.scenes(scenes), toy.generators(*seeds)).evidence
-    assert together is not None
-    for number, (scene, seed) in enumerate(zip(scenes, seeds, strict=True)):
-        alone = own.plan(toy.scenes([scene]), toy.generators(seed)).evidence
-        assert alone is not None and torch.equal(alone.log_evidence[0], together.log_evidence[number])
-
-
 @pytest.mark.parametrize("early_stopping", [False, True])
 def test_a_plan_does_not_depend_on_whether_its_neighbours_are_stuck(toy: SimpleNamespace, early_stopping: bool) -> None:
     places = [[(0.01, 0.0)], [(-0.4, 0.0)], [(0.01, 0.2)]]

@@ -104,26 +104,6 @@ def test_complete_plans_keep_their_order_and_their_lead_and_failed_ones_gain_on_
     assert returns[active].argmax() == left.argmin() and returns[active].argmin() == left.argmax()
 
 
-def test_of_two_plans_to_one_place_the_one_that_is_there_earlier_leads(toy: SimpleNamespace) -> None:
-    disc = guided_disc(toy, goal=(1.0, 0.0), radius=0.0)
-    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
-    places = {"early": [0.5, 0.5, 0.5], "late": [0.0, 0.0, 0.5], "astray": [0.5, 0.5, 0.0], "still": [0.0] * 3}
-    returns = {}
-    for name, path in places.items():
-        here = toy.scenes([[(0.0, 0.0)]]).map(lambda field: field.unsqueeze(1))
-        state = objective.start(here)
-        assert state.returns == -20.0  # one metre
-        for segment, x in enumerate(path):
-            there = toy.scenes([[(x, 0.0)]]).map(lambda field: field.unsqueeze(1))
-            rollout = SegmentRollout(torch.zeros(1, 1, 1), None, there, there.centers.unsqueeze(2))
-            state, here = objective.advance(state, segment, here, rollout), there
-        returns[name] = float(state.returns)
-    weights = torch.tensor([0.1, 0.09, 0.81])  # of the states after the three segments
-    assert returns["late"] == pytest.approx(-3 - 20 * float(weights @ torch.tensor([1.0, 1.0, 0.5])))
-    assert returns["early"] == pytest.approx(-3 - 10.0) and returns["still"] == pytest.approx(-3 - 20.0)
-    assert returns["early"] > returns["late"] > returns["astray"] > returns["still"]
-
-
 class Tracked:
     """A tracking cost of 0."""
 
@@ -148,16 +128,6 @@ def test_motions_that_fall_behind_their_subgoal_cost_more_and_those_beyond_it_do
     after = cost.advance(cost.start(reached), 0, reached, rollout)
     torch.testing.assert_close(after.cost, torch.tensor([[0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3]))
     assert not after.executed_cost.any()
-
-
-def test_an_environment_is_guided_as_it_would_be_alone(toy: SimpleNamespace) -> None:
-    reward, model = bridge(), toy.PointMass()
-    places = [tile_center((1, 2)), tile_center((2, 5)), tile_center((3, 3))]
-    planner = toy.plain(model, reward, 64, 6, guidance="layout")
-    together = planner.plan(toy.scenes([[place] for place in places]), toy.generators(1, 2, 3))
-    for number, place in enumerate(places):
-        alone = planner.plan(toy.scenes([[place]]), toy.generators(number + 1))
-        torch.testing.assert_close(together.actions[number], alone.actions[0])
 
 
 def test_what_cannot_guide_is_refused_in_one_line(toy: SimpleNamespace) -> None:

@@ -116,12 +116,3 @@ def test_an_object_that_is_left_out_still_counts_for_the_rules(toy: SimpleNamesp
 
     assert min(lowest()) >= 0.0
     assert min(lowest(avoid_failures=False)) < 0.0
-
-
-def test_each_environment_has_its_own_nearest(toy: SimpleNamespace) -> None:
-    mirrored = [PLACES[0], *PLACES[:0:-1]]
-    planner = CavinPlanner(toy.PointMass(), target_reward(toy), 64, 6, nearest_objects=4)
-    both = planner.plan(toy.scenes([PLACES, mirrored]), toy.generators(0, 1))
-    alone = planner.plan(toy.scenes([mirrored]), toy.generators(1))
-    assert torch.equal(both.actions[1:], alone.actions)
-    assert torch.equal(both.subgoals.centers[1:], alone.subgoals.centers)

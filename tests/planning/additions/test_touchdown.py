@@ -5,14 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cavin_pyro.data.observed import observed_points
 from envs.pushing import PushingEnv
-from envs.workspace import push_endpoints
 from models.state import State
 from planning import CavinPlanner, CvaeMpcPlanner, SectarPlanner
 from planning.additions.touchdown import ObservedPoints, prefer_free
@@ -41,28 +37,12 @@ def test_infinite_points_stand_for_none_among_many() -> None:
     assert many.blocked(starts, 0.01).tolist() == padded.blocked(starts, 0.01).tolist() == [[True, False]]
 
 
-@given(st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=2))
-def test_starts_are_where_the_environment_puts_them(start: list[float]) -> None:
-    place, _ = push_endpoints(np.array([*start, 0.0, 0.0]))
-    low, high = (torch.from_numpy(np.array([push_endpoints(np.array([c, c, 0.0, 0.0]))[0]])) for c in (-1.0, 1.0))
-    points = ObservedPoints(torch.from_numpy(place).reshape(1, 1, 2), low, high)
-    push = torch.tensor([[[*start, 0.0, 0.0]]], dtype=torch.float64)
-    assert points.blocked(push, 1e-6).item()
-
-
 def test_a_blocked_motion_loses_unless_all_are_blocked() -> None:
     scores = torch.tensor([[3.0, 2.0, 1.0]])
     first = pushes((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0))
     assert prefer_free(scores, first, seen((0.5, 0.0)), 0.02).tolist() == [[-torch.inf, 2.0, 1.0]]
     everywhere = seen((0.5, 0.0), (0.75, 0.0), (0.25, 0.0))
     assert torch.equal(prefer_free(scores, first, everywhere, 0.02), scores)
-
-
-@pytest.mark.parametrize("observed", [None, seen(), seen((0.5, 0.0))])
-def test_nothing_is_left_out_without_points_or_without_a_distance(observed: ObservedPoints | None) -> None:
-    scores, first = torch.tensor([[3.0, 2.0]]), pushes((0.0, 0.0), (0.5, 0.0))
-    distance = 0.0 if observed is not None and observed.points.numel() else 0.02
-    assert prefer_free(scores, first, observed, distance) is scores
 
 
 class Scattered:
