@@ -43,8 +43,13 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
         cause, section, place = error, config, ""
         if isinstance(error, InstantiationException):
             cause = error.__cause__ or error  # type: ignore[assignment]
-            if inner := re.search(r"full_key: ([\w.]+)$", str(error)):  # Hydra's name of the part within this one
-                place, section = inner[1], OmegaConf.select(OmegaConf.create(dict(config)), inner[1])
+            inner = re.search(r"full_key: ([\w.]+)$", str(error))  # Hydra's name of a part, from the root of its tree
+            place = inner[1] if inner else ""
+            while place and not isinstance(
+                found := OmegaConf.select(OmegaConf.create(dict(config)), place), DictConfig
+            ):
+                place = place.partition(".")[2]
+            section = found if place else config
         said = "" if isinstance(cause, ValueError) else f"_target_={section.get('_target_')} cannot be built: "
         with naming(place, section):
             raise UserError(said + one_line(cause)) from error
