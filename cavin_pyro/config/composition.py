@@ -37,7 +37,7 @@ OUTPUT = {  # the folder of a run for which the user names none
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
 SAME_RUN = {"output", "workers", "launcher", "address", "transitions", "repair", "sections", "video", "viewer"}
 SAME_RUN |= {"episodes", "compare", "merge"}
-USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=.*", re.DOTALL)
+USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
 
 
 def compose(name: str, *overrides: str) -> DictConfig:
@@ -133,34 +133,22 @@ def of_sweep(overrides: Sequence[str]) -> list[str]:
 
 
 def rewritten(overrides: Sequence[str]) -> list[str]:
-    """The overrides in Hydra's form: `planner.optimizer=cem` as `planner/optimizer=cem`, which brings cem's options."""
-    words = []
-    for word in sections_of_classes(overrides):
+    """The overrides in Hydra's form.
+
+    `planner.optimizer=cem` becomes `planner/optimizer=cem`, which brings cem's options with it. Parts of the world that
+    are ours have a name and no section, which a class of the user's and its arguments need: `env.camera._target_=Mine`
+    becomes `env.camera={} ++env.camera._target_=Mine`.
+    """
+    parts = dict.fromkeys(one[1] for word in overrides if (one := USER_CLASS.match(word)))
+    words = [f"{part}={{}}" for part in parts]
+    for word in overrides:
         key, _, value = word.partition("=")
         group = key.replace(".", "/")
-        by_name = "." in key and (PRESETS / group).is_dir() and re.fullmatch(r"(?!null$)[A-Za-z_][\w.,]*", value)
-        words.append(f"{group}={value}" if by_name else word)
-    return words
-
-
-def sections_of_classes(overrides: Sequence[str]) -> list[str]:
-    """`env.camera._target_=my_lab.Mine +env.camera.noise=1` as `env.camera={_target_: my_lab.Mine, noise: 1}`.
-
-    Parts of the world that are ours have a name and no section, which a class of the user's and its arguments need.
-    Classes with commas between them are a sweep.
-    """
-    words = list(overrides)
-    for part in dict.fromkeys(one[1] for word in overrides if (one := USER_CLASS.fullmatch(word))):
-        option = re.compile(rf"\+{{0,2}}{re.escape(part)}\.([\w.]+)=(.*)", re.DOTALL)
-        of_part = {word: (one[1], one[2]) for word in words if (one := option.fullmatch(word))}
-        values = dict(of_part.values())
-        sections = (
-            ", ".join(f"{name}: {value}" for name, value in {**values, "_target_": target}.items())
-            for target in values["_target_"].split(",")
-        )
-        place = words.index(next(iter(of_part)))
-        words[place] = f"{part}=" + ",".join(f"{{{section}}}" for section in sections)
-        words = [word for word in words if word not in of_part]
+        if key.lstrip("+").startswith(tuple(f"{part}." for part in parts)):
+            word = f"++{word.lstrip('+')}"
+        elif "." in key and (PRESETS / group).is_dir() and re.fullmatch(r"(?!null$)[A-Za-z_][\w.,]*", value):
+            word = f"{group}={value}"
+        words.append(word)
     return words
 
 
@@ -194,7 +182,7 @@ def _default_output(name: str, config: dict[str, Any], hydra_config: Any) -> str
     """A folder that says how a run differs from the usual one: "runs/train-model=flat,guide=flat"."""
     pattern = OUTPUT.get(name, f"runs/{name}")
     told = {*SAME_RUN, *re.findall(r"{(\w+)}", pattern)}
-    overrides = [word.lstrip("+") for word in hydra_config.overrides.task]
+    overrides = [word.lstrip("+") for word in hydra_config.overrides.task if not word.endswith("={}")]
     others = ",".join(sorted(word.replace("/", "-") for word in overrides if word.partition("=")[0] not in told))
     return pattern.format(**{**config, **hydra_config.runtime.choices}) + ("-" if others else "") + others
 

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from cavin_pyro.config.application import read_command_line
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.commands.episodes import CHECKPOINTS
-from cavin_pyro.config.composition import PRESETS, compose, composed, of_sweep, sections_of_classes, sweeps
+from cavin_pyro.config.composition import PRESETS, compose, composed, of_sweep, sweeps
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.help import EXAMPLES, FACTS_OF_PRESETS, WIDTH, help_page, presets
 from cavin_pyro.config.options import flat_options
@@ -181,8 +181,6 @@ def test_a_class_of_the_users_takes_the_place_of_a_part() -> None:
     assert config.env.camera == {"_target_": "my_lab.Mine", "noise": 0.1}
     assert config.env.objects == {"_target_": "my_lab.Others"} and config.env.segmentation == "mask"
     assert (config.planner._target_, config.planner.depth, config.planner.samples) == ("my_lab.Plans", 3, 1024)
-    swept = sections_of_classes(["env.robot.speed=2", "env.robot._target_=my_lab.One,my_lab.Other"])
-    assert swept == ["env.robot={speed: 2, _target_: my_lab.One},{speed: 2, _target_: my_lab.Other}"]
 
 
 def test_presets_of_the_users_own_lie_in_a_folder(tmp_path: Path) -> None:
