@@ -44,7 +44,7 @@ class About:
     @property
     def names(self) -> tuple[str, ...] | None:
         """The choices, None if there is no list of them."""
-        return None if self.choices is None else tuple(named(self.choices))
+        return self.choices and tuple(get_object(self.choices) if isinstance(self.choices, str) else self.choices)
 
     @property
     def range(self) -> str:
@@ -59,21 +59,15 @@ class About:
 
 def option(default: Any, help: str, **about: Any) -> Any:
     """A field of a configuration; for `about` see `About`. A list or a dataclass is copied for each configuration."""
-    about = {name: value for name, value in about.items() if name not in ("group", "limit")}
     metadata = {"about": About(help, **about)}
     if isinstance(default, list | dict) or is_dataclass(default):
         return field(default_factory=lambda: copy.deepcopy(default), metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
-def seed_option(help: str = "seed of all random numbers", default: int = 0, group: str = "") -> Any:
+def seed_option(help: str = "seed of all random numbers", default: int = 0) -> Any:
     """The option `seed`."""
     return option(default, help, minimum=0, maximum=MAXIMUM_SEED)
-
-
-def named(choices: Collection[str] | str) -> Collection[str]:
-    """Choices, or the collection at their dotted path."""
-    return get_object(choices) if isinstance(choices, str) else choices
 
 
 @dataclass(frozen=True)

@@ -22,25 +22,20 @@ class CheckConfig:
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
         f"checkpoint to check: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train",
-        group="model",
     )
-    a: str | None = option(None, "first of two checkpoints to compare, in place of checkpoint", group="model")
+    a: str | None = option(None, "first of two checkpoints to compare, in place of checkpoint")
     b: str | None = option(
-        None, "second checkpoint to compare; both are checked on windows that neither was trained on", group="model"
+        None, "second checkpoint to compare; both are checked on windows that neither was trained on"
     )
-    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
-    data: Any = option("data/pushes", f"{DATA}; preferably the model's training data", group="data")
+    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name")
+    data: Any = option("data/pushes", f"{DATA}; preferably the model's training data")
     output: str | None = option(
-        None,
-        "folder for the report, in which an unfinished check resumes; by default runs/check, or beside it",
-        group="run",
+        None, "folder for the report, in which an unfinished check resumes; by default runs/check, or beside it"
     )
-    seed: int = seed_option(group="run")
-    windows: int = option(1000, "held-out windows, and as many training windows", minimum=1, group="data", limit=10**7)
-    sections: Any = option(None, "sections of the report, [elbo,subgoals]; by default all", group="run")
-    export: str | None = option(
-        None, "file.nc for samples of prior, guide and predictions, which ArviZ reads", group="run"
-    )
+    seed: int = seed_option()
+    windows: int = option(1000, "held-out windows, and as many training windows", minimum=1)
+    sections: Any = option(None, "sections of the report, [elbo,subgoals]; by default all")
+    export: str | None = option(None, "file.nc for samples of prior, guide and predictions, which ArviZ reads")
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
 
@@ -56,27 +51,21 @@ class CalibrateConfig(DeviceOptions):
     checkpoint: str = option(
         DEFAULT_CHECKPOINT,
         f"checkpoint to calibrate: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train",
-        group="model",
     )
-    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name", group="model")
+    trust: list[str] = option([], "modules of your own whose classes the checkpoint may name")
     parts: list[str] = option(
-        ["guide"], f"what to calibrate, {' or '.join(CALIBRATED)}: parts=[guide,scales] does both", group="model"
+        ["guide"], f"what to calibrate, {' or '.join(CALIBRATED)}: parts=[guide,scales] does both"
     )
-    data: Any = option("data/pushes", f"{DATA}; the model's training data", group="data")
-    output: str | None = option(None, "folder for the checkpoint; by default runs/calibrate, or beside it", group="run")
-    seed: int = seed_option(group="run")
-    steps: int = option(1500, "gradient steps", minimum=1, group="training", limit=10**9)
-    batch_size: int = option(256, "windows per step", minimum=1, group="training", limit=10**6)
-    learning_rate: float = option(
-        3e-3, "learning rate of Adam at the start; it falls to a hundredth of that", above=0, group="training"
-    )
+    data: Any = option("data/pushes", f"{DATA}; the model's training data")
+    output: str | None = option(None, "folder for the checkpoint; by default runs/calibrate, or beside it")
+    seed: int = seed_option()
+    steps: int = option(1500, "gradient steps", minimum=1)
+    batch_size: int = option(256, "windows per step", minimum=1)
+    learning_rate: float = option(3e-3, "learning rate of Adam at the start; it falls to a hundredth of that", above=0)
     wake_weight: float = option(
         0.03,
         "weight of -ELBO on real windows beside the loss on generated ones; 0 learns from generated ones alone",
         minimum=0,
-        group="training",
     )
-    windows: int = option(2000, "held-out windows for measurements", minimum=1, group="data", limit=10**7)
-    samples: int = option(
-        50, "samples of the guide for each window, in measurements", minimum=2, group="data", limit=10**5
-    )
+    windows: int = option(2000, "held-out windows for measurements", minimum=1)
+    samples: int = option(50, "samples of the guide for each window, in measurements", minimum=2)
