@@ -44,7 +44,8 @@ class About:
     @property
     def names(self) -> tuple[str, ...] | None:
         """The choices, None if there is no list of them."""
-        return self.choices and tuple(get_object(self.choices) if isinstance(self.choices, str) else self.choices)
+        choices = get_object(self.choices) if isinstance(self.choices, str) else self.choices
+        return None if choices is None else tuple(choices)
 
     @property
     def range(self) -> str:
