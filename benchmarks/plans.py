@@ -7,8 +7,9 @@ Wall time, all in turn, medians and the fastest; crossing, sparse, horizon 30, T
 planned one after another or all at once: how long a search goes on depends on the scene. "Algorithm 1" is compiled
 planning without the perturbed rollouts of `planner.robustness`, which are not in the paper. Set OMP_NUM_THREADS for the
 number of threads. Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The
-public planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out. Options
-of `evaluate` come last, such as `matmul_precision=bfloat16`.
+public planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out, and
+`--first` times the first compiled plan of a process. Options of `evaluate` come last, such as
+`matmul_precision=bfloat16`.
 """
 
 from __future__ import annotations
@@ -101,6 +102,7 @@ def operations(action: Callable[[], object]) -> int:
 def planners(objects: int, samples: int, ways: list[str], options: list[str]) -> tuple[dict[str, Any], State]:
     """A planner for each of the `ways`, and the scenes that they plan for."""
     found: dict[str, Any] = {}
+    torch.compiler.reset()  # which keeps eight versions of a function
     for way in ways:
         one = runner(objects, samples, f"planner.compile={str(way == 'compiled').lower()}", *options)
         found[way], state = one.planner, scenes(one, SCENES)
@@ -132,6 +134,19 @@ def grid(
                     share = f"  {work / (median / 1e3) / rate:5.2f}" if way in ways else ""
                     figures.append(f"{median:7.1f} ({fastest:5.1f}){share}")
                 print("  ".join(figures), flush=True)
+
+
+def first(objects: list[int], samples: int, options: list[str]) -> None:
+    """The first compiled plan of this process: the first process compiles, later ones find torch's cache on disk."""
+    for number in objects:
+        one = runner(number, samples, "planner.compile=true", *options)
+        state = scenes(one, 1)
+        for name in ("first", "second"):
+            began, spent = time.perf_counter(), time.process_time()
+            planning(one.planner, state, 1)()
+            took, spent = time.perf_counter() - began, time.process_time() - spent
+            print(f"{number} objects, {name} plan: {took:.2f} s, of this process's processor {spent:.2f} s", flush=True)
+        one.env.close()
 
 
 def next_state(model: PlanningModel, state: State, action: Tensor) -> State:
@@ -218,7 +233,7 @@ def cem_planner(problem: FlatProblem, samples: int) -> Callable[[], object]:
 
 
 def flat(samples: list[int], repetitions: int, ways: list[str], options: list[str]) -> None:
-    print("the flat problem, 3 objects: ms per plan; all call the same f, eager or compiled by our backend")
+    print("the flat problem, 3 objects: ms per plan; all call the same f, eager or compiled by torch")
     for count in samples:
         runners = {
             # No margin: all maximise the task's own reward.
@@ -249,6 +264,7 @@ def main() -> None:
     parser.add_argument("--no-grid", action="store_true", help="the public planners only")
     parser.add_argument("--no-flat", action="store_true", help="leave the public planners out")
     parser.add_argument("--no-compile", action="store_true", help="leave compiled planning out, and its compilations")
+    parser.add_argument("--first", action="store_true", help="the first plan of a process only: give it twice")
     parser.add_argument("--samples", type=int, nargs="+", help="numbers of samples (256, 1024 and 8192 by default)")
     parser.add_argument("--objects", type=int, nargs="+", help="numbers of objects (1, 3 and 5 by default)")
     parser.add_argument("options", nargs="*", metavar="OPTION=VALUE", help="of evaluate")
@@ -256,6 +272,9 @@ def main() -> None:
     ways = ["eager"] if arguments.no_compile else ["eager", "compiled"]
     samples, objects, repetitions = ([32], [2], 2) if arguments.quick else ([256, 1024, 8192], [1, 3, 5], 4)
     samples, objects = arguments.samples or samples, arguments.objects or objects
+    if arguments.first:
+        first(objects, arguments.samples[0] if arguments.samples else 1024, arguments.options)
+        return
     if not arguments.no_grid:
         grid(samples, objects, repetitions, ways, size=512 if arguments.quick else 2048, options=arguments.options)
     if not arguments.no_flat:
