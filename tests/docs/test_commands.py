@@ -1,0 +1,162 @@
+"""Every command and every block of Python in README and documentation runs, in the order of its page.
+
+A page is a test with a folder of its own. Options that make a command small are added to it. A page that uses data or
+a model which none of its commands makes gets those of the README's commands. A block of Python that begins with a
+file's name is written to that file (`continued` adds to it), as is one of YAML; the others run as one script after the
+page's commands. What does not run is in NOT_RUN, with its reason.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.cavin_pyro.conftest import Case, run_in_turn, run_script
+from tests.docs.pages import FENCE, PAGES, ROOT, Line, commands, name
+
+EPISODES = "maximum_steps=2 planner.samples=8"
+SMALL = {  # options that make each command a matter of a second
+    "collect": "transitions=60 seed=4 steps=6 episodes_per_shard=4 workers=1",
+    "pretrain": "steps=2 batch_size=4 clouds=40",
+    "train": "model.width=8 trainer.steps=2 trainer.validate_every=1 trainer.batch_size=4 trainer.validation_windows=8 "
+    "windows.minimum_move=0.001 windows.validation_fraction=0.4",
+    "plan": f"{EPISODES} video=false",
+    "evaluate": f"{EPISODES} episodes=2 workers=1",
+    "calibrate": "steps=2 batch_size=4 windows=4 samples=3",
+    "check": "windows=2 sections=[elbo]",
+    "reproduce": "",
+}
+NOT_RUN = {  # a part of a command, and why it does not run here
+    "make ": "installs and tests everything",
+    "source ": "of the shell",
+    " -m pip ": "needs the network",
+    "rerun ": "opens a window",
+    "cavin_pyro.assets": "needs the network; tests/cavin_pyro/fetching runs it on small archives",
+    "env.assets=": "needs files from publishers",
+    "launcher=ray": "needs a cluster",
+    "viewer=rerun": "needs an extra; tests/cavin_pyro/visualization runs it",
+    "export=": "needs an extra; tests/cavin_pyro/criticism runs it",
+    "cavin_pyro.data export": "needs an extra; tests/cavin_pyro/data runs it",
+    "reproduce scale=": "trains for minutes; tests/cavin_pyro/reproduction runs it on tiny models",
+    "rsync ": "of the shell",
+}
+MADE = ("runs/train", "runs/pretrain", "data/pushes")  # by the README's commands
+SHORTER = {  # in blocks of Python
+    '"objects=3"': '"objects=3", "planner.samples=16", "maximum_steps=2"',
+    "samples=1024": "samples=16",
+    "objects=3)": "objects=3, maximum_steps=2)",
+    "num_samples=500": "num_samples=20",
+    "num_samples=50)": "num_samples=5)",
+    "num_samples=5, warmup_steps=5": "num_samples=1, warmup_steps=1",
+    'compose("check", "data=data/pushes")': 'compose("check", "data=data/pushes", "windows=8")',
+}
+FILE = re.compile(r"# (\w+\.(?:py|yaml))\b(, continued)?")
+
+
+def reason(line: Line) -> str | None:
+    """Why a command does not run."""
+    return next((why for part, why in NOT_RUN.items() if part in " ".join(line.tokens)), None)
+
+
+def small(line: Line) -> Case:
+    """A command with the options that make it small."""
+    if line.command == "data":
+        return Case("data.__main__", line.options)
+    assert line.command is not None, line
+    more = SMALL[line.command].split()
+    given = {option.partition("=")[0] for option in line.options}
+    more = [option for option in more if not (option.startswith("seed=") and "seed" in given)]
+    if "planner=random" in line.options:
+        more.remove("planner.samples=8")
+    more += ["device=cpu"] if "device=cuda" in line.options else []
+    more += ["planner.compile=false"] if "planner.compile=true" in line.options else []
+    return Case(line.command, [*line.options, *more])
+
+
+def runnable(page: Path) -> list[Line]:
+    """The page's commands that run, each once, and those of the README on its page alone."""
+    known = set() if page.name == "README.md" else {line.tokens for line in commands(ROOT / "README.md")}
+    return [
+        *{line.tokens: line for line in commands(page) if reason(line) is None and line.tokens not in known}.values()
+    ]
+
+
+def blocks(page: Path) -> Iterator[tuple[str, str]]:
+    """Language and text of the blocks of Python and YAML."""
+    found = FENCE.findall(page.read_text(encoding="utf-8"))
+    yield from ((language, text) for language, text in found if language in ("python", "yaml"))
+
+
+def write_files(page: Path, folder: Path) -> list[str]:
+    """Write the page's named files; returns its other blocks of Python, shorter, and the scripts among the files."""
+    others = []
+    for language, text in blocks(page):
+        if match := FILE.match(text):
+            with open(folder / match[1], "a" if match[2] else "w", encoding="utf-8") as file:
+                file.write(text)
+            others += [f"import runpy; runpy.run_path({match[1]!r})\n"] if match[1] == "use_it.py" else []
+        elif language == "python":
+            others.append(text)
+    script = "".join(others)
+    for long, short in SHORTER.items():
+        script = script.replace(long, short)
+    return [script] if script else []
+
+
+def run(lines: list[Line], folder: Path) -> None:
+    """Run commands in one process; pictures are not drawn, which would take longer than all else."""
+    cases = {f"{number}/..": small(line) for number, line in enumerate(lines)}
+    answers = run_in_turn(cases, folder, pictures="blank")
+    for line, answer in zip(lines, answers.values(), strict=True):
+        assert answer.status == 0, f"{line}\n{answer.errors}"
+
+
+@functools.cache
+def readme_folder(parent: Path) -> Path:
+    """A folder in which the README's commands have run."""
+    folder = parent / "readme"
+    folder.mkdir()
+    for shared in ("docs", "checkpoints"):
+        (folder / shared).symlink_to(ROOT / shared)
+    run(runnable(ROOT / "README.md"), folder)
+    return folder
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if runnable(page) or list(blocks(page))], ids=name)
+def test_the_page_runs(page: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    done = readme_folder(tmp_path_factory.getbasetemp())
+    if page.name == "README.md":
+        return
+    folder, text = tmp_path_factory.mktemp("page"), page.read_text(encoding="utf-8")
+    lines = runnable(page)
+    outputs = {option.removeprefix("output=") for line in lines for option in line.options}
+    for made in MADE:
+        if made in text and made not in outputs:
+            shutil.copytree(done / made, folder / made)
+    for shared in ("docs", "checkpoints"):
+        (folder / shared).symlink_to(ROOT / shared)
+    scripts = write_files(page, folder)
+    if lines:
+        run(lines, folder)
+    if "import minari" in text:  # it reads what `data export` writes
+        return
+    for script in scripts:
+        (folder / "blocks.py").write_text(f"if __name__ == '__main__':\n{_indented(script)}", encoding="utf-8")
+        ended = run_script(folder / "blocks.py", folder=folder)
+        assert ended.status == 0, ended.errors
+
+
+def _indented(script: str) -> str:
+    return "".join(f"    {line}\n" if line else "\n" for line in script.splitlines())
+
+
+def test_what_does_not_run_is_still_in_the_documentation() -> None:
+    """A reason that no command needs any more goes."""
+    said = [shlex.join(line.tokens) for page in PAGES for line in commands(page)]
+    assert not [part for part in NOT_RUN if not any(part.strip() in one for one in said)]
