@@ -15,7 +15,7 @@ def main(config: DictConfig) -> None:
 
     Resumes an interrupted run.
     """
-    from cavin_pyro.config.commands.collection import CollectionOptions
+    from cavin_pyro.config.commands import CollectionOptions
     from cavin_pyro.config.errors import UserError
     from cavin_pyro.data.collection import check_policy, collect, collecting_world, repair
     from cavin_pyro.data.summary import summarize_data

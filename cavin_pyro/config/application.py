@@ -48,13 +48,12 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             # where another program uses a core, plans would take fifty times as long, and training would stand still.
             os.environ.setdefault("OMP_NUM_THREADS", "1")
             line = guarded(lambda: read_command_line(sys.argv[1:]))
-            if line.version:
-                guarded(lambda: print(f"cavin_pyro {__version__}"))
-                return
             guarded(check_packages)
             config, choices = guarded(lambda: _compose(name, line))
             if line.help:
-                guarded(lambda: _print_help(name, body.__doc__ or "", config, choices))
+                from cavin_pyro.config.help import help_page
+
+                guarded(lambda: print(help_page(name, body.__doc__ or "", config, choices)))
             elif line.cfg:
                 guarded(lambda: print(OmegaConf.to_yaml(config), end=""))
             elif line.multirun:
@@ -72,10 +71,8 @@ def guarded(action: Callable[[], T], name: str | None = None) -> T:
     """Run; bad input, a disk that refuses and an interruption end in one line instead of a traceback (`--traceback`).
 
     SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number. A reader of what is
-    printed that stops early, such as `head`, ends the command silently, with the status of SIGPIPE.
-
-    Args:
-        name: of the command, if it has begun its work: an interruption says whether it resumes.
+    printed that stops early, such as `head`, ends the command silently, with the status of SIGPIPE. `name`: of the
+    command, if it has begun its work: an interruption says whether it resumes.
     """
     try:
         with _interruptions():
@@ -98,7 +95,7 @@ def guarded(action: Callable[[], T], name: str | None = None) -> T:
             raise
         _stop(f"these options need more memory than there is: choose smaller ones ({str(error)[:160]})", 2)
     except KeyboardInterrupt as error:
-        number = error.number if isinstance(error, Interruption) else signal.SIGINT
+        number = error.args[0] if isinstance(error, Interruption) else signal.SIGINT
         by = "" if number == signal.SIGINT else f" by {number.name}"
         then = "to resume" if name in RESUMING else "to start again: nothing is kept of this one"
         _stop(f"interrupted{by}{f'; rerun the same command {then}' if name else ''}", 128 + number)
@@ -116,11 +113,7 @@ def _refusal(error: OSError) -> str:
 
 
 class Interruption(KeyboardInterrupt):
-    """A signal that ends a command as Ctrl-C does."""
-
-    def __init__(self, number: signal.Signals) -> None:
-        super().__init__(number)
-        self.number = number
+    """A signal, its argument, that ends a command as Ctrl-C does."""
 
 
 @contextmanager
@@ -157,29 +150,18 @@ def _compose(name: str, line: argparse.Namespace) -> tuple[DictConfig, dict[str,
     return [composed(name, overrides, line.config_dir) for overrides in every][-1]
 
 
-def _print_help(name: str, purpose: str, config: DictConfig, choices: dict[str, str]) -> None:
-    from cavin_pyro.config.help import help_page
-
-    print(help_page(name, purpose, config, choices))
-
-
 def read_command_line(arguments: Sequence[str]) -> argparse.Namespace:
-    """Separate overrides from flags.
-
-    Raises:
-        UserError: an unknown flag, or one without its value.
-    """
-    parser = Parser(hint="--help lists the options", add_help=False, allow_abbrev=False)
+    """Separate overrides from flags; an unknown flag, or one without its value, is a `UserError`."""
+    parser = Parser(epilog="--help lists the options", add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
-    for flags in (("--help", "-h"), ("--version",), ("--multirun", "-m"), ("--traceback",)):
+    for flags in (("--help", "-h"), ("--multirun", "-m"), ("--traceback",)):
         parser.add_argument(*flags, action="store_true")
+    parser.add_argument("--version", action="version", version=f"cavin_pyro {__version__}")
     parser.add_argument("--cfg", choices=["job"])
     parser.add_argument("--config-dir")
     line = parser.parse_intermixed_args(list(arguments))
     if line.config_dir is not None and not Path(line.config_dir).is_dir():
-        raise UserError(
-            f"--config-dir {line.config_dir} is no folder: give one with presets, such as planner/mine.yaml"
-        )
+        raise UserError(f"--config-dir {line.config_dir} is no folder: give one that has planner/mine.yaml or the like")
     return line
 
 
@@ -200,17 +182,12 @@ def _sweep(name: str, body: Body, line: argparse.Namespace) -> None:
 
 
 def check_packages() -> None:
-    """Check that the packages with common names are ours.
-
-    Raises:
-        UserError: a foreign package of the same name comes first on the path.
-    """
+    """Raise a `UserError` if a foreign package of the same name as one of ours comes first on the path."""
     home = Path(__file__).resolve().parents[2]
     for package in PACKAGES:
         found = importlib.util.find_spec(package)
-        place = Path((found and found.origin) or "nowhere").resolve()
-        if place != home / package / "__init__.py":
+        if not found or Path(found.origin or "").resolve() != home / package / "__init__.py":
             raise UserError(
-                f"the package {package!r} of this program is hidden by {place}: "
+                f"the package {package!r} of this program is hidden by {found and found.origin}: "
                 "run from another folder, or rename or uninstall that package"
             )

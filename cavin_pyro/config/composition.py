@@ -23,9 +23,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.constructors import with_defaults
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.options import check_options, options
+from cavin_pyro.config.options import check_options, options, with_defaults
 
 PRESETS = Path(__file__).parent / "presets"
 OUTPUT = {  # the folder of a run for which the user names none
@@ -41,11 +40,7 @@ USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._
 
 
 def compose(name: str, *overrides: str) -> DictConfig:
-    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for callers in Python.
-
-    Raises:
-        UserError: an invalid override.
-    """
+    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for callers in Python; see `composed`."""
     return composed(name, overrides)[0]
 
 
@@ -58,15 +53,15 @@ def composed(name: str, overrides: Sequence[str], config_dir: str | None = None)
     if name not in COMMANDS:
         raise UserError(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
     register(name)
-    words = rewritten(overrides)
-    more = [] if config_dir is None else [f"hydra.searchpath=['file://{Path(config_dir).resolve()}']"]
+    words = [f"hydra.searchpath=['file://{Path(config_dir).resolve()}']"] if config_dir else []
+    words += rewritten(overrides)
     with _hydra():
         try:
-            return _composed(name, words, more)
+            return _composed(name, words)
         except UserError:
             raise
         except Exception as error:
-            raise UserError(_explained(name, words, more)) from error
+            raise UserError(_explained(name, words)) from error
 
 
 @functools.cache
@@ -95,8 +90,7 @@ def register(name: str) -> None:
 def finished(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
     """What Hydra has composed, resolved, checked and with a folder for results, without Hydra's own section.
 
-    Raises:
-        UserError: an option without a value, or with one out of its range.
+    An option without a value, or with one out of its range, is a `UserError`.
     """
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     OmegaConf.resolve(own)  # checks the types of what interpolations stand for
@@ -163,8 +157,8 @@ def _hydra() -> Iterator[None]:
         GlobalHydra.instance().hydra = running
 
 
-def _composed(name: str, words: Sequence[str], more: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    config = hydra.compose(name, overrides=[*words, *more], return_hydra_config=True)
+def _composed(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    config = hydra.compose(name, overrides=list(words), return_hydra_config=True)
     for one in map(_parsed, words):
         section = one.key_or_group.rpartition(".")[0]
         if one.is_delete() and not section.startswith("hydra"):
@@ -187,13 +181,13 @@ def _default_output(name: str, config: dict[str, Any], hydra_config: Any) -> str
     return pattern.format(**{**config, **hydra_config.runtime.choices}) + ("-" if others else "") + others
 
 
-def _explained(name: str, words: Sequence[str], more: Sequence[str]) -> str:
+def _explained(name: str, words: Sequence[str]) -> str:
     """One line about the first override with which the composition fails; those that choose presets come first."""
-    words = sorted(words, key=lambda word: not (PRESETS / word.partition("=")[0]).is_dir())
-    known: Any = _composed(name, [], more)[0]
+    words = sorted(words, key=lambda word: not ((PRESETS / word.partition("=")[0]).is_dir() or "searchpath" in word))
+    known: Any = _composed(name, [])[0]
     for count, word in enumerate(words, start=1):
         try:
-            known, _ = _composed(name, words[:count], more)
+            known, _ = _composed(name, words[:count])
         except UserError as error:
             return str(error)
         except Exception as error:
@@ -235,7 +229,4 @@ def _parsed(word: str) -> Override:
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException as error:
-        first = str(error).splitlines()[0].removeprefix("LexerNoViableAltException: ")
-        raise UserError(
-            f"{word}: {first}; write name=value, and a value with special characters as 'name=\"value\"'"
-        ) from error
+        raise UserError(f"{word}: {str(error).splitlines()[0]}; write name=value, or 'name=\"value\"'") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import NoReturn
 
 
 class UserError(Exception):
@@ -37,26 +37,9 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def whole_number(name: str, value: object, minimum: int, maximum: int) -> None:
-    """Check a count from the command line.
-
-    Raises:
-        UserError: the value is not a whole number from the minimum to the maximum.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
-        raise UserError(f"{name} must be a whole number from {minimum} to {maximum}, not {value}")
-
-
 class Parser(argparse.ArgumentParser):
-    """Reads a command line, of which a wrong one is a `UserError`.
-
-    hint: what to do about a wrong one; by default the usage, as in `assets ycb --to DIR`.
-    """
-
-    def __init__(self, *arguments: Any, hint: str | None = None, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._hint = hint
+    """Reads a command line, of which a wrong one is a `UserError` that ends with the epilog, or else the usage."""
 
     def error(self, message: str) -> NoReturn:
         """Called by argparse for a wrong command line."""
-        raise UserError(f"{message}; {self._hint or ' '.join(self.format_usage().split())}")
+        raise UserError(f"{message}; {self.epilog or ' '.join(self.format_usage().split())}")

@@ -24,11 +24,7 @@ EXAMPLES = {
     "check": ("checkpoint=cavin data=data/pushes", "a=cavin b=sectar", "sections=[prior,subgoals]"),
     "calibrate": ("checkpoint=runs/train/checkpoint.safetensors data=data/pushes", "checkpoint=contact seed=1"),
     "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
-    "evaluate": (
-        "task=crossing reward=sparse objects=3",
-        "planner=paper compare=runs/evaluate/crossing-sparse-3-cavin-0",
-        "-m task=clearing,insertion,crossing episodes=50",
-    ),
+    "evaluate": ("task=crossing objects=3", "planner=paper compare=runs/mine", "-m task=clearing,insertion,crossing"),
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
     "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }
@@ -46,12 +42,7 @@ FLAGS = {
 
 
 def help_page(name: str, purpose: str, config: DictConfig, choices: Mapping[str, str]) -> str:
-    """The page of a command.
-
-    Args:
-        purpose: its docstring. config: as composed, so that the options of chosen presets are shown.
-        choices: the preset of each group.
-    """
+    """The page of a command: its docstring, and its options as composed, with those of the preset of each group."""
     lines = [f"python -m cavin_pyro.{name} [option=value ...]     (cavin_pyro {__version__})", ""]
     lines += textwrap.wrap(" ".join(inspect.cleandoc(purpose).split()), WIDTH)
     lines += ["", "Examples"]
@@ -88,11 +79,7 @@ def presets(group: str) -> list[str]:
 
 
 def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tuple[str, str]]:
-    """The options of a part and of the parts in it, with what its class says of each.
-
-    Args:
-        meaning: of the section, for the entries of one without a class.
-    """
+    """The options of a part and of the parts in it, with what its class says of each; without one, the meaning."""
     try:
         found = section.get("_target_") and get_object(section["_target_"])
     except Exception:  # a user's module may raise anything; building the part says it in one line
@@ -110,11 +97,7 @@ def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tupl
 
 
 def _meanings(found: Any) -> Mapping[str, str]:
-    """What the docstrings of a class, its parents and their constructors, or of a function, say of each argument.
-
-    Returns:
-        A sentence by the argument's name.
-    """
+    """The sentences on each argument in the docstrings of a class, its parents, their constructors, or a function."""
     described = [found]
     if inspect.isclass(found):
         described = [part for one in found.__mro__ for part in (one, vars(one).get("__init__"))]

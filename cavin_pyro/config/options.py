@@ -4,24 +4,35 @@
 class TrainerConfig:
     batch_size: int = option(64, "windows per gradient step", minimum=1)
 
-The command line, `--help`, the library and the documentation all read them there.
+The command line, `--help`, the library and the documentation all read them there. Those of a preset's class come from
+the signature of its constructor.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Collection, Iterator, Mapping
+import importlib
+import inspect
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from types import UnionType
+from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
-from omegaconf import OmegaConf
+from omegaconf import BooleanNode, FloatNode, IntegerNode, OmegaConf, StringNode, ValueNode
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError
 
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
+OWN_PACKAGES = ("cavin_pyro", "models", "guides", "planning", "envs")
+GIVEN = {  # which `build_model` gives, by group
+    "prior": ("dimension", "feature_dimension", "effect_dimension"),
+    "geometry": ("feature_dimension",),
+    "dynamics": ("feature_dimension", "width"),
+}
+NODES: dict[Any, Callable[..., ValueNode]] = {bool: BooleanNode, int: IntegerNode, float: FloatNode, str: StringNode}
+CONTAINERS = (Sequence, Mapping, list, tuple, dict)
 
 
 @dataclass(frozen=True)
@@ -31,7 +42,7 @@ class About:
     Attributes:
         help: one line. unit: of a number.
         choices: names, or the dotted path of a collection of them, which is imported on demand.
-        minimum, maximum: both allowed. above: an exclusive lower bound.
+        minimum, maximum: both allowed. positive: more than 0, and finite.
     """
 
     help: str
@@ -39,7 +50,7 @@ class About:
     choices: Collection[str] | str | None = None
     minimum: float | None = None
     maximum: float | None = None
-    above: float | None = None
+    positive: bool = False
 
     @property
     def names(self) -> tuple[str, ...] | None:
@@ -51,18 +62,18 @@ class About:
     def range(self) -> str:
         """The numbers that are allowed, in words."""
         unit = f" {self.unit}" if self.unit else ""
-        if self.above is not None:
-            return "a positive number" if self.above == 0 else f"more than {self.above:g}{unit}"
+        if self.positive:
+            return "a positive number"
         if self.maximum is None:
             return f"at least {self.minimum:g}{unit}"
         return f"between {self.minimum:.10g} and {self.maximum:.10g}{unit}"
 
 
 def option(default: Any, help: str, **about: Any) -> Any:
-    """A field of a configuration; for `about` see `About`. A list or a dataclass is copied for each configuration."""
+    """A field of a configuration; for `about` see `About`. A list is copied for each configuration."""
     metadata = {"about": About(help, **about)}
-    if isinstance(default, list | dict) or is_dataclass(default):
-        return field(default_factory=lambda: copy.deepcopy(default), metadata=metadata)
+    if isinstance(default, list):
+        return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
@@ -71,8 +82,13 @@ def seed_option(help: str = "seed of all random numbers", default: int = 0) -> A
     return option(default, help, minimum=0, maximum=MAXIMUM_SEED)
 
 
-@dataclass(frozen=True)
-class Option:
+def preset_defaults(presets: str) -> Any:
+    """Hydra's `defaults` of a command, with the preset of each group, as users type them: "model=flat guide=flat"."""
+    chosen = [{group: name} for group, _, name in (word.partition("=") for word in presets.split())]
+    return field(default_factory=lambda: ["_self_", *chosen, "base"])
+
+
+class Option(NamedTuple):
     """An option of the command line: `name` is dotted."""
 
     name: str
@@ -93,14 +109,7 @@ def options(schema: Any, prefix: str = "") -> Iterator[Option]:
 
 
 def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> None:
-    """Check the ranges and choices of a resolved configuration with valid types.
-
-    Args:
-        prefix: of option names in error lines.
-
-    Raises:
-        UserError: an option out of its range, or none of the choices; the message states them.
-    """
+    """Check all values of a resolved configuration with valid types by `check_value`; `prefix`: of their names."""
     for one in options(schema):
         value: Any = config
         for part in one.name.split("."):
@@ -110,11 +119,7 @@ def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> 
 
 
 def check_value(name: str, value: Any, about: About) -> None:
-    """Check one value.
-
-    Raises:
-        UserError: it is out of its range, or none of the choices.
-    """
+    """Raise a `UserError` for a value that is out of its range, or none of the choices; the line states them."""
     if isinstance(value, Mapping) and value.get("_target_"):
         return  # a class of the user's, which says itself what is wrong with it
     if about.choices is not None:
@@ -122,10 +127,13 @@ def check_value(name: str, value: Any, about: About) -> None:
             if entry not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")
         return
-    low = -float("inf") if about.minimum is None else about.minimum
-    high = float("inf") if about.maximum is None else about.maximum
-    bounded = about.above is not None or about.minimum is not None
-    if bounded and not (low <= value <= high and (about.above is None or about.above < value < float("inf"))):
+    if about.positive:
+        allowed = 0 < value < float("inf")
+    else:
+        allowed = (about.minimum is None or value >= about.minimum) and (
+            about.maximum is None or value <= about.maximum
+        )
+    if not allowed:
         raise UserError(f"{name} must be {about.range}, not {shown(value)}")
 
 
@@ -139,8 +147,7 @@ def shown(value: Any) -> Any:
 def configured(schema: type[T], values: Mapping[str, Any], section: str) -> T:
     """A configuration from a section of a command's or of a stored one, in which options may be missing or unknown.
 
-    Raises:
-        UserError: a value of another type, or out of its range.
+    A value of another type, or out of its range, is a `UserError`.
     """
     known = {str(name): value for name, value in values.items() if name in {one.name for one in fields(schema)}}  # type: ignore[arg-type]
     try:
@@ -156,3 +163,78 @@ def flat_options(value: Any, prefix: str = "") -> dict[str, Any]:
     if not isinstance(value, dict):
         return {prefix.rstrip("."): value}
     return {key: one for name, entry in value.items() for key, one in flat_options(entry, f"{prefix}{name}.").items()}
+
+
+def with_defaults(value: Any, group: str = "") -> Any:
+    """A preset with all options of our parts: those of the preset, else the constructors' defaults.
+
+    They are nodes of OmegaConf that take values of the constructor's types alone.
+    """
+    if isinstance(value, list):
+        return [with_defaults(entry) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    own = {name: with_defaults(entry) for name, entry in value.items()}
+    declared = constructor_options(own["_target_"]) if own.get("_target_") else {}
+    options = {"_target_": own.pop("_target_")} if "_target_" in own else {}
+    for name, one in declared.items():
+        if name in own or (is_shown(one) and name not in GIVEN.get(group, ())):
+            option = own.pop(name) if name in own else _part_of(one.default)
+            options[name] = _node_of(option, one.annotation)
+    return options | own
+
+
+def constructor_options(target: str) -> dict[str, inspect.Parameter]:
+    """The named arguments of a class of ours or the user's by its dotted path, with types for annotations.
+
+    Empty where there is no such class. They include arguments that a constructor passes on to its parent's.
+    """
+    try:
+        found = get_object(target)
+    except Exception:  # a user's module may raise anything; building the part says it in one line
+        return {}
+    constructors = [found]
+    if inspect.isclass(found):
+        constructors = [vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)]
+    options: dict[str, inspect.Parameter] = {}
+    for constructor in constructors:
+        if not inspect.isfunction(constructor) or constructor.__module__.partition(".")[0] not in OWN_PACKAGES:
+            break
+        hints, parameters = get_type_hints(constructor), inspect.signature(constructor).parameters.values()
+        for one in parameters:
+            if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY) and one.name != "self":
+                options.setdefault(one.name, one.replace(annotation=hints.get(one.name, Any)))
+        if not any(one.kind is one.VAR_KEYWORD for one in parameters):
+            break
+    return options
+
+
+def is_shown(one: inspect.Parameter) -> bool:
+    """Whether an argument is an option: it has a default that can be written down, or may be left out."""
+    if one.default is None:
+        inner = [get_origin(part) or part for part in get_args(one.annotation) if part is not type(None)]
+        return bool(inner) and all(part in NODES or part in CONTAINERS for part in inner)
+    return isinstance(one.default, (*NODES, tuple, list, dict)) or (
+        one.default is not one.empty and is_dataclass(one.default)
+    )
+
+
+def _part_of(default: Any) -> Any:
+    """A default as configuration: a dataclass becomes a part of its own."""
+    if is_dataclass(default):
+        module, name = type(default).__module__, type(default).__name__
+        package = module.partition(".")[0]
+        if getattr(importlib.import_module(package), name, None) is type(default):
+            module = package  # the shorter path, for users
+        values = {one.name: getattr(default, one.name) for one in fields(default)}
+        return with_defaults({"_target_": f"{module}.{name}", **values})
+    return list(default) if isinstance(default, tuple) else default
+
+
+def _node_of(value: Any, annotation: Any) -> Any:
+    """A value that may be replaced by those of its type; other types than plain ones are left to the class."""
+    union = get_origin(annotation) in (Union, UnionType)
+    inner = [part for part in get_args(annotation) if part is not type(None)] if union else [annotation]
+    if len(inner) != 1 or inner[0] not in NODES:
+        return value
+    return NODES[inner[0]](value, is_optional=value is None or (union and type(None) in get_args(annotation)))

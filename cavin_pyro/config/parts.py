@@ -11,7 +11,6 @@ import yaml
 from hydra.errors import InstantiationException
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
-from pyro.infer.autoguide import AutoGuide, AutoMessenger
 
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line
@@ -70,11 +69,7 @@ def naming(section: str, config: Config) -> Iterator[None]:
 
 
 def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
-    """Check that no whole number of a section or of those in it is too small or a slip, apart from weights and margins.
-
-    Raises:
-        UserError: one is smaller than the minimum, or larger than `LARGEST_SIZE`.
-    """
+    """Raise a `UserError` for a whole number of a section, but weights and margins, that is too small or a slip."""
     for name, value in config.items():
         if isinstance(value, Mapping | DictConfig):
             check_sizes(f"{section}.{name!s}", value, minimum)
@@ -83,6 +78,13 @@ def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
                 raise UserError(f"{section}.{name!s} must be at least {minimum:g}, not {value}")
             if value > LARGEST_SIZE:
                 raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
+
+
+def build_part(section: str, config: Config, *arguments: Any, **keywords: Any) -> Any:
+    """Build the part of a section, whose name the lines of `check_sizes` and `construct` have."""
+    check_sizes(section, config)
+    with naming(section, config):
+        return construct(config, *arguments, **keywords)
 
 
 def build_model(config: Config) -> Model:
@@ -98,30 +100,24 @@ def build_model(config: Config) -> Model:
     own_prior = sizes.pop("prior", None) or {}
     check_sizes("model", sizes)
     try:
-        prior = own_prior if own_prior.get("_target_") else config["prior"]
-        check_sizes("prior", prior)
-        with naming("model.prior" if prior is own_prior else "prior", prior):
-            parts = {
-                name: construct(
-                    prior,
-                    dimension=sizes[f"{kind}_dimension"],
-                    feature_dimension=sizes["feature_dimension"],
-                    effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
-                )
-                for name, kind in (("effect_prior", "effect"), ("motion_prior", "motion"))
-                if f"{kind}_dimension" in sizes
-            }
-        section = config.get("dynamics") or PAPER_DYNAMICS
-        check_sizes("dynamics", section)
-        with naming("dynamics", section):
-            dynamics = construct(section, feature_dimension=sizes["feature_dimension"], width=sizes["width"])
+        of_model = bool(own_prior.get("_target_"))
+        parts = {
+            f"{kind}_prior": build_part(
+                "model.prior" if of_model else "prior",
+                own_prior if of_model else config["prior"],
+                dimension=sizes[f"{kind}_dimension"],
+                feature_dimension=sizes["feature_dimension"],
+                effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
+            )
+            for kind in ("effect", "motion")
+            if f"{kind}_dimension" in sizes
+        }
+        given = {"feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
+        dynamics = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
-    scales = config.get("scales") or FIXED_SCALES
-    with naming("scales", scales):
-        built_scales = construct(scales)
-    with naming("model", sizes):
-        model = construct(sizes, **parts, scales=built_scales, dynamics=dynamics)
+    scales = build_part("scales", config.get("scales") or FIXED_SCALES)
+    model = build_part("model", sizes, **parts, scales=scales, dynamics=dynamics)
     if not isinstance(model, Model):
         raise UserError(f"model {sizes['_target_']} is no model program: derive it from models.model.Model")
     if not parts and config["prior"]["_target_"] != STANDARD_PRIOR:
@@ -135,22 +131,17 @@ def build_guide(config: Config, model: Model) -> Guide:
     Raises:
         UserError: a guide that cannot be built, or is incompatible; the message lists the compatible ones.
     """
-    check_sizes("guide", config["guide"])
     target, kind = config["guide"].get("_target_"), class_of(config["guide"])
-    if isinstance(kind, type) and issubclass(kind, AutoGuide | AutoMessenger):
-        raise UserError(
-            f"guide {target} is an automatic guide: choose guide=auto_normal guide.autoguide._target_={target}"
-        )
-    if isinstance(kind, type) and not issubclass(kind, Guide):
-        raise UserError(f"guide {target} is no Pyro program: derive it from guides.guide.Guide")
-    if kind is not None and model.name not in kind.fits:
+    fits = getattr(kind, "fits", ())
+    if kind is not None and model.name not in fits:
         choices = ", ".join(name for name, guide in _guides().items() if model.name in guide.fits) or "none of ours"
+        other = f", derive yours from guides.guide.Guide, or choose guide=auto_normal guide.autoguide._target_={target}"
         raise UserError(
-            f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(kind.fits) or 'none'}): "
-            f"choose guide= from {choices}"
+            f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(fits) or 'none'}): "
+            f"choose guide= from {choices}{'' if issubclass(kind, Guide) else other}"
         )
-    with naming("guide", config["guide"]):
-        return construct(config["guide"], model)
+    guide: Guide = build_part("guide", config["guide"], model)
+    return guide
 
 
 def class_of(config: Config) -> Any:

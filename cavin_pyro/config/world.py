@@ -15,8 +15,8 @@ from cavin_pyro.config.parts import construct, naming
 from envs.layouts import task_class
 from envs.objects.object_sets import ObjectSet, chosen, load_object_set, plain_name
 from envs.objects.sampling import ObjectRanges
-from envs.robots import Robot, RobotFactory, robot_factory
-from envs.segmentation import Segmenter, SegmenterFactory
+from envs.robots import Robot, robot_factory
+from envs.segmentation import Segmenter
 from envs.sensors import DepthSensor
 from envs.tasks import Task
 
@@ -26,6 +26,7 @@ LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes t
     "friction": (0.001, 10.0),
     "kilograms": (0.001, 1000.0),
 }
+PROTOCOLS: dict[str, type] = {"robot": Robot, "objects": ObjectSet, "camera": DepthSensor, "segmentation": Segmenter}
 Named = str | Mapping[str, Any] | DictConfig
 """The value of an option: a name of ours, or a section with `_target_`, a class of the user's, and its options."""
 
@@ -33,8 +34,7 @@ Named = str | Mapping[str, Any] | DictConfig
 def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
     """The class that the option `task` names, and replacements of fields of its layout: `task.*` and `tiles.*`.
 
-    Raises:
-        UserError: there is no such class, or it is no task.
+    A class that is not there, or that is no task, is a `UserError`.
     """
     tiles: Any = OmegaConf.to_container(config.tiles)
     if isinstance(config.task, str):
@@ -44,22 +44,21 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
     target = section.pop("_target_", None)
     try:
         kind = get_class(target)
+        if not issubclass(kind, Task):
+            raise TypeError("derive it from envs.tasks.Task")
     except Exception as error:
-        raise UserError(f"task._target_={target} cannot be imported: {one_line(error)}") from error
-    if not issubclass(kind, Task):
-        raise UserError(f"task._target_={target} is no task: derive it from envs.tasks.Task")
+        raise UserError(f"task._target_={target} is no task: {one_line(error)}") from error
     return kind, tiles | {name: value for name, value in section.items() if value is not None}
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:
-    """Object parameters' ranges.
+    """Object parameters' ranges, increasing and within `LIMITS`.
 
     Raises:
-        UserError: assets that are not there, an unknown object, or a range that is not two increasing numbers within
-            `LIMITS`.
+        UserError: assets that are not there, an unknown object, or another range.
     """
     ranges: Any = OmegaConf.to_container(env.ranges)
-    objects = object_set_of(env.objects, env.assets)
+    objects = part_of("objects", env.objects, env.assets)
     every = tuple(dict.fromkeys(map(plain_name, objects.names)))
     if ranges["names"] == []:
         raise UserError(f"env.ranges.names must name an object, or be null for all: choose from {', '.join(every)}")
@@ -79,60 +78,30 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
     return ObjectRanges(**ranges)
 
 
-def plain(value: Named) -> str | dict[str, Any]:
-    """The value without the types of configurations, for files and other processes."""
-    section: Any = value if isinstance(value, str) else OmegaConf.to_container(OmegaConf.create(dict(value)))
-    return section if isinstance(section, str) else dict(section)
+def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:
+    """The part of the world that the option `env.<name>` names, ready for `envs.pushing.PushingEnv`.
 
-
-def robot_of(value: Named, assets: str | Path | None = None) -> RobotFactory:
-    """The factory of the robot `env.robot`; a class of the user's gets the world (`envs.physics.PhysicsWorld`).
+    An object set or a sensor of the user's is built; of robots and segmenters it is a factory, which gets the world
+    (`envs.physics.PhysicsWorld`) or M, the most objects. A name of a camera or of a segmentation stays one.
 
     Raises:
-        UserError: unknown robot, or missing files; the message says how to get them.
+        UserError: an unknown name, missing files, or a class that cannot be built or is no such part.
     """
+    made: Any = value if isinstance(value, str) else partial(_made, f"env.{name}", dict(value), PROTOCOLS[name])
+    if name in ("objects", "camera") and not isinstance(made, str):
+        made = made()
     with user_input():
-        return robot_factory(_checked(value, "robot", Robot), assets)
+        if name == "robot":
+            return robot_factory(made, assets)
+        return load_object_set(made, assets) if name == "objects" else made
 
 
-def camera_of(value: Named) -> str | DepthSensor:
-    """The sensor `env.camera`, or its name.
-
-    Raises:
-        UserError: a class that cannot be built, or is no sensor.
-    """
-    made = _checked(value, "camera", DepthSensor)
-    return made if isinstance(made, str) else made()
-
-
-def segmentation_of(value: Named) -> str | SegmenterFactory:
-    """The factory of segmenters `env.segmentation`, or a name; a class of the user's gets M, the most objects."""
-    return _checked(value, "segmentation", Segmenter)
-
-
-def object_set_of(value: Named, assets: str | Path | None = None) -> ObjectSet:
-    """The object set `env.objects`.
-
-    Raises:
-        UserError: a class that cannot be built or is no object set, or missing files.
-    """
-    made = _checked(value, "objects", ObjectSet)
-    with user_input():
-        return load_object_set(made if isinstance(made, str) else made(), assets)
-
-
-def _checked(value: Named, part: str, protocol: type) -> Any:
-    """A name as it is; else a function that builds the class, and raises a `UserError` for what is no such part."""
-    return value if isinstance(value, str) else partial(_made, dict(value), f"env.{part}", protocol)
-
-
-def _made(section: Mapping[str, Any], name: str, protocol: type, *arguments: Any) -> Any:
+def _made(name: str, section: Mapping[str, Any], protocol: type, *arguments: Any) -> Any:
     with naming(name, section):
         made = construct(section, *arguments)
     wanted = [member for member in {**vars(protocol), **protocol.__annotations__} if not member.startswith("_")]
     if lacking := [member for member in wanted if not hasattr(made, member)]:
         raise UserError(
-            f"{name}._target_={section['_target_']} is no {protocol.__name__}: it lacks {', '.join(lacking)} "
-            f"({protocol.__module__}.{protocol.__name__})"
+            f"{name}._target_={section['_target_']} is no {protocol.__name__}: it lacks {', '.join(lacking)}"
         )
     return made

@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands import DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.elbo import terms_by_window
 from cavin_pyro.criticism.estimates import Interval, mean_interval

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
 from cavin_pyro.config.parts import amortized_guides, build_guide

@@ -23,8 +23,7 @@ from pyro import poutine
 from scipy.stats import t as student
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands.criticism import CALIBRATED
-from cavin_pyro.config.commands.training import TrainerConfig
+from cavin_pyro.config.commands import CALIBRATED, TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.guide import LEVEL, simulate
 from cavin_pyro.criticism.intervals import assess_intervals

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro import __version__
-from cavin_pyro.config.commands.collection import CollectConfig, CollectionOptions
-from cavin_pyro.config.commands.world import COLLECTION_CLEARANCE, WorldConfig
+from cavin_pyro.config.commands import COLLECTION_CLEARANCE, CollectConfig, CollectionOptions, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.world import camera_of, object_ranges, object_set_of, plain, robot_of, segmentation_of
+from cavin_pyro.config.world import object_ranges, part_of
 from cavin_pyro.data.dataset import (
     ARRAYS,
     COUNTS,
@@ -70,20 +69,21 @@ def collecting_world(env: DictConfig) -> CollectionConfig:
     """The configuration of a collection in the world of `env.*`, with default options.
 
     Raises:
-        UserError: as `robot_of` and `object_ranges`, or another robot than the stick.
+        UserError: as `part_of` and `object_ranges`, or another robot than the stick.
     """
-    robot_of(env.robot, env.assets)
+    part_of("robot", env.robot, env.assets)
     if env.robot != WorldConfig.robot:
         robot = env.robot if isinstance(env.robot, str) else env.robot.get("_target_")
         raise UserError(
             f"random pushes are made with env.robot=stick, not {robot}: its pushes are equivalent and faster"
         )
+    named: Any = OmegaConf.to_container(env)
     return CollectionConfig(
         ranges=object_ranges(env),
-        object_set=plain(env.objects),
-        assets=env.assets,
-        camera=plain(env.camera),
-        segmentation=plain(env.segmentation),
+        object_set=named["objects"],
+        assets=named["assets"],
+        camera=named["camera"],
+        segmentation=named["segmentation"],
     )
 
 
@@ -216,9 +216,9 @@ def open_scene(config: CollectionConfig) -> Scene:
     """
     with user_input():
         return Scene(
-            object_set=object_set_of(config.object_set, config.assets),
-            camera=camera_of(config.camera),
-            segmentation=segmentation_of(config.segmentation),
+            object_set=part_of("objects", config.object_set, config.assets),
+            camera=part_of("camera", config.camera),
+            segmentation=part_of("segmentation", config.segmentation),
             slots=object_slots(config.maximum_objects),
         )
 
@@ -264,7 +264,7 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
     if not (folder / "metadata.json").exists():
         return {
             "configuration": wanted,
-            "shape_names": list(object_set_of(config.object_set, config.assets).names),
+            "shape_names": list(part_of("objects", config.object_set, config.assets).names),
             "made_by": f"cavin_pyro {__version__}",
             **dict.fromkeys(COUNTS, 0),
         }

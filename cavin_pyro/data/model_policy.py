@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavin_pyro.config.device import one_thread
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.numerics import one_thread
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import (

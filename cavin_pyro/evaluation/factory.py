@@ -13,12 +13,12 @@ import pyro
 import torch
 from omegaconf import DictConfig
 
-from cavin_pyro.config.commands.episodes import CHECKPOINTS
-from cavin_pyro.config.device import choose_device
-from cavin_pyro.config.errors import UserError, user_input, whole_number
-from cavin_pyro.config.numerics import keep_freed_memory, set_matmul_precision
+from cavin_pyro.config.commands import CHECKPOINTS
+from cavin_pyro.config.device import choose_device, keep_freed_memory, set_matmul_precision
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.options import About, check_value
 from cavin_pyro.config.parts import check_sizes, class_of, construct, naming
-from cavin_pyro.config.world import camera_of, object_ranges, object_set_of, robot_of, segmentation_of, task_of
+from cavin_pyro.config.world import object_ranges, part_of, task_of
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
@@ -89,7 +89,7 @@ def check_options(config: DictConfig, device: torch.device) -> None:
     Raises:
         UserError: a number or name out of its range, or options that exclude each other.
     """
-    robot_of(config.env.robot, config.env.assets)
+    part_of("robot", config.env.robot, config.env.assets)
     check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
     if device.type != "cpu" and config.get("launcher") == "ray":
         raise UserError(
@@ -146,13 +146,13 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
             criterion=config.criterion,
             objects=config.objects,
             ranges=object_ranges(config.env),
-            object_set=object_set_of(config.env.objects, config.env.assets),
+            object_set=part_of("objects", config.env.objects, config.env.assets),
             assets=config.env.assets,
             maximum_steps=config.maximum_steps,
-            camera=camera_of(config.env.camera),
-            segmentation=segmentation_of(config.env.segmentation),
+            camera=part_of("camera", config.env.camera),
+            segmentation=part_of("segmentation", config.env.segmentation),
             render_mode="rgb_array" if render else None,
-            robot=robot_of(config.env.robot, config.env.assets),
+            robot=part_of("robot", config.env.robot, config.env.assets),
         )
 
 
@@ -202,7 +202,7 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
             reward = EpisodeReward(env, reward=config.reward, margin=config.margin, device=device)
         planner, geometry = make_planner(config, reward, device)
         if config.pushes_per_plan is not None:
-            whole_number("pushes_per_plan", config.pushes_per_plan, 1, planner.segment_length)
+            check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
             for number in range(len(env.tasks)):
                 env.reset(seed=config.seed, options={"layout": number})

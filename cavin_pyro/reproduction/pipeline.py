@@ -15,8 +15,8 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.config.device import set_matmul_precision
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of
 from cavin_pyro.launching.launcher import Launcher, of_shard
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Cell, cells

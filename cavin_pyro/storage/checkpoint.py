@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands.episodes import CHECKPOINTS, DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.digests import check_manifest, tensors_digest
 from cavin_pyro.storage.files import atomic_write

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from cavin_pyro.config.commands.episodes import DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands import DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import Config, construct
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint

@@ -17,8 +17,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import atomic_write
 
-# What each optimizer keeps for a weight: moments as large as the weight, and Adam the number of its steps.
-ENTRIES = {"adam": ("exp_avg", "exp_avg_sq", "step"), "muon": ("momentum_buffer",)}
+ENTRIES = ("exp_avg", "exp_avg_sq", "step")  # what Adam keeps for a weight: moments of its size, and the steps
 
 
 def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
@@ -58,16 +57,16 @@ def section(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     return {name.removeprefix(f"{part}."): value for name, value in tensors.items() if name.startswith(f"{part}.")}
 
 
-def optimizer_tensors(optimizer: torch.optim.Optimizer, part: str = "adam") -> dict[str, Tensor]:
-    """An optimizer's moments, by names that begin with `part`."""
+def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
+    """An optimizer's moments, by names that begin with `adam`."""
     return {
-        f"{part}.{number}.{name}": value
+        f"adam.{number}.{name}": value
         for number, entry in optimizer.state_dict()["state"].items()
         for name, value in entry.items()
     }
 
 
-def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], part: str = "adam") -> None:
+def load_optimizer(optimizer: torch.optim.Adam, tensors: Mapping[str, Tensor]) -> None:
     """Take over the moments that `optimizer_tensors` gave.
 
     Weights that no gradient has reached (of a network that the model does not use) have none; theirs begin at zero.
@@ -77,18 +76,18 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
             names one.
     """
     moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in section(tensors, part).items():
+    for name, value in section(tensors, "adam").items():
         place, _, entry = name.partition(".")
         moments.setdefault(int(place), {})[entry] = value
     parameters: list[nn.Parameter] = [one for group in optimizer.param_groups for one in group["params"]]
     for number, entries in moments.items():
         if not 0 <= number < len(parameters):
-            raise ValueError(f"{part}.{number} belongs to no weight")
-        for entry in ENTRIES[part]:
+            raise ValueError(f"adam.{number} belongs to no weight")
+        for entry in ENTRIES:
             if entry not in entries:
-                raise ValueError(f"{part}.{number}.{entry} is missing")
+                raise ValueError(f"adam.{number}.{entry} is missing")
             if entries[entry].shape != (() if entry == "step" else parameters[number].shape):
-                raise ValueError(f"{part}.{number}.{entry} is of another shape")
+                raise ValueError(f"adam.{number}.{entry} is of another shape")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 

@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.commands import TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured, shown

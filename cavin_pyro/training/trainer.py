@@ -19,10 +19,9 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands.training import TrainerConfig
-from cavin_pyro.config.device import send
+from cavin_pyro.config.commands import TrainerConfig
+from cavin_pyro.config.device import send, set_matmul_precision
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.numerics import set_matmul_precision
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import ScalarLog, progress_bar
@@ -43,7 +42,6 @@ from guides.guide import Guide
 from models.model import Model
 from models.state import State, Window
 
-SMALLEST = 5  # rows and columns of a matrix whose update Muon orthogonalises, at least
 VALIDATION_BATCH = 1024  # windows at once, which bounds the memory
 
 Row = dict[str, float]
@@ -82,7 +80,7 @@ class Trainer:
         self._captured: CapturedLoss | None = None
         self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
         trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
-        self._optimizers = make_optimizers(config.optimizer, trained, config.learning_rate)
+        self._optimizer = torch.optim.Adam(trained, lr=config.learning_rate, fused=True)
         self._batches = torch.Generator().manual_seed(seed)
         set_matmul_precision(config.matmul_precision)
         torch.manual_seed(seed)
@@ -159,8 +157,7 @@ class Trainer:
                     flush=True,
                 )
         if self._captured is None:
-            for optimizer in self._optimizers.values():
-                optimizer.zero_grad(set_to_none=True)
+            self._optimizer.zero_grad(set_to_none=True)
             loss = self._loss(window, self.step) / len(window.sequence_mask)
         if not math.isfinite(value := loss.item()):
             self._stop_at(first_nonfinite(elbo_terms(self.model, self.guide, window)) or "loss")
@@ -169,14 +166,13 @@ class Trainer:
         return value
 
     def _apply_gradients(self) -> None:
-        """A step of the optimizers with the clipped gradients and the scheduled learning rate."""
+        """A step of the optimizer with the clipped gradients and the scheduled learning rate."""
         norm = nn.utils.clip_grad_norm_(self._loss.parameters(), self.config.clip_norm)
         if not math.isfinite(norm.item()):
             self._stop_at("gradient")
-        for optimizer in self._optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = self.config.rate(self.step)
-            optimizer.step()
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.config.rate(self.step)
+        self._optimizer.step()
 
     def _stop_at(self, term: str) -> None:
         kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
@@ -242,9 +238,7 @@ class Trainer:
         }
         for part, module in (("model", self.model), ("guide", self.guide)):
             tensors |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
-        for part, optimizer in self._optimizers.items():
-            tensors |= optimizer_tensors(optimizer, part)
-        write_resume(self.resume_path, tensors, {})
+        write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {})
 
     def resume(self) -> None:
         """Take over the state in the resume file, if there is one.
@@ -257,8 +251,7 @@ class Trainer:
         with resuming(self.resume_path) as (tensors, _):
             for part, module in (("model", self.model), ("guide", self.guide)):
                 module.load_state_dict(section(tensors, part))
-            for part, optimizer in self._optimizers.items():
-                load_optimizer(optimizer, tensors, part)
+            load_optimizer(self._optimizer, tensors)
             step, best, best_step, stale = tensors["counters"].tolist()
             if not (math.isfinite(best) and 1 <= best_step <= step and stale >= 0):
                 raise ValueError("its counters contradict one another")
@@ -271,25 +264,6 @@ class Trainer:
                 f"{self.folder / 'metrics.csv'} lacks step {self.step} or {self.best_step} of {self.resume_path.name}: "
                 "delete both to start again, or choose another output=DIR"
             )
-
-
-def make_optimizers(
-    name: str, parameters: Sequence[nn.Parameter], learning_rate: float
-) -> dict[str, torch.optim.Optimizer]:
-    """`adam` or `muon` as its parts, by name; all of them take every step with the same learning rate.
-
-    Muon makes the singular values of each matrix's update alike (Jordan et al., 2024), scaled so that the update is as
-    large as Adam's usually is (Liu et al., 2025, arXiv:2502.16982), so that a learning rate of Adam's fits. It does not
-    fit vectors, such as biases, or layers of a few outputs.
-    """
-    matrices = [one for one in parameters if name == "muon" and one.dim() == 2 and min(one.shape) >= SMALLEST]
-    others = [one for one in parameters if all(one is not matrix for matrix in matrices)]
-    made: dict[str, torch.optim.Optimizer] = {}
-    if matrices:
-        made["muon"] = torch.optim.Muon(matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
-    if others:
-        made["adam"] = torch.optim.Adam(others, lr=learning_rate, fused=True)
-    return made
 
 
 def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:

@@ -31,7 +31,7 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "planner._target_=my_lab.Mine", "planner._target_=my_lab.Mine cannot be built: "),
     ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine cannot be built: "),
     ("evaluate", "env.camera._target_=builtins.dict", "env.camera._target_=builtins.dict is no DepthSensor: it lacks "),
-    ("plan", "pushes_per_plan=4", "pushes_per_plan must be a whole number from 1 to 3, not 4"),
+    ("plan", "pushes_per_plan=4", "pushes_per_plan must be between 1 and 3, not 4"),
     ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, random, generated or the path of a YAML file"),
     ("plan", "tiles.goal=[[9,9]]", "tile [9, 9] is off the table"),
     ("plan", "env.robot=sawyer", "robot sawyer needs a folder"),

@@ -20,7 +20,7 @@ from cavin_pyro import __main__ as listing
 from cavin_pyro import __version__
 from cavin_pyro.config.application import PACKAGES, Interruption, check_packages, guarded, read_command_line
 from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.errors import UserError, user_input, whole_number
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.storage.files import atomic_write
 from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT
 
@@ -128,10 +128,6 @@ def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None
         raise ValueError("two\n   lines")
     with pytest.raises(KeyError), user_input():
         raise KeyError("a bug")
-    whole_number("workers", 1, 1, 3)
-    for value in (0, 4, 0.5, float("nan"), "3", None, True):
-        with pytest.raises(UserError, match=f"^workers must be a whole number from 1 to 3, not {value}$"):
-            whole_number("workers", value, 1, 3)
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -9,8 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from cavin_pyro.config.application import read_command_line
-from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.commands.episodes import CHECKPOINTS
+from cavin_pyro.config.commands import CHECKPOINTS, COMMANDS
 from cavin_pyro.config.composition import PRESETS, compose, composed, of_sweep, sweeps
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.help import EXAMPLES, FACTS_OF_PRESETS, WIDTH, help_page, presets
@@ -69,7 +68,7 @@ def test_help_names_units_defaults_choices_and_arguments_of_a_users_class(
     lines = [" ".join(line.split()) for line in page.splitlines()]
     assert "guide.width=64 width of my layers" in lines
     page = " ".join(help_page("plan", "", *composed("plan", [])).split())
-    assert "env.ranges.clearance=0.15 least distance between the objects' centres at the start, in metres" in page
+    assert "env.ranges.clearance=0.15 least distance of centres at the start, in metres" in page
     assert "reward=sparse reward of the task; one of dense, sparse" in page
 
 

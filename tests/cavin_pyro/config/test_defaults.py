@@ -12,12 +12,10 @@ import pytest
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
-from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.commands import COMMANDS, TrainerConfig, WindowConfig
 from cavin_pyro.config.composition import PRESETS, compose
-from cavin_pyro.config.constructors import constructor_options
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.options import configured, options
+from cavin_pyro.config.options import configured, constructor_options, options
 from cavin_pyro.config.parts import build_model, construct
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from envs.pushing import PushingEnv

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from cavin_pyro.config.numerics import MATMUL_PRECISIONS, set_matmul_precision
+from cavin_pyro.config.device import MATMUL_PRECISIONS, set_matmul_precision
 
 # Page faults of tensors that are made and dropped: before the call, after it, and after a second one.
 COUNT_PAGE_FAULTS = """
 import json, resource, torch
-from cavin_pyro.config.numerics import keep_freed_memory
+from cavin_pyro.config.device import keep_freed_memory
 
 def page_faults():
     first = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -12,7 +12,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.criticism.predictive import assess_predictive, compare, effect_size, replicate
 from cavin_pyro.criticism.pushing import Nearness, statistics_of
 from cavin_pyro.criticism.windows import Outcome, generated, observed, seeded

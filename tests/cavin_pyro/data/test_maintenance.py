@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.collection import collect
 from cavin_pyro.data.dataset import (

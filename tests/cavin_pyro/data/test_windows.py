@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from cavin_pyro.config.commands.training import WindowConfig
+from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, write_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows

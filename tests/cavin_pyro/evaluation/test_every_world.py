@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from cavin_pyro.config.commands.world import WorldConfig
+from cavin_pyro.config.commands import WorldConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import options
 from cavin_pyro.evaluation.factory import make_runner

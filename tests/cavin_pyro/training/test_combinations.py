@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from cavin_pyro.config import parts as building
-from cavin_pyro.config.commands.training import TrainerConfig, WindowConfig
+from cavin_pyro.config.commands import TrainerConfig, WindowConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable, load_windows

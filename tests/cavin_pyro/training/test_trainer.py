@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from cavin_pyro.config.commands.training import TrainerConfig
+from cavin_pyro.config.commands import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
@@ -27,7 +27,7 @@ from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors
 from cavin_pyro.training.run import _keep_best
-from cavin_pyro.training.trainer import SMALLEST, Row, Trainer, make_optimizers, read_rows
+from cavin_pyro.training.trainer import Row, Trainer, read_rows
 from models.state import State
 
 SHORT = TrainerConfig(steps=8, batch_size=4, validate_every=2, validation_windows=10, learning_rate=1e-2)
@@ -95,7 +95,7 @@ def test_the_optimizer_follows_the_schedule(small: SimpleNamespace, tmp_path: Pa
     assert [config.rate(step) for step in (0, 4, 8)] == pytest.approx([1e-2, 0.505e-2, 1e-4])
     run = trainer(small, tmp_path / "run", config)
     run.run()
-    (group,) = run._optimizers["adam"].param_groups
+    (group,) = run._optimizer.param_groups
     assert group["lr"] == config.rate(7)
     assert [row["learning_rate"] for row in run.rows] == [config.rate(step) for step in (2, 4, 6, 8)]
 
@@ -203,23 +203,21 @@ def test_training_stops_when_patience_is_lost(small: SimpleNamespace, tmp_path: 
     assert run.step == 2 * (1 + 3)
 
 
-@pytest.mark.parametrize(("broken_after", "optimizer"), [(2, "adam"), (4, "adam"), (6, "adam"), (4, "muon")])
+@pytest.mark.parametrize("broken_after", [2, 4, 6])
 def test_an_interrupted_run_resumes_as_if_it_had_not_been_interrupted(
-    broken_after: int, optimizer: str, small: SimpleNamespace, tmp_path: Path
+    broken_after: int, small: SimpleNamespace, tmp_path: Path
 ) -> None:
-    config = TrainerConfig(**{**vars(SHORT), "optimizer": optimizer})
-
     def stop(run: Trainer, step: int) -> None:
         if step == broken_after:
             raise KeyboardInterrupt
 
-    whole = trainer(small, tmp_path / "whole", config)
+    whole = trainer(small, tmp_path / "whole")
     whole.run()
     assert [row["step"] for row in whole.rows] == [2, 4, 6, 8]
     with pytest.raises(KeyboardInterrupt):
-        trainer(small, tmp_path / "broken", config, hook=stop).run()
+        trainer(small, tmp_path / "broken", hook=stop).run()
     assert not (tmp_path / "broken" / "metrics.csv").exists() or broken_after > 2
-    resumed = trainer(small, tmp_path / "broken", config)
+    resumed = trainer(small, tmp_path / "broken")
     resumed.run()
     assert torch.equal(weights(resumed), weights(whole))
     assert without_speed(resumed.rows) == without_speed(whole.rows)
@@ -296,40 +294,25 @@ PARAMETERS = 3
 Tensors = dict[str, Tensor]
 
 
-def stepped(name: str, *, without_gradient: int | None = None) -> tuple[torch.optim.Optimizer, Tensors]:
+def stepped(*, without_gradient: int | None = None) -> tuple[torch.optim.Adam, Tensors]:
     """An optimizer of three matrices after a step, and its moments."""
     torch.manual_seed(0)
     parameters = [nn.Parameter(torch.randn(6, 6)) for _ in range(PARAMETERS)]
-    (optimizer,) = make_optimizers(name, parameters, 0.1).values()
+    optimizer = torch.optim.Adam(parameters, lr=0.1)
     for number, parameter in enumerate(parameters):
         parameter.grad = None if number == without_gradient else torch.ones_like(parameter)
     optimizer.step()
-    return optimizer, optimizer_tensors(optimizer, name)
+    return optimizer, optimizer_tensors(optimizer)
 
 
-@pytest.mark.parametrize("name", ["adam", "muon"])
-def test_moments_come_back_and_a_weight_without_gradient_has_none(name: str) -> None:
-    optimizer, tensors = stepped(name, without_gradient=1)
-    assert not [entry for entry in tensors if entry.startswith(f"{name}.1.")]
-    again, _ = stepped(name)
-    load_optimizer(again, tensors, name)
-    assert optimizer_tensors(again, name).keys() == tensors.keys()
-    with pytest.raises(ValueError, match=rf"^{name}\.3 belongs to no weight$"):
-        load_optimizer(optimizer, {**tensors, f"{name}.3.exp_avg": torch.zeros(6, 6)}, name)
-
-
-def test_muon_has_the_matrices_but_those_of_few_outputs_and_moves_small_gradients_as_far_as_large_ones() -> None:
-    torch.manual_seed(0)
-    module = nn.Sequential(nn.Linear(12, 20), nn.Linear(20, SMALLEST - 1))
-    made = make_optimizers("muon", list(module.parameters()), 0.01)
-    held = {name: [id(one) for one in optimizer.param_groups[0]["params"]] for name, optimizer in made.items()}
-    assert held["muon"] == [id(module[0].weight)] and len(held["adam"]) == 3
-    weight = nn.Parameter(torch.zeros(12, 20))
-    (left, _), (right, _) = (torch.linalg.qr(torch.randn(size, 12)) for size in (12, 20))
-    weight.grad = left @ torch.diag(torch.logspace(0, -1, 12)) @ right.T  # with these singular values
-    make_optimizers("muon", [weight], 0.01)["muon"].step()
-    moved = torch.diagonal(left.T @ weight.detach() @ right) / (-0.01 * 0.2 * math.sqrt(20))
-    assert moved.min() > 0.6 and moved.max() < 1.3
+def test_moments_come_back_and_a_weight_without_gradient_has_none() -> None:
+    optimizer, tensors = stepped(without_gradient=1)
+    assert not [entry for entry in tensors if entry.startswith("adam.1.")]
+    again, _ = stepped()
+    load_optimizer(again, tensors)
+    assert optimizer_tensors(again).keys() == tensors.keys()
+    with pytest.raises(ValueError, match=r"^adam\.3 belongs to no weight$"):
+        load_optimizer(optimizer, {**tensors, "adam.3.exp_avg": torch.zeros(6, 6)})
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,345 @@
+"""The options of every command, each declared once: type, default, meaning, unit and range."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavin_pyro.config.options import option, preset_defaults, seed_option
+from envs.objects.sampling import ObjectRanges
+from envs.pushing import PushingEnv
+from envs.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
+from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
+
+CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
+    **dict.fromkeys(("cavin", "kinect", "held_out", "contact"), ("cascaded", "cascaded")),
+    "sectar": ("single_latent", "single_latent"),
+    "cvae_mpc": ("flat", "flat"),
+    "mpc": ("dynamics", "none"),
+}
+DEFAULT_CHECKPOINT = "cavin"
+CALIBRATED = ("guide", "scales")
+COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of an episode
+ENV = {name: one.default for name, one in inspect.signature(PushingEnv).parameters.items()}
+GENERATED, RANGES = GeneratedLayouts(), ObjectRanges()
+
+# Meanings of options of several commands.
+CHECKPOINT = f"checkpoint: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train"
+DATA = "dataset folder from collect, or several: data=[data/one,data/two]"
+FOLDER = "folder for the results, in which an unfinished run resumes; by default one in runs/"
+HELD_OUT = "names of objects, [mug,banana]; training omits what shows one of them"
+PRECISION = "precision of the factors of matrix products; bfloat16 is TF32 on a GPU"
+TRUST = "modules of your own whose classes the checkpoint may name"
+REPRODUCE = "cavin_pyro.reproduction"  # where the choices of options are listed
+PRECISIONS = "cavin_pyro.config.device.MATMUL_PRECISIONS"
+
+
+@dataclass
+class DeviceOptions:
+    """Where networks run."""
+
+    device: str = option("cpu", "where networks run; auto takes a GPU if there is one", choices=("auto", "cpu", "cuda"))
+
+
+@dataclass
+class LaunchOptions:
+    """Where episodes are run; results do not depend on it, apart from times."""
+
+    workers: int = option(2, "processes; results do not depend on it, apart from times", minimum=1, maximum=1024)
+    launcher: str = option("local", "processes here, or a Ray cluster (extra .[ray])", choices=("local", "ray"))
+    address: str | None = option(None, "running Ray cluster, host:6379; by default one on this machine is started")
+
+
+@dataclass
+class RangesConfig:
+    """Distributions of objects and their parameters (section `env.ranges`; presets `env/ranges=`)."""
+
+    names: list[str] | None = option(None, "objects to sample from; by default all of env.objects")
+    target: list[str] | None = option(None, "objects to sample the target from; by default those of names")
+    scale: list[float] = option(list(RANGES.scale), "factor on each object's size: low, high")
+    mass: list[float] = option(list(RANGES.mass), "factor on each object's own mass: low, high")
+    kilograms: list[float] | None = option(None, "mass of every object, not a factor: low, high", unit="kilograms")
+    friction: list[float] = option(list(RANGES.friction), "Coulomb coefficient of friction: low, high")
+    clearance: float = option(RANGES.clearance, "least distance of centres at the start", unit="metres", minimum=0)
+    drop_height: float = option(RANGES.drop_height, "height of objects' drop", unit="metres", minimum=0, maximum=10)
+
+
+@dataclass
+class WorldConfig:
+    """The section `env`: robot, objects, camera and segmentation, by name or as a class of the user's own."""
+
+    robot: Any = option(ENV["robot"], "robot that pushes", choices="envs.robots.ROBOTS")
+    objects: Any = option(ENV["object_set"], "set of objects", choices="envs.objects.object_sets.OBJECT_SETS")
+    camera: Any = option(ENV["camera"], "depth camera", choices="envs.sensors.CAMERAS")
+    segmentation: Any = option(ENV["segmentation"], "of depth images", choices="envs.segmentation.SEGMENTERS")
+    assets: str | None = option(None, "folder of meshes, for object sets and robots that need one")
+    ranges: RangesConfig = field(default_factory=RangesConfig)
+
+
+def collection_world() -> WorldConfig:
+    """The world for the collection of random pushes."""
+    return WorldConfig(ranges=RangesConfig(clearance=COLLECTION_CLEARANCE))
+
+
+@dataclass
+class CollectionOptions:
+    """Options that determine the collected episodes, apart from their world."""
+
+    seed: int = seed_option("root of all randomness")
+    steps: int = option(10, "pushes per episode", minimum=1)
+    intent_length: int = option(5, "pushes in a row that share a target object and a direction", minimum=1)
+    perturbation_rate: float = option(0.3, "fraction of pushes with a perturbed start", minimum=0, maximum=1)
+    policy: str = option("heuristic", "what chooses pushes; model has a checkpoint", choices=("heuristic", "model"))
+    checkpoint: str | None = option(None, "checkpoint for policy=model, by name or path; by default contact")
+    motions: int = option(256, "motions sampled for each effect, for policy=model", minimum=1)
+    minimum_objects: int = option(1, "objects on the table, at least", minimum=1)
+    maximum_objects: int = option(OBJECT_SLOTS, f"objects, at most; files have room for {OBJECT_SLOTS}, or for more")
+    episodes_per_shard: int = option(50, "episodes per file, the unit of resuming", minimum=1, maximum=10_000)
+
+
+@dataclass
+class CollectConfig(LaunchOptions, CollectionOptions):
+    """Options of `python -m cavin_pyro.collect`."""
+
+    defaults: list[Any] = preset_defaults("env/ranges=paper")
+    transitions: int = option(100_000, "pushes to collect, at least; whole files of episodes are written", minimum=1)
+    output: str | None = option(None, "folder for the dataset, in which an unfinished one resumes; by default in data/")
+    repair: bool = option(False, "collect missing or corrupt files again")
+    env: WorldConfig = field(default_factory=collection_world)
+
+
+@dataclass
+class TrainerConfig:
+    """How to train (section `trainer`)."""
+
+    steps: int = option(1_000_000, "gradient steps, at most", minimum=1)
+    batch_size: int = option(64, "windows per step", minimum=1)
+    learning_rate: float = option(1e-4, "learning rate of Adam", positive=True)
+    schedule: str = option("constant", "of the learning rate; cosine ends at 1 %", choices=("constant", "cosine"))
+    batches: str = option("mixed", "bucketed: one number of objects in each", choices=("mixed", "bucketed"))
+    matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
+    cuda_graphs: bool = option(True, "on a GPU, replay each step's loss and gradients as one CUDA graph")
+    clip_norm: float = option(250.0, "largest norm of the gradient of the mean loss per window", positive=True)
+    reflect: bool = option(False, "mirror every other window, at random, in y = 0; for geometry=outline")
+    validate_every: int = option(1000, "steps between validations, at which a killed run can resume", minimum=1)
+    validation_windows: int = option(4096, "windows per validation, at most", minimum=1)
+    patience: int = option(20, "validations without a new best before training stops", minimum=1)
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step, from 0."""
+        if self.schedule == "constant":
+            return self.learning_rate
+        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / self.steps)))
+
+
+@dataclass
+class WindowConfig:
+    """Selection of windows and transitions for training (section `windows`; the published implementation)."""
+
+    validation_fraction: float = option(0.1, "share of the episodes held out for validation", minimum=0, maximum=1)
+    maximum_step: float = option(0.2, "most that an object moves in a transition for f", unit="metres", positive=True)
+    minimum_move: float = option(0.1, "least move of a window's farthest object, for h, g", unit="metres", minimum=0)
+    maximum_move: float = option(0.5, "largest such move; all pushes are also safe", unit="metres", minimum=0)
+    negative_fraction: float = option(0.25, "share of the other windows that f also learns", minimum=0, maximum=1)
+    held_out_objects: list[str] = option([], HELD_OUT)
+
+
+@dataclass
+class TrainConfig(DeviceOptions):
+    """Options of `python -m cavin_pyro.train`."""
+
+    defaults: list[Any] = preset_defaults(
+        "model=cascaded guide=cascaded prior=standard geometry=pointnet "
+        "dynamics=paper scales=fixed objective=trace_elbo"
+    )
+    data: Any = option("data/pushes", DATA)
+    output: str | None = option(None, FOLDER)
+    pointnet: str = option(DEFAULT_CHECKPOINT, "for geometry=pointnet: a shipped checkpoint, or one from pretrain")
+    skip_corrupt: bool = option(False, "skip corrupt files of the dataset instead of stopping")
+    initial: str | None = option(None, "checkpoint whose weights training starts from, by name or path")
+    trained: list[str] = option([], "parts that change, [dynamics], while others stay as they are; by default all")
+    model: Any = None
+    guide: Any = None
+    prior: Any = None
+    geometry: Any = None
+    dynamics: Any = None
+    scales: Any = None
+    objective: Any = None
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    seed: int = seed_option("seed of weights, split, batches and codes")
+
+
+@dataclass
+class PretrainConfig(DeviceOptions):
+    """Options of `python -m cavin_pyro.pretrain`."""
+
+    defaults: list[Any] = preset_defaults("autoencoder=pointnet")
+    data: Any = option("data/pushes", DATA)
+    output: str | None = option(None, FOLDER)
+    seed: int = seed_option()
+    clouds: int = option(60_000, "point clouds of the dataset, one in ten for validation", minimum=2)
+    held_out_objects: list[str] = option([], HELD_OUT)
+    steps: int = option(6000, "gradient steps", minimum=1)
+    batch_size: int = option(128, "clouds per step", minimum=1)
+    learning_rate: float = option(1e-3, "learning rate of Adam", positive=True)
+    autoencoder: Any = None
+
+
+@dataclass
+class CheckConfig:
+    """Options of `python -m cavin_pyro.check`."""
+
+    defaults: list[Any] = preset_defaults("sizes=default env/ranges=paper")
+    checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
+    a: str | None = option(None, "first of two checkpoints to compare, in place of checkpoint")
+    b: str | None = option(None, "second one; both are checked on windows that neither was trained on")
+    trust: list[str] = option([], TRUST)
+    data: Any = option("data/pushes", f"{DATA}; preferably the model's training data")
+    output: str | None = option(None, FOLDER)
+    seed: int = seed_option()
+    windows: int = option(1000, "held-out windows, and as many training windows", minimum=1)
+    sections: Any = option(None, "sections of the report, [elbo,subgoals]; by default all")
+    export: str | None = option(None, "file.nc for samples of prior, guide and predictions, which ArviZ reads")
+    sizes: Any = None
+    env: WorldConfig = field(default_factory=collection_world)
+
+
+@dataclass
+class CalibrateConfig(DeviceOptions):
+    """Options of `python -m cavin_pyro.calibrate`."""
+
+    defaults: list[Any] = preset_defaults("")
+    checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
+    trust: list[str] = option([], TRUST)
+    parts: list[str] = option(["guide"], f"what to calibrate, {' or '.join(CALIBRATED)} or both: parts=[guide,scales]")
+    data: Any = option("data/pushes", f"{DATA}; the model's training data")
+    output: str | None = option(None, "folder for the checkpoint; by default one in runs/")
+    seed: int = seed_option()
+    steps: int = option(1500, "gradient steps", minimum=1)
+    batch_size: int = option(256, "windows per step", minimum=1)
+    learning_rate: float = option(3e-3, "of Adam at the start; it falls to a hundredth of that", positive=True)
+    wake_weight: float = option(0.03, "weight of -ELBO on real windows beside the loss on generated ones", minimum=0)
+    windows: int = option(2000, "held-out windows for measurements", minimum=1)
+    samples: int = option(50, "samples of the guide for each window, in measurements", minimum=2)
+
+
+@dataclass
+class TilesConfig:
+    """Fields of the layout to replace, for example `tiles.goal=[[1,2]]` (section `tiles`)."""
+
+    region: Any = option(None, "tiles of the region")
+    goal: Any = option(None, "tiles of the goal")
+    target_start: Any = option(None, "tiles where the target may start")
+    obstacle_start: Any = option(None, "tiles where the other objects may start")
+
+
+@dataclass
+class GeneratedConfig:
+    """What is wanted of `layout=generated` (section `generated`)."""
+
+    tiles: int = option(GENERATED.tiles, "4 to 14 tiles of the bridge, of the region, or of the way to the slot (to 8)")
+    shape: str = option(GENERATED.shape, f"shape of the bridge or of the region: {', '.join((*SHAPES, ANY_SHAPE))}")
+    obstacles: str = option(GENERATED.obstacles, "where obstacles start: anywhere, or beside the bridge")
+    seed: int | None = option(GENERATED.seed, "seed of one layout for all scenes; null generates one for each scene")
+
+
+@dataclass
+class SceneConfig(DeviceOptions):
+    """Options of commands that run episodes of one task or of several."""
+
+    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper")
+    layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
+    reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
+    criterion: str = option(ENV["criterion"], "violations: the text's, or the code's", choices="envs.tasks.CRITERIA")
+    objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
+    maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
+    planner: Any = None
+    pushes_per_plan: int | None = option(1, "executed pushes per plan; null executes all T (Algorithm 1, line 11)")
+    push_decimals: int | None = option(PUSH_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
+    margin: float = option(0.02, "margin of the planner's reward", unit="metres", minimum=0, maximum=TILE_SIDE / 2)
+    matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
+    checkpoint: str = option("${oc.select:planner.default_checkpoint,cavin}", f"{CHECKPOINT}; by default the planner's")
+    trust: list[str] = option([], TRUST)
+    generated: GeneratedConfig = field(default_factory=GeneratedConfig)
+    env: WorldConfig = field(default_factory=WorldConfig)
+    seed: int = seed_option("seed of the scene and of the planner")
+
+
+@dataclass
+class EpisodeConfig(SceneConfig):
+    """Options of commands that run episodes of one task."""
+
+    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper task=" + ENV["task"])
+    task: Any = None
+    tiles: TilesConfig = field(default_factory=TilesConfig)
+
+
+@dataclass
+class PlanConfig(EpisodeConfig):
+    """Options of `python -m cavin_pyro.plan`."""
+
+    output: str | None = option(None, "folder for the results; by default one in runs/")
+    video: bool = option(True, "write a video of the episode")
+    save_goal: str | None = option(None, "file for the last scene, a goal for task=rearrange: .png or .safetensors")
+    viewer: str | None = option(None, "rerun writes a recording in 3D, episode.rrd, and needs the extra .[viewer]")
+
+
+@dataclass
+class EvaluateConfig(LaunchOptions, EpisodeConfig):
+    """Options of `python -m cavin_pyro.evaluate`."""
+
+    output: str | None = option(None, FOLDER)
+    episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1)
+    compare: str | None = option(None, "folder of another evaluation of the same scenes, to compare episode by episode")
+    shard: str = option("1/1", "i/n: the i-th of every n episodes, so that n machines share the work")
+    merge: list[str] = option([], "folders of finished shards, [a,b], whose episodes are joined")
+
+
+@dataclass
+class DemoConfig(SceneConfig):
+    """Options of `python -m cavin_pyro.demo`."""
+
+    output: str | None = option(None, "folder for the results, with a subfolder per task; by default runs/demo")
+    tasks: list[str] = option(["clearing", "insertion", "crossing"], "tasks to run", choices="envs.tasks.TASKS")
+    seed: int = seed_option("seed of the scenes and of the planner", default=1)
+
+
+@dataclass
+class ReproduceConfig(DeviceOptions):
+    """Options of `python -m cavin_pyro.reproduce`."""
+
+    defaults: list[Any] = preset_defaults("")
+    scale: str = option("smoke", "how large: minutes (smoke) to days (paper)", choices=f"{REPRODUCE}.sizes.SIZES")
+    methods: list[str] = option(
+        ["cavin", "sectar", "cvae_mpc", "mpc"],
+        "methods; contact is CAVIN with networks that see contact",
+        choices=f"{REPRODUCE}.methods.METHODS",
+    )
+    planners: list[str] = option(["paper", "ours"], "kinds of planners", choices=f"{REPRODUCE}.cells.PLANNERS")
+    tasks: list[str] = option(["clearing", "insertion", "crossing"], "tasks", choices=f"{REPRODUCE}.sizes.TASKS")
+    objects: list[int] = option([1, 2, 3, 4, 5], "numbers of objects with sparse rewards, at most those of the scale")
+    rewards: list[str] = option(["dense", "sparse"], "rewards of the tasks", choices=f"{REPRODUCE}.sizes.REWARDS")
+    episodes: int | None = option(None, "episodes per cell of the top row; by default the scale's", minimum=1)
+    bottom_episodes: int | None = option(None, "episodes per cell of the bottom row; by default the scale's", minimum=1)
+    first_scene: int | None = option(None, "seed of the first scene; by default the scale's", minimum=0)
+    models: str | None = option(None, "folder of trained models, METHOD-SEED.safetensors; nothing is trained then")
+    output: str | None = option(None, FOLDER)
+    workers: int = option(2, "processes; the table does not depend on it", minimum=1)
+    shard: str = option("1/1", "i/n: the i-th of every n trainings and their episodes; rerun in the joined folders")
+    table: str | None = option(None, "a table of episodes, episodes.parquet, to draw and count; nothing is run then")
+
+
+COMMANDS: dict[str, type] = {
+    "collect": CollectConfig,
+    "pretrain": PretrainConfig,
+    "train": TrainConfig,
+    "check": CheckConfig,
+    "calibrate": CalibrateConfig,
+    "plan": PlanConfig,
+    "evaluate": EvaluateConfig,
+    "demo": DemoConfig,
+    "reproduce": ReproduceConfig,
+}
