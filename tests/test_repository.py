@@ -182,7 +182,8 @@ def test_no_module_calls_what_can_run_code_out_of_data(file: Path) -> None:
         if isinstance(node, ast.Call):
             keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
             unsafe = keywords.get("shell") == "True" or keywords.get("allow_pickle") == "True"
-            if unsafe or ast.unparse(node.func) in CODE_RUNNING_CALLS:
+            safe = "yaml.CSafeLoader" in map(ast.unparse, node.args)
+            if unsafe or (ast.unparse(node.func) in CODE_RUNNING_CALLS and not safe):
                 found.append(place(file, node.lineno))
     assert not found
 
