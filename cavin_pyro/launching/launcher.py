@@ -67,7 +67,9 @@ class Launcher:
                     submitted[submit(job)] = number
                 if not submitted:
                     return
-                finished = [next(iter(submitted))] if ordered else [*wait(submitted, None, FIRST_COMPLETED).done]
+                awaited, finished = [next(iter(submitted))] if ordered else submitted, set[Future[Result]]()
+                while not finished:  # a signal that comes just before a wait is handled when the wait ends
+                    finished = wait(awaited, 1.0, FIRST_COMPLETED).done
                 for future in sorted(finished, key=lambda one: one.exception() is not None):  # results before errors
                     yield submitted.pop(future), future.result()
 

@@ -79,6 +79,7 @@ def test_episodes_are_added_once(
     assert {row["planner"] for row in rows} == {"random"} and all(row["commit"] for row in rows)
 
 
+@pytest.mark.soak
 def test_errors_of_predictions_stand_beside_their_floor(tmp_path: Path) -> None:
     arguments = ("contact", "--seed", "4", "--episodes", "1", "--redraws", "1", "--output", str(tmp_path / "a.parquet"))
     ended = run_script(ROOT / "benchmarks" / "accuracy.py", *arguments, folder=tmp_path)

@@ -73,7 +73,9 @@ def test_the_command_writes_a_report_and_runs_no_section_twice(
     assert json.loads((tmp_path / "out" / "report.json").read_text())["sections"] == report["sections"]
 
 
-@pytest.mark.parametrize("name", ["dynamics", "flat", "single_latent"])
+@pytest.mark.parametrize(
+    "name", ["flat", *(pytest.param(name, marks=pytest.mark.soak) for name in ("dynamics", "single_latent"))]
+)
 def test_other_models_are_checked_for_what_they_have(
     name: str, small: SimpleNamespace, pushes: Path, tmp_path: Path
 ) -> None:
