@@ -11,6 +11,8 @@ PYTHON ?= $(shell for python in python3.11 python3.10; do \
 # For the tests pip compiles nothing in advance, which takes a minute: a module is compiled when it is first imported, and
 # kept, which this variable would forbid.
 unexport PYTHONDONTWRITEBYTECODE
+# Another environment that is active in the user's shell, of which IPython would warn.
+unexport VIRTUAL_ENV
 
 bin := .venv/bin
 install := $(bin)/python -m pip install --disable-pip-version-check --no-input --constraint constraints.txt

@@ -23,6 +23,7 @@ def act(job: tuple[str, float]) -> int:
 
 def main() -> None:
     """Print the numbers of two workers that then sleep for long; after Ctrl-C, that this process ends."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
     jobs = [("sleep", 0.5)] * 2 + [("sleep", 60.0)] * 2
     try:
         with closing(Launcher(workers=2).run(act, jobs)) as results:
