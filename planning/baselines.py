@@ -20,10 +20,12 @@ from planning.protocol import (
     Plan,
     PlanningModel,
     RewardFunction,
+    SearchSpace,
+    SegmentRollout,
     SingleLatentModel,
 )
 from planning.returns import best_of, prefer
-from planning.rollout import Candidates, SearchSpace, SegmentRollout, actions_of, predict_states
+from planning.rollout import Candidates, actions_of, predict_states
 from planning.sampling import noise_each, sample_codes
 from planning.searching import SearchingPlanner, chunked, summary
 
@@ -98,7 +100,7 @@ class FlatMotionSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollout.SearchSpace`."""
+        """See `planning.protocol.SearchSpace`."""
         z = sample_codes(self.model.motion_prior, [plans], noise, generators)
         a = self.model.actions(here, motion_code=z)
         states, path = predict_states(self.model, here, a)
@@ -132,7 +134,7 @@ class PushSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollout.SearchSpace`."""
+        """See `planning.protocol.SearchSpace`."""
         if noise is None:
             noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
         actions = (2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4))
@@ -253,7 +255,7 @@ class CascadeSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollout.SearchSpace`."""
+        """See `planning.protocol.SearchSpace`."""
         sizes = self.model.effect_dimension, self.model.motion_dimension
         effect_noise, motion_noise = (None, None) if noise is None else noise.split(sizes, -1)
         c = sample_codes(self.model.effect_prior, [plans], effect_noise, generators)

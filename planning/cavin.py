@@ -18,9 +18,18 @@ from planning.additions.perturbed_rollouts import PerturbedRollouts, most_robust
 from planning.additions.touchdown import ObservedPoints
 from planning.checks import check_choice, check_positive, check_weight
 from planning.optimizers import Optimizer, make_optimizer
-from planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, RewardFunction, goal_objects
+from planning.protocol import (
+    EffectModel,
+    ModelRequirements,
+    Objective,
+    Plan,
+    PlanningModel,
+    RewardFunction,
+    SegmentRollout,
+    goal_objects,
+)
 from planning.returns import AUTO, END, FIRST_PUSH, SubgoalDistance, best_of, interpolate
-from planning.rollout import Candidates, Objective, SegmentRollout, actions_of, predict_states, select_segment
+from planning.rollout import Candidates, actions_of, predict_states, select_segment
 from planning.sampling import sample_codes
 from planning.searching import SearchingPlanner, chunked, summary
 
@@ -207,7 +216,7 @@ class EffectSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollout.SearchSpace`."""
+        """See `planning.protocol.SearchSpace`."""
         # Line 5: sample c_k, a segment at a time, since a learned prior p(c | s) depends on the state before it.
         c = sample_codes(self.model.effect_prior, [plans], noise, generators)
         # Line 6: predict the subgoal by equation 2 ...
@@ -232,7 +241,7 @@ class MotionSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.rollout.SearchSpace`."""
+        """See `planning.protocol.SearchSpace`."""
         c = select_segment(self.effect_codes, segment).expand(-1, plans.batch_shape[-1], -1)
         # Line 8: sample z_k, a segment at a time, as in line 5.
         z = sample_codes(self.model.motion_prior, [self.near.of(plans), c], noise, generators)

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from models.state import State
 from planning.checks import NoFiniteCandidateError
-from planning.protocol import BoundedReward, Outcome, PathReward, RewardFunction
-from planning.rollout import SegmentRollout
+from planning.protocol import BoundedReward, Outcome, PathReward, RewardFunction, SegmentRollout
 
 REWARD_AT = ("path", "subgoals")
 STRIDE_PENALTY = -100.0  # of a step, as for a violation (published code)

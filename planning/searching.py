@@ -25,11 +25,13 @@ from planning.protocol import (
     EpisodicReward,
     FixedShapes,
     ModelRequirements,
+    Objective,
     Plan,
     RewardFunction,
+    SearchSpace,
 )
 from planning.returns import CumulativeReward, StrideLimits
-from planning.rollout import Candidates, Objective, SearchProblem, SearchSpace
+from planning.rollout import Candidates, SearchProblem
 
 ROBUSTNESS = PerturbedRollouts()
 # Measured: a plan of 1,024 samples fills a processor's caches; sixteen plans in one pass take 1.6 times as long per

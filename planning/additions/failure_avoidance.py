@@ -9,9 +9,8 @@ from torch import Tensor
 
 from models.state import State
 from planning import returns
-from planning.protocol import RewardFunction
+from planning.protocol import Objective, RewardFunction, SegmentRollout
 from planning.returns import Progress, prefer
-from planning.rollout import Objective, SegmentRollout
 
 FAILURE = 1e3  # square metres, the cost of a predicted failure: more than any distance on the table
 

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from models.state import State
-from planning.protocol import DistanceToGoal, GuidingReward, RewardFunction
+from planning.protocol import DistanceToGoal, GuidingReward, Objective, RewardFunction, SegmentRollout
 from planning.returns import CumulativeReward, Progress
-from planning.rollout import Objective, SegmentRollout, select_segment
+from planning.rollout import select_segment
 
 GUIDANCE = ("none", "layout")
 CONTINUES = 0.9  # after each segment; 1 values the last state alone

@@ -13,8 +13,7 @@ from torch.distributions import Distribution, Independent, Normal
 
 from models.state import State
 from planning import CavinPlanner, searching
-from planning.protocol import PlanningModel, RewardFunction
-from planning.rollout import SegmentRollout
+from planning.protocol import PlanningModel, RewardFunction, SegmentRollout
 from planning.sampling import noise_each
 
 REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1

@@ -13,9 +13,9 @@ from torch import Tensor
 from models.state import State
 from planning.optimizers import SequentialMonteCarlo, search
 from planning.optimizers.sequential_monte_carlo import active_returns
-from planning.protocol import Evidence
+from planning.protocol import Evidence, SegmentRollout
 from planning.returns import CumulativeReward
-from planning.rollout import Candidates, SearchProblem, SegmentRollout
+from planning.rollout import Candidates, SearchProblem
 
 TOP = (0.8, -0.6)
 SEGMENTS = 3

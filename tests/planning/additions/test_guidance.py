@@ -16,8 +16,8 @@ from models.state import State
 from planning import CavinPlanner, CvaeMpcPlanner
 from planning.additions.guidance import GuidedReturn, GuidedTracking
 from planning.cavin import TrackingState
+from planning.protocol import SegmentRollout
 from planning.returns import CumulativeReward, Progress
-from planning.rollout import SegmentRollout
 
 ARM = [[1, column] for column in range(1, 6)]
 U = [*ARM, [2, 5], *[[3, column] for column in range(5, 0, -1)]]  # eleven tiles from (1, 1) round to (3, 1)
