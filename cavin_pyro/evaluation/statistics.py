@@ -69,7 +69,7 @@ def table(results: dict[str, Any], title: str) -> str:
 
 
 def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
-    """How many candidates of the plans in rows of results reach the goal, and what to try where none of a plan does.
+    """How many candidates of the plans in rows of results reach the goal, and what to try if none did and some failed.
 
     Empty for planners that predict nothing.
     """
@@ -81,8 +81,9 @@ def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
     if not (without := sum(share == 0.0 for share in shares)):
         return f"{line}, some in each of {len(shares)} plans"
     never = sum(bool(episode) and not any(episode) for episode in episodes)
-    episodes_without = f", in {never} of {len(rows)} episodes in no plan" if len(rows) > 1 and never else ""
-    return f"{line}; in {without} of {len(shares)} plans none did{episodes_without}: {_advice(config)}"
+    line += f"; none did in {without} of {len(shares)} plans"
+    line += f", nor in any plan of {never} of {len(rows)} episodes" if len(rows) > 1 and never else ""
+    return line if all(row["outcome"] == "success" for row in rows) else f"{line}: {_advice(config)}"
 
 
 def _advice(config: DictConfig) -> str:
