@@ -31,14 +31,14 @@ from pyro import poutine
 from cavin_pyro.criticism.loading import load_programs
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene, pushing_policy
 from cavin_pyro.data.features import cloud_features
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.randomness import collection_streams
+from cavin_pyro.envs.scene import FALLEN, Scene
+from cavin_pyro.models.state import State, Window, stack_steps
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.progress import progress_bar
-from envs.observation import Observation
-from envs.randomness import collection_streams
-from envs.scene import FALLEN, Scene
-from models.state import State, Window, stack_steps
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 T = 3  # pushes of a segment

@@ -27,10 +27,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.observed import observed_state
+from cavin_pyro.envs.tasks import TaskReward
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
-from envs.tasks import TaskReward
-from models.state import State
-from planning import MpcPlanner, Planner, PlanningModel
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import MpcPlanner, Planner, PlanningModel
 
 HORIZON = 30
 SCENES = 16  # also the larger batch

@@ -19,12 +19,12 @@ import torch
 from pyro.infer import Trace_ELBO
 from torch import Tensor, nn
 
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.networks.layers import SCALE_FLOOR
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.trainer import unchecked_programs
-from guides.cascaded import CascadedGuide
-from models.cascaded import CascadedModel
-from models.networks.layers import SCALE_FLOOR
-from models.state import State, Window
 
 PAIRS = 60  # of steps per batch size
 OBJECTS, FEATURES, SEGMENT = 5, 64, 3

@@ -19,10 +19,10 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.config.errors import UserError
     from cavin_pyro.data.collection import check_policy, collect, collecting_world, repair
     from cavin_pyro.data.summary import summarize_data
+    from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS
     from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.visualization.data_summary import draw_data
-    from envs.workspace import MAXIMUM_OBJECTS
 
     if not config.minimum_objects <= config.maximum_objects <= MAXIMUM_OBJECTS:
         raise UserError(

@@ -68,7 +68,8 @@ def _modules(folder: Path) -> list[Path]:
 
 
 def _name(path: Path) -> str:
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts if parts[0] == "cavin_pyro" else ("cavin_pyro", *parts))
 
 
 def _page(folder: Path) -> str:

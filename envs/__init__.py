@@ -2,10 +2,12 @@
 
 import gymnasium
 
-from envs.tasks import TASKS
+from cavin_pyro.envs.tasks import TASKS
 
 for _name in TASKS:
     gymnasium.register(
-        id=f"cavin/{_name.capitalize()}-v0", entry_point="envs.pushing:PushingEnv", kwargs={"task": _name}
+        id=f"cavin/{_name.capitalize()}-v0", entry_point="cavin_pyro.envs.pushing:PushingEnv", kwargs={"task": _name}
     )
-gymnasium.register(id="cavin/Pushing-v0", entry_point="envs.pushing:PushingEnv")  # with PushingEnv's arguments
+gymnasium.register(
+    id="cavin/Pushing-v0", entry_point="cavin_pyro.envs.pushing:PushingEnv"
+)  # with PushingEnv's arguments

@@ -14,15 +14,23 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 from scipy.optimize import linear_sum_assignment
 
-from envs.markings import Place
-from envs.objects.sampling import arrange
-from envs.observation import MINIMUM_PIXELS, Observation
-from envs.scene import Scene
-from envs.segmentation.clusters import find_objects, pixels_of
-from envs.segmentation.height_map import map_heights
-from envs.sensors import DepthImage
-from envs.sensors.camera import Camera, sample_cloud
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, tile_center
+from cavin_pyro.envs.markings import Place
+from cavin_pyro.envs.objects.sampling import arrange
+from cavin_pyro.envs.observation import MINIMUM_PIXELS, Observation
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.segmentation.clusters import find_objects, pixels_of
+from cavin_pyro.envs.segmentation.height_map import map_heights
+from cavin_pyro.envs.sensors import DepthImage
+from cavin_pyro.envs.sensors.camera import Camera, sample_cloud
+from cavin_pyro.envs.workspace import (
+    MAXIMUM_OBJECTS,
+    POINTS_PER_OBJECT,
+    TABLE_HIGH,
+    TABLE_LOW,
+    TILE_SIDE,
+    Tile,
+    tile_center,
+)
 
 SHAPE_WEIGHT = 100.0  # metres of distance that one metre of shape difference is worth
 SUFFIXES = (".png", ".safetensors")

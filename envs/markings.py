@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.sensors.camera import Camera
-from envs.sensors.sensor import Rendering
-from envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE, Tile
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.sensors.sensor import Rendering
+from cavin_pyro.envs.workspace import TILE_COUNT, TILE_ORIGIN, TILE_SIDE, Tile
 
 LEVEL = 0.002  # metres; points at most this far from z = 0 belong to the table's top
 BORDER = 0.003  # metres on either side of a tile's edge with an opaque line

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.segmentation import Pixels
-from envs.sensors import DepthImage
-from envs.sensors.camera import sample_cloud
-from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT
+from cavin_pyro.envs.segmentation import Pixels
+from cavin_pyro.envs.sensors import DepthImage
+from cavin_pyro.envs.sensors.camera import sample_cloud
+from cavin_pyro.envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT
 
 MINIMUM_PIXELS = 8  # minimum to locate an object
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.observation import Observation
-from envs.robots import STICK_RADIUS
-from envs.workspace import normalised_push, push_endpoints
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.robots import STICK_RADIUS
+from cavin_pyro.envs.workspace import normalised_push, push_endpoints
 
 CANDIDATES = 2048  # pushes sampled at once
 SPREAD = np.radians(45.0)  # radians; how far a push may turn from the base angle, either way

@@ -12,19 +12,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from envs.layouts import GENERATED, generate_task, possible_tasks
-from envs.objects.object_sets import ObjectSet, load_object_set, plain_name
-from envs.objects.sampling import Area, ObjectRanges
-from envs.observation import Observation
-from envs.randomness import GOAL, LAYOUT, named_stream
-from envs.robots import RobotFactory
-from envs.scene import Scene
-from envs.segmentation import SegmenterFactory
-from envs.sensors import DepthSensor
-from envs.sensors.camera import Camera
-from envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
-from envs.tasks.task import check_functions
-from envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, object_slots, tile_center
+from cavin_pyro.envs.layouts import GENERATED, generate_task, possible_tasks
+from cavin_pyro.envs.objects.object_sets import ObjectSet, load_object_set, plain_name
+from cavin_pyro.envs.objects.sampling import Area, ObjectRanges
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.randomness import GOAL, LAYOUT, named_stream
+from cavin_pyro.envs.robots import RobotFactory
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.segmentation import SegmenterFactory
+from cavin_pyro.envs.sensors import DepthSensor
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
+from cavin_pyro.envs.tasks.task import check_functions
+from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, object_slots, tile_center
 
 EPISODE_STEPS = 60
 TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
@@ -49,15 +49,15 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     after `maximum_steps`.
 
     Args:
-        task, layout, tiles: see `envs.layouts.possible_tasks`; `tiles` replaces fields of the layout.
+        task, layout, tiles: see `cavin_pyro.envs.layouts.possible_tasks`; `tiles` replaces fields of the layout.
             `layout="random"` is sampled at every reset. A `Task` object has its own layout.
         generated: what is wanted of `layout="generated"`, which is generated at every reset, unless it has a seed.
-        reward: dense or sparse. criterion: what ends an episode as a violation, see `envs.tasks.TaskReward`. Scenes and
+        reward: dense or sparse. criterion: what ends an episode as a violation, see `TaskReward`. Scenes and
             observations do not depend on it.
         objects: how many, 1 to 10. ranges: object parameters.
-        robot: one of `envs.robots.ROBOTS`, or a factory of robots.
-        object_set: a key of `envs.objects.object_sets.OBJECT_SETS`, or a set.
-        camera, segmentation: see `envs.scene.Scene`.
+        robot: one of `cavin_pyro.envs.robots.ROBOTS`, or a factory of robots.
+        object_set: a key of `cavin_pyro.envs.objects.object_sets.OBJECT_SETS`, or a set.
+        camera, segmentation: see `cavin_pyro.envs.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
         maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table, and the
             objects' places.

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.markings import Place, TileGroup, paint_of
-from envs.objects.object_sets import BUILTIN, ObjectSet
-from envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
-from envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
-from envs.physics import PhysicsWorld, Poses
-from envs.randomness import SENSOR, named_stream
-from envs.robots import TIP_HEIGHT, RobotFactory, Stopped, push, robot_factory, settle
-from envs.segmentation import Pixels, SegmenterFactory, segmenter_of
-from envs.sensors import DepthImage, DepthSensor, sensor_of
-from envs.sensors.camera import Camera
-from envs.workspace import OBJECT_SLOTS, push_endpoints
+from cavin_pyro.envs.markings import Place, TileGroup, paint_of
+from cavin_pyro.envs.objects.object_sets import BUILTIN, ObjectSet
+from cavin_pyro.envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
+from cavin_pyro.envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
+from cavin_pyro.envs.physics import PhysicsWorld, Poses
+from cavin_pyro.envs.randomness import SENSOR, named_stream
+from cavin_pyro.envs.robots import TIP_HEIGHT, RobotFactory, Stopped, push, robot_factory, settle
+from cavin_pyro.envs.segmentation import Pixels, SegmenterFactory, segmenter_of
+from cavin_pyro.envs.sensors import DepthImage, DepthSensor, sensor_of
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.workspace import OBJECT_SLOTS, push_endpoints
 
 MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians
@@ -51,7 +51,7 @@ class PushReport:
         unsafe: the tool would have touched down on an object, so the push was not executed. ineffective: no object
             moved.
         moved: [objects] metres. fallen: an object left the table.
-        stopped: why the robot ended the push early, see `envs.robots.robot.Stopped`; "" if it did not.
+        stopped: why the robot ended the push early, see `cavin_pyro.envs.robots.robot.Stopped`; "" if it did not.
     """
 
     unsafe: bool
@@ -65,11 +65,11 @@ class Scene:
     """A simulated world: sample scenes, push, and observe.
 
     Args:
-        camera: the depth camera: a name in `envs.sensors.CAMERAS`, the pose of one without errors, or any sensor.
-        segmentation: a name in `envs.segmentation.SEGMENTERS`, or a factory of segmenters.
+        camera: the depth camera: a name in `CAMERAS`, the pose of one without errors, or any sensor.
+        segmentation: a name in `cavin_pyro.envs.segmentation.SEGMENTERS`, or a factory of segmenters.
         object_set: the set of the objects' names.
         on_frame: called a few times during every push, to film it.
-        robot: one of `envs.robots.ROBOTS`, or a factory of robots. assets: folder of the files that some robots need.
+        robot: one of `ROBOTS`, or a factory of robots. assets: folder of the files that some robots need.
         slots: M, the objects that observations have room for.
 
     Raises:
@@ -120,7 +120,7 @@ class Scene:
 
         Args:
             areas: start area of each object; the first is the target.
-            generator: the scene's stream, from which those of objects and points derive (`envs.randomness`).
+            generator: the scene's stream, from which those of objects and points derive (`cavin_pyro.envs.randomness`).
 
         Raises:
             NoRoomError: no such scene was found.

@@ -9,9 +9,9 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
-from guides.guide import Guide
-from models.model import Model
-from models.state import Window
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import Window
 
 
 class AutomaticGuide(Guide):

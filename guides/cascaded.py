@@ -5,10 +5,10 @@ from __future__ import annotations
 import pyro
 from torch import Tensor
 
-from guides.guide import EffectInference, Guide, MotionInference
-from models.cascaded import CascadedModel
-from models.model import sequence_mask, windows_plate
-from models.state import Window
+from cavin_pyro.guides.guide import EffectInference, Guide, MotionInference
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.model import sequence_mask, windows_plate
+from cavin_pyro.models.state import Window
 
 
 class CascadedGuide(Guide):

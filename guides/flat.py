@@ -5,10 +5,10 @@ from __future__ import annotations
 import pyro
 from torch import Tensor
 
-from guides.guide import Guide, MotionInference
-from models.flat import FlatModel
-from models.model import sequence_mask, windows_plate
-from models.state import Window
+from cavin_pyro.guides.guide import Guide, MotionInference
+from cavin_pyro.models.flat import FlatModel
+from cavin_pyro.models.model import sequence_mask, windows_plate
+from cavin_pyro.models.state import Window
 
 
 class FlatGuide(Guide):

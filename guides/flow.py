@@ -5,9 +5,9 @@ from __future__ import annotations
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from guides.cascaded import CascadedGuide
-from models.cascaded import CascadedModel
-from models.networks.flows import CodeFlow
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.networks.flows import CodeFlow
 
 
 class FlowCode(nn.Module):

@@ -8,10 +8,16 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from models.model import Model, Program
-from models.networks.dynamics import EffectTrunk
-from models.networks.layers import POSITION_UNIT, GaussianCode, ObjectPool, fully_connected, relative_positions
-from models.state import State
+from cavin_pyro.models.model import Model, Program
+from cavin_pyro.models.networks.dynamics import EffectTrunk
+from cavin_pyro.models.networks.layers import (
+    POSITION_UNIT,
+    GaussianCode,
+    ObjectPool,
+    fully_connected,
+    relative_positions,
+)
+from cavin_pyro.models.state import State
 
 
 class Guide(Program):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from guides.guide import Guide
-from models.state import Window
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.state import Window
 
 
 class NoGuide(Guide):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pyro
 from torch import Tensor
 
-from guides.guide import EffectInference, Guide
-from models.model import sequence_mask, windows_plate
-from models.single_latent import SingleLatentModel
-from models.state import Window
+from cavin_pyro.guides.guide import EffectInference, Guide
+from cavin_pyro.models.model import sequence_mask, windows_plate
+from cavin_pyro.models.single_latent import SingleLatentModel
+from cavin_pyro.models.state import Window
 
 
 class SingleLatentGuide(Guide):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from models.model import Model, windows_plate
-from models.state import Window
+from cavin_pyro.models.model import Model, windows_plate
+from cavin_pyro.models.state import Window
 
 
 class DynamicsModel(Model):

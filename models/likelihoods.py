@@ -12,7 +12,7 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 
-from models.state import State
+from cavin_pyro.models.state import State
 
 Self = TypeVar("Self", bound="Isotropic")
 

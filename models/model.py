@@ -12,10 +12,10 @@ from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from models.likelihoods import LikelihoodScales, PredictedScales, Scales
-from models.networks.dynamics import Dynamics, PushOutcome
-from models.networks.layers import StateEncoder, fixed_shapes, unit
-from models.state import State, Window, stack_steps
+from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
+from cavin_pyro.models.networks.dynamics import Dynamics, PushOutcome
+from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes, unit
+from cavin_pyro.models.state import State, Window, stack_steps
 
 
 class Program(nn.Module):
@@ -103,7 +103,7 @@ class Model(Program):
 
     @staticmethod
     def fixed_shapes() -> AbstractContextManager[None]:
-        """See `models.networks.layers`: for planners that compile."""
+        """See `cavin_pyro.models.networks.layers`: for planners that compile."""
         return fixed_shapes()
 
     def next_state(self, state: State, action: Tensor) -> State:

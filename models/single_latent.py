@@ -10,11 +10,11 @@ from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from models.model import Model, sequence_mask, windows_plate
-from models.networks.dynamics import ActionGenerator, MetaDynamics
-from models.priors.prior import Prior
-from models.priors.standard import StandardPrior
-from models.state import State, Window
+from cavin_pyro.models.model import Model, sequence_mask, windows_plate
+from cavin_pyro.models.networks.dynamics import ActionGenerator, MetaDynamics
+from cavin_pyro.models.priors.prior import Prior
+from cavin_pyro.models.priors.standard import StandardPrior
+from cavin_pyro.models.state import State, Window
 
 
 class SingleLatentModel(Model):

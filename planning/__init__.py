@@ -4,10 +4,16 @@
 search candidates (`rollout`, `returns`) with one of the `optimizers`; `protocol` says what a model and a reward offer.
 """
 
-from planning.additions.perturbed_rollouts import PerturbedRollouts
-from planning.baselines import CavinWithoutEffectsPlanner, CvaeMpcPlanner, MpcPlanner, RandomPlanner, SectarPlanner
-from planning.cavin import MOTION_HORIZONS, CavinPlanner
-from planning.protocol import Outcome, Plan, Planner, PlanningModel, RewardFunction
+from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts
+from cavin_pyro.planning.baselines import (
+    CavinWithoutEffectsPlanner,
+    CvaeMpcPlanner,
+    MpcPlanner,
+    RandomPlanner,
+    SectarPlanner,
+)
+from cavin_pyro.planning.cavin import MOTION_HORIZONS, CavinPlanner
+from cavin_pyro.planning.protocol import Outcome, Plan, Planner, PlanningModel, RewardFunction
 
 __all__ = [
     "MOTION_HORIZONS",

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from planning import records
+from cavin_pyro.planning import records
 
 GRAPHS = "cuda_graphs"  # value of `compile`
 MOST_GRAPHS = 64  # each keeps its results in the GPU's memory
@@ -74,7 +74,7 @@ class CudaGraphs:
 
     A GPU replays hundreds of small operations in one launch. A graph calls the operations that the function called, so
     results are those of eager execution; but shapes must not depend on values, so a model computes what it would
-    otherwise leave out (`planning.protocol.FixedShapes`). Graphs read the weights where they are: these may change, but
+    otherwise leave out (`FixedShapes`). Graphs read the weights where they are: these may change, but
     not move.
 
     A function that cannot be captured, because it waits for the GPU (a reward that calls `item()`, say), runs eagerly,

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning.additions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
-from planning.additions.touchdown import ObservedPoints
-from planning.cavin import EffectSpace
-from planning.checks import NoFiniteCandidateError, check_positive, check_scenes
-from planning.protocol import (
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.additions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
+from cavin_pyro.planning.additions.touchdown import ObservedPoints
+from cavin_pyro.planning.cavin import EffectSpace
+from cavin_pyro.planning.checks import NoFiniteCandidateError, check_positive, check_scenes
+from cavin_pyro.planning.protocol import (
     DynamicsModel,
     FlatModel,
     ModelRequirements,
@@ -24,10 +24,10 @@ from planning.protocol import (
     SegmentRollout,
     SingleLatentModel,
 )
-from planning.returns import best_of, prefer
-from planning.rollout import Candidates, actions_of, predict_states
-from planning.sampling import noise_each, sample_codes
-from planning.searching import SearchingPlanner, chunked, summary
+from cavin_pyro.planning.returns import best_of, prefer
+from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states
+from cavin_pyro.planning.sampling import noise_each, sample_codes
+from cavin_pyro.planning.searching import SearchingPlanner, chunked, summary
 
 
 class PushSearch(SearchingPlanner):
@@ -100,7 +100,7 @@ class FlatMotionSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.protocol.SearchSpace`."""
+        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         z = sample_codes(self.model.motion_prior, [plans], noise, generators)
         a = self.model.actions(here, motion_code=z)
         states, path = predict_states(self.model, here, a)
@@ -134,7 +134,7 @@ class PushSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.protocol.SearchSpace`."""
+        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         if noise is None:
             noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
         actions = (2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4))
@@ -255,7 +255,7 @@ class CascadeSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.protocol.SearchSpace`."""
+        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         sizes = self.model.effect_dimension, self.model.motion_dimension
         effect_noise, motion_noise = (None, None) if noise is None else noise.split(sizes, -1)
         c = sample_codes(self.model.effect_prior, [plans], effect_noise, generators)

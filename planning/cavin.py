@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning.additions.effect_retries import try_other_effects
-from planning.additions.failure_avoidance import AvoidFailures, prefer_no_failure
-from planning.additions.guidance import guided_tracking
-from planning.additions.nearest_objects import NearestObjects, nearest_objects
-from planning.additions.perturbed_rollouts import PerturbedRollouts, most_robust
-from planning.additions.touchdown import ObservedPoints
-from planning.checks import check_choice, check_positive, check_weight
-from planning.optimizers import Optimizer, make_optimizer
-from planning.protocol import (
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.additions.effect_retries import try_other_effects
+from cavin_pyro.planning.additions.failure_avoidance import AvoidFailures, prefer_no_failure
+from cavin_pyro.planning.additions.guidance import guided_tracking
+from cavin_pyro.planning.additions.nearest_objects import NearestObjects, nearest_objects
+from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts, most_robust
+from cavin_pyro.planning.additions.touchdown import ObservedPoints
+from cavin_pyro.planning.checks import check_choice, check_positive, check_weight
+from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
+from cavin_pyro.planning.protocol import (
     EffectModel,
     ModelRequirements,
     Objective,
@@ -28,10 +28,10 @@ from planning.protocol import (
     SegmentRollout,
     goal_objects,
 )
-from planning.returns import AUTO, END, FIRST_PUSH, SubgoalDistance, best_of, interpolate
-from planning.rollout import Candidates, actions_of, predict_states, select_segment
-from planning.sampling import sample_codes
-from planning.searching import SearchingPlanner, chunked, summary
+from cavin_pyro.planning.returns import AUTO, END, FIRST_PUSH, SubgoalDistance, best_of, interpolate
+from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states, select_segment
+from cavin_pyro.planning.sampling import sample_codes
+from cavin_pyro.planning.searching import SearchingPlanner, chunked, summary
 
 MOTION_HORIZONS = ("full_horizon", "first_segment")
 # Motions are all sampled for one effect, so few candidates suffice.
@@ -64,7 +64,7 @@ class CavinPlanner(SearchingPlanner):
         paper.
     avoid_failures: our addition to line 10: prefers motions along which f predicts no failure; false in the paper.
     robustness: our addition to line 10: ranks the best motions by perturbed rollouts; None in the paper.
-    options: of `planning.searching.SearchingPlanner`, whose optimizer searches codes at both levels.
+    options: of `cavin_pyro.planning.searching.SearchingPlanner`, whose optimizer searches codes at both levels.
 
     Raises ValueError for counts below 1, a horizon that T does not divide, an unknown `motion_horizon`, `optimizer`,
     `reward_at` or `tracking_at`, limits out of order, and a weight or a distance that is negative or not finite.
@@ -131,7 +131,7 @@ class CavinPlanner(SearchingPlanner):
         """Algorithm 1 for observed scenes `state: [B]`; the call advances `generators`, one per environment.
 
         `observed`: points of the objects that the camera sees, where no push may touch down. An environment's plan
-        depends on its own arguments only. For errors see `planning.searching.chunked`.
+        depends on its own arguments only. For errors see `cavin_pyro.planning.searching.chunked`.
         """
         # Line 1 (K = H / T) is in the constructor. Lines 2, 3 and 12, the loop over t, are the caller's.
         # Line 4: receive the new s_t from the environment.
@@ -216,7 +216,7 @@ class EffectSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.protocol.SearchSpace`."""
+        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         # Line 5: sample c_k, a segment at a time, since a learned prior p(c | s) depends on the state before it.
         c = sample_codes(self.model.effect_prior, [plans], noise, generators)
         # Line 6: predict the subgoal by equation 2 ...
@@ -241,7 +241,7 @@ class MotionSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `planning.protocol.SearchSpace`."""
+        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         c = select_segment(self.effect_codes, segment).expand(-1, plans.batch_shape[-1], -1)
         # Line 8: sample z_k, a segment at a time, as in line 5.
         z = sample_codes(self.model.motion_prior, [self.near.of(plans), c], noise, generators)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from models.state import State
+from cavin_pyro.models.state import State
 
 
 class NoFiniteCandidateError(ValueError):
@@ -23,7 +23,7 @@ class NoFiniteCandidateError(ValueError):
 
 
 class OptimizerError(ValueError):
-    """An optimizer breaks the interface `planning.optimizers.Optimizer`; the message names its class."""
+    """An optimizer breaks the interface `cavin_pyro.planning.optimizers.Optimizer`; the message names its class."""
 
 
 def check_positive(name: str, value: int) -> None:

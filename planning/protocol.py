@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from models.state import State
+from cavin_pyro.models.state import State
 
 
 class DynamicsModel(Protocol):
@@ -116,7 +116,7 @@ class ModelRequirements:
 class Reparameterized(Protocol):
     """A distribution with its own reparameterisation.
 
-    Torch's normal distributions and their transforms do not need it: `planning.sampling.reparameterize`.
+    Torch's normal distributions and their transforms do not need it: `cavin_pyro.planning.sampling.reparameterize`.
     """
 
     def reparameterize(self, noise: Tensor) -> Tensor:
@@ -320,6 +320,6 @@ class Planner(Protocol):
 
 @runtime_checkable
 class ObservingPlanner(Planner, Protocol):
-    """A planner whose method `plan` also takes what the camera sees: `planning.additions.touchdown.ObservedPoints`."""
+    """A planner whose method `plan` also takes what the camera sees: `ObservedPoints`."""
 
     touchdown_distance: float

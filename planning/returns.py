@@ -13,9 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning.checks import NoFiniteCandidateError
-from planning.protocol import BoundedReward, Outcome, PathReward, RewardFunction, SegmentRollout
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.checks import NoFiniteCandidateError
+from cavin_pyro.planning.protocol import BoundedReward, Outcome, PathReward, RewardFunction, SegmentRollout
 
 REWARD_AT = ("path", "subgoals")
 STRIDE_PENALTY = -100.0  # of a step, as for a violation (published code)
@@ -133,7 +133,7 @@ class CumulativeReward:
     def early_stopped(self, score_state: Progress) -> Tensor:
         """`[B]` bool: no active candidate can still reach a higher return than the best terminated one.
 
-        Always false, unless the reward function is a `planning.protocol.BoundedReward`.
+        Always false, unless the reward function is a `cavin_pyro.planning.protocol.BoundedReward`.
         """
         ended = torch.where(score_state.active, -torch.inf, score_state.returns).amax(-1)
         possible = torch.where(

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import records
-from planning.backends import Backend, eager
-from planning.checks import OptimizerError
-from planning.protocol import DynamicsModel, Evidence, Objective, SearchSpace, SegmentRollout
-from planning.sampling import noise_each, uniform_each
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import records
+from cavin_pyro.planning.backends import Backend, eager
+from cavin_pyro.planning.checks import OptimizerError
+from cavin_pyro.planning.protocol import DynamicsModel, Evidence, Objective, SearchSpace, SegmentRollout
+from cavin_pyro.planning.sampling import noise_each, uniform_each
 
 
 class SegmentRecord(NamedTuple):

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
 
-from models.state import State
-from planning.protocol import Reparameterized
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.protocol import Reparameterized
 
 
 def sample_each(

@@ -11,15 +11,15 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import records
-from planning.additions.guidance import check_guidance, distance_to_goal_of, guided_return
-from planning.additions.perturbed_rollouts import PerturbedRollouts
-from planning.additions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
-from planning.backends import make_backend
-from planning.checks import NoFiniteCandidateError, check_horizon, check_positive, check_scenes, check_weight
-from planning.optimizers import Optimizer, make_optimizer, search
-from planning.protocol import (
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import records
+from cavin_pyro.planning.additions.guidance import check_guidance, distance_to_goal_of, guided_return
+from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts
+from cavin_pyro.planning.additions.touchdown import TOUCHDOWN_DISTANCE, ObservedPoints, prefer_free
+from cavin_pyro.planning.backends import make_backend
+from cavin_pyro.planning.checks import NoFiniteCandidateError, check_horizon, check_positive, check_scenes, check_weight
+from cavin_pyro.planning.optimizers import Optimizer, make_optimizer, search
+from cavin_pyro.planning.protocol import (
     DistanceToGoal,
     DynamicsModel,
     EpisodicReward,
@@ -30,8 +30,8 @@ from planning.protocol import (
     RewardFunction,
     SearchSpace,
 )
-from planning.returns import CumulativeReward, StrideLimits
-from planning.rollout import Candidates, SearchProblem
+from cavin_pyro.planning.returns import CumulativeReward, StrideLimits
+from cavin_pyro.planning.rollout import Candidates, SearchProblem
 
 ROBUSTNESS = PerturbedRollouts()
 # Measured: a plan of 1,024 samples fills a processor's caches; sixteen plans in one pass take 1.6 times as long per
@@ -76,12 +76,12 @@ def chunked(plan: PlanMethod) -> PlanMethod:
 class SearchingPlanner:
     """Searches N = `samples` plans of K = `horizon` / T segments for the highest cumulative reward.
 
-    The options, of which `planning.cavin.CavinPlanner` has more:
+    The options, of which `cavin_pyro.planning.cavin.CavinPlanner` has more:
 
     samples: N, plans to compare.
     horizon: H steps, a multiple of the model's T.
     optimizer: searches the plans: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
-        `planning.optimizers.Optimizer`.
+        `cavin_pyro.planning.optimizers.Optimizer`.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment (published
         implementation).
     stride_limits: two distances in metres; a segment that moves every object less than the first, or any object more

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import importlib.util
 import logging
 import os
 import signal
@@ -26,7 +25,6 @@ from omegaconf import DictConfig, OmegaConf
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import Parser, UserError
 
-PACKAGES = ("models", "guides", "planning", "envs")
 RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "assets")  # docs/reliability.md
 _REFUSALS = ("ENOSPC", "EDQUOT", "EACCES", "EPERM", "EROFS", "EFBIG", "EIO", "ENAMETOOLONG")
 _DISK_ERRORS = {getattr(errno, name) for name in _REFUSALS}
@@ -48,7 +46,6 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             # where another program uses a core, plans would take fifty times as long, and training would stand still.
             os.environ.setdefault("OMP_NUM_THREADS", "1")
             line = guarded(lambda: read_command_line(sys.argv[1:]))
-            guarded(check_packages)
             config, choices = guarded(lambda: _compose(name, line))
             if line.help:
                 from cavin_pyro.config.help import help_page
@@ -179,15 +176,3 @@ def _sweep(name: str, body: Body, line: argparse.Namespace) -> None:
     presets = [] if line.config_dir is None else ["--config-dir", str(Path(line.config_dir).resolve())]
     sys.argv[1:] = ["--multirun", *presets, *words, *of_sweep(words)]
     hydra.main(version_base="1.3", config_path=None, config_name=name)(job)()
-
-
-def check_packages() -> None:
-    """Raise a `UserError` if a foreign package of the same name as one of ours comes first on the path."""
-    home = Path(__file__).resolve().parents[2]
-    for package in PACKAGES:
-        found = importlib.util.find_spec(package)
-        if not found or Path(found.origin or "").resolve() != home / package / "__init__.py":
-            raise UserError(
-                f"the package {package!r} of this program is hidden by {found and found.origin}: "
-                "run from another folder, or rename or uninstall that package"
-            )

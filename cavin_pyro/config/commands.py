@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cavin_pyro.config.options import option, preset_defaults, seed_option
-from envs.objects.sampling import ObjectRanges
-from envs.pushing import PushingEnv
-from envs.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
-from envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
+from cavin_pyro.envs.objects.sampling import ObjectRanges
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
+from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
 
 CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
     **dict.fromkeys(("cavin", "kinect", "held_out", "contact"), ("cascaded", "cascaded")),
@@ -70,10 +70,14 @@ class RangesConfig:
 class WorldConfig:
     """The section `env`: robot, objects, camera and segmentation, by name or as a class of the user's own."""
 
-    robot: Any = option(ENV["robot"], "robot that pushes", choices="envs.robots.ROBOTS")
-    objects: Any = option(ENV["object_set"], "set of objects", choices="envs.objects.object_sets.OBJECT_SETS")
-    camera: Any = option(ENV["camera"], "depth camera", choices="envs.sensors.CAMERAS")
-    segmentation: Any = option(ENV["segmentation"], "of depth images", choices="envs.segmentation.SEGMENTERS")
+    robot: Any = option(ENV["robot"], "robot that pushes", choices="cavin_pyro.envs.robots.ROBOTS")
+    objects: Any = option(
+        ENV["object_set"], "set of objects", choices="cavin_pyro.envs.objects.object_sets.OBJECT_SETS"
+    )
+    camera: Any = option(ENV["camera"], "depth camera", choices="cavin_pyro.envs.sensors.CAMERAS")
+    segmentation: Any = option(
+        ENV["segmentation"], "of depth images", choices="cavin_pyro.envs.segmentation.SEGMENTERS"
+    )
     assets: str | None = option(None, "folder of meshes, for object sets and robots that need one")
     ranges: RangesConfig = field(default_factory=RangesConfig)
 
@@ -253,7 +257,9 @@ class SceneConfig(DeviceOptions):
     defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper")
     layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
     reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
-    criterion: str = option(ENV["criterion"], "violations: the text's, or the code's", choices="envs.tasks.CRITERIA")
+    criterion: str = option(
+        ENV["criterion"], "violations: the text's, or the code's", choices="cavin_pyro.envs.tasks.CRITERIA"
+    )
     objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
     planner: Any = None
@@ -303,7 +309,9 @@ class DemoConfig(SceneConfig):
     """Options of `python -m cavin_pyro.demo`."""
 
     output: str | None = option(None, "folder for the results, with a subfolder per task; by default runs/demo")
-    tasks: list[str] = option(["clearing", "insertion", "crossing"], "tasks to run", choices="envs.tasks.TASKS")
+    tasks: list[str] = option(
+        ["clearing", "insertion", "crossing"], "tasks to run", choices="cavin_pyro.envs.tasks.TASKS"
+    )
     seed: int = seed_option("seed of the scenes and of the planner", default=1)
 
 

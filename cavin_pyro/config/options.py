@@ -25,7 +25,6 @@ from cavin_pyro.config.errors import UserError
 
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
-OWN_PACKAGES = ("cavin_pyro", "models", "guides", "planning", "envs")
 GIVEN = {  # which `build_model` gives, by group
     "prior": ("dimension", "feature_dimension", "effect_dimension"),
     "geometry": ("feature_dimension",),
@@ -198,7 +197,7 @@ def constructor_options(target: str) -> dict[str, inspect.Parameter]:
         constructors = [vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)]
     options: dict[str, inspect.Parameter] = {}
     for constructor in constructors:
-        if not inspect.isfunction(constructor) or constructor.__module__.partition(".")[0] not in OWN_PACKAGES:
+        if not inspect.isfunction(constructor) or constructor.__module__.partition(".")[0] != "cavin_pyro":
             break
         hints, parameters = get_type_hints(constructor), inspect.signature(constructor).parameters.values()
         for one in parameters:

@@ -14,14 +14,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line
-from guides.guide import Guide
-from models.model import Model
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
 
 Config = Mapping[str, Any] | DictConfig
-STANDARD_PRIOR = "models.priors.standard.StandardPrior"
+STANDARD_PRIOR = "cavin_pyro.models.priors.standard.StandardPrior"
 LARGEST_SIZE = 10**6  # more would fill the memory until the system kills the process, or take minutes to begin
-FIXED_SCALES = {"_target_": "models.likelihoods.LikelihoodScales"}
-PAPER_DYNAMICS = {"_target_": "models.networks.dynamics.Dynamics"}
+FIXED_SCALES = {"_target_": "cavin_pyro.models.likelihoods.LikelihoodScales"}
+PAPER_DYNAMICS = {"_target_": "cavin_pyro.models.networks.dynamics.Dynamics"}
 
 
 def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
@@ -119,7 +119,7 @@ def build_model(config: Config) -> Model:
     scales = build_part("scales", config.get("scales") or FIXED_SCALES)
     model = build_part("model", sizes, **parts, scales=scales, dynamics=dynamics)
     if not isinstance(model, Model):
-        raise UserError(f"model {sizes['_target_']} is no model program: derive it from models.model.Model")
+        raise UserError(f"model {sizes['_target_']} is no model program: derive it from cavin_pyro.models.model.Model")
     if not parts and config["prior"]["_target_"] != STANDARD_PRIOR:
         raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
     return model
@@ -135,7 +135,8 @@ def build_guide(config: Config, model: Model) -> Guide:
     fits = getattr(kind, "fits", ())
     if kind is not None and model.name not in fits:
         choices = ", ".join(name for name, guide in _guides().items() if model.name in guide.fits) or "none of ours"
-        other = f", derive yours from guides.guide.Guide, or choose guide=auto_normal guide.autoguide._target_={target}"
+        other = ", derive yours from cavin_pyro.guides.guide.Guide, "
+        other += f"or choose guide=auto_normal guide.autoguide._target_={target}"
         raise UserError(
             f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(fits) or 'none'}): "
             f"choose guide= from {choices}{'' if issubclass(kind, Guide) else other}"

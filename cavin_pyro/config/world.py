@@ -12,13 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.parts import construct, naming
-from envs.layouts import task_class
-from envs.objects.object_sets import ObjectSet, chosen, load_object_set, plain_name
-from envs.objects.sampling import ObjectRanges
-from envs.robots import Robot, robot_factory
-from envs.segmentation import Segmenter
-from envs.sensors import DepthSensor
-from envs.tasks import Task
+from cavin_pyro.envs.layouts import task_class
+from cavin_pyro.envs.objects.object_sets import ObjectSet, chosen, load_object_set, plain_name
+from cavin_pyro.envs.objects.sampling import ObjectRanges
+from cavin_pyro.envs.robots import Robot, robot_factory
+from cavin_pyro.envs.segmentation import Segmenter
+from cavin_pyro.envs.sensors import DepthSensor
+from cavin_pyro.envs.tasks import Task
 
 LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
     "scale": (0.1, 10.0),
@@ -45,7 +45,7 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
     try:
         kind = get_class(target)
         if not issubclass(kind, Task):
-            raise TypeError("derive it from envs.tasks.Task")
+            raise TypeError("derive it from cavin_pyro.envs.tasks.Task")
     except Exception as error:
         raise UserError(f"task._target_={target} is no task: {one_line(error)}") from error
     return kind, tiles | {name: value for name, value in section.items() if value is not None}
@@ -79,10 +79,10 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
 
 
 def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:
-    """The part of the world that the option `env.<name>` names, ready for `envs.pushing.PushingEnv`.
+    """The part of the world that the option `env.<name>` names, ready for `cavin_pyro.envs.pushing.PushingEnv`.
 
     An object set or a sensor of the user's is built; of robots and segmenters it is a factory, which gets the world
-    (`envs.physics.PhysicsWorld`) or M, the most objects. A name of a camera or of a segmentation stays one.
+    (`cavin_pyro.envs.physics.PhysicsWorld`) or M, the most objects. A name of a camera or of a segmentation stays one.
 
     Raises:
         UserError: an unknown name, missing files, or a class that cannot be built or is no such part.

@@ -11,8 +11,8 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, substitute, window_terms
-from models.state import Window
 
 ROWS = 4096  # particles times windows at once: some 100 MB with five objects
 NO_CODES = "The model has no codes, so there is nothing to check here."

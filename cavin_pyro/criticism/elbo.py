@@ -13,8 +13,8 @@ from cavin_pyro.criticism.estimates import Interval, clustered_interval, mean_in
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, Table, conclude, grade
 from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, window_terms
-from models.state import Window
 
 LABELS = {
     "nll_next_centers": "f: next states",

@@ -7,8 +7,8 @@ import subprocess
 
 import pyro
 
-from models.model import Model
-from models.state import Window
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import Window
 
 MISSING = "The graph of the program is not drawn: install Graphviz (its program dot) and the package graphviz."
 

@@ -18,9 +18,9 @@ from cavin_pyro.criticism.estimates import Interval, arviz, covered, draw_ranks,
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
 from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.models.networks.layers import unit
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program
-from models.networks.layers import unit
-from models.state import State, Window
 
 NAME, TITLE = "guide", "Is the guide calibrated?"
 INFORMED = 0.1  # a dimension counts as informed where its variance shrinks by more, given s

@@ -19,9 +19,9 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import MOVED
 from cavin_pyro.criticism.section import Section, conclude, within, worst
 from cavin_pyro.criticism.windows import repeated, seeded
-from guides.guide import Guide
-from models.model import Model
-from models.state import State, Window
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import State, Window
 
 NAME, TITLE = "intervals", "Do intervals of f and h hold what they say?"
 LEVELS = (0.5, 0.9)  # of central intervals

@@ -19,6 +19,10 @@ from cavin_pyro.config.parts import amortized_guides, build_guide
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.dataset import content_records, read_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.state import Window
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import file_digest
@@ -26,10 +30,6 @@ from cavin_pyro.storage.geometry import check_fit, geometry_of
 from cavin_pyro.storage.models import model_of
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.run import data_folders
-from guides.guide import Guide
-from models.model import Model
-from models.networks.geometry import Geometry
-from models.state import Window
 
 # Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
 ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum_move", "negative_fraction")

@@ -18,9 +18,9 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import Nearness, Statistic, statistics_of
 from cavin_pyro.criticism.section import Section, conclude, within, worst
 from cavin_pyro.criticism.windows import generated, observed, repeated, seeded
-from guides.guide import Guide
-from models.model import Model
-from models.state import Window
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import Window
 
 NAME, TITLE = "predictive", "Does the predictive distribution look like the data?"
 SOURCES = {

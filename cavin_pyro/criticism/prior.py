@@ -19,9 +19,9 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
 from cavin_pyro.criticism.section import INSPECT, Section, conclude, grade, not_applicable
 from cavin_pyro.criticism.windows import Outcome, generated, seeded
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program, substitute
-from models.model import Model
-from models.state import State, Window
 
 NAME, TITLE = "prior", "Is the prior the aggregate posterior, given the state?"
 GOOD, BAD = 0.6, 0.7  # AUC

@@ -32,6 +32,9 @@ from cavin_pyro.criticism.pushing import MOVED
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.data.dataset import content_records
+from cavin_pyro.models.likelihoods import PredictedScales
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import Window
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, find_checkpoint
 from cavin_pyro.storage.files import atomic_write, file_digest, write_json
 from cavin_pyro.storage.progress import progress_bar
@@ -39,9 +42,6 @@ from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.elbo import Program, elbo_terms, substitute
 from cavin_pyro.training.run import place
 from cavin_pyro.training.trainer import unchecked_programs
-from models.likelihoods import PredictedScales
-from models.model import Model
-from models.state import Window
 
 CPU = torch.device("cpu")
 OPTIONS = ("steps", "batch_size", "learning_rate", "wake_weight", "seed", "device")

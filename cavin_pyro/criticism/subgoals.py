@@ -24,15 +24,15 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
 from cavin_pyro.data.collection import clutter_area, open_scene
 from cavin_pyro.data.observed import observed_state
+from cavin_pyro.envs.objects.sampling import ObjectRanges
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.returns import best_of, squared_distance
+from cavin_pyro.planning.rollout import predict_states
+from cavin_pyro.planning.sampling import sample_each
 from cavin_pyro.storage.progress import progress_bar
-from envs.objects.sampling import ObjectRanges
-from envs.observation import Observation
-from envs.scene import Scene
-from models.model import Model
-from models.state import State
-from planning.returns import best_of, squared_distance
-from planning.rollout import predict_states
-from planning.sampling import sample_each
 
 SAMPLED, CLOSEST, GIVEN = "sampled", "closest", "given by the effect"  # how a motion is obtained
 

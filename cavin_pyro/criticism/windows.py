@@ -13,10 +13,10 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import substitute
-from guides.guide import Guide
-from models.model import Model
-from models.state import State, Window
 
 WINDOWS_AT_ONCE = 4096  # a few megabytes per layer, so that a pass stays in the processor's cache
 

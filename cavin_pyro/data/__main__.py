@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cavin_pyro import __version__
-from cavin_pyro.config.application import check_packages, guarded
+from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import Parser
 
 
@@ -15,7 +15,6 @@ def main() -> None:
 
 
 def _run() -> None:
-    check_packages()
     arguments = _parser().parse_args()
     folders = [Path(folder) for folder in arguments.folders]
     if arguments.action == "export":

@@ -30,18 +30,18 @@ from cavin_pyro.data.dataset import (
     write_shard,
 )
 from cavin_pyro.data.model_policy import ModelPushingPolicy, PushingPolicy, load_pusher
+from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.policy import HeuristicPushingPolicy
+from cavin_pyro.envs.randomness import collection_streams
+from cavin_pyro.envs.scene import PushReport, Scene
+from cavin_pyro.envs.workspace import POINTS_PER_OBJECT, object_slots
 from cavin_pyro.launching.launcher import Launcher, as_launcher
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.checkpoint import find_checkpoint
 from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.progress import progress_bar
-from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
-from envs.observation import Observation
-from envs.policy import HeuristicPushingPolicy
-from envs.randomness import collection_streams
-from envs.scene import PushReport, Scene
-from envs.workspace import POINTS_PER_OBJECT, object_slots
-from models.model import Model
-from models.networks.geometry import Geometry
 
 PUSHER = "contact"  # the checkpoint of policy=model, without another
 OPTIONS_OF_POLICIES = {"model": ("checkpoint", "motions"), "heuristic": ("intent_length", "perturbation_rate")}
@@ -165,7 +165,7 @@ def check_policy(config: CollectionConfig) -> None:
 
 
 def pushing_policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:
-    """What chooses the pushes of one episode; `generator`: its randomness, see `envs.randomness.collection_streams`."""
+    """What chooses the pushes of one episode; `generator`: its randomness, see `collection_streams`."""
     if config.policy == "model":
         return ModelPushingPolicy(generator, *_pusher(config.checkpoint or PUSHER), motions=config.motions)
     return HeuristicPushingPolicy(

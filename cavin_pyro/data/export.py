@@ -27,9 +27,9 @@ from cavin_pyro.data.dataset import (
     source_of_shards,
     sources_of,
 )
+from cavin_pyro.envs.workspace import POINTS_PER_OBJECT
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
-from envs.workspace import POINTS_PER_OBJECT
 
 OBSERVED = ("centers", "clouds", "visible")  # of every state; `mask` is the same in all states of an episode
 TOLD = ("moved", "unsafe", "ineffective", "fallen", "target", "angle")  # of every push, as `infos`

@@ -28,9 +28,9 @@ from cavin_pyro.data.dataset import (
     shard_path,
     write_shard,
 )
+from cavin_pyro.envs.objects.object_sets import listed, plain_name
+from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.files import clear_abandoned
-from envs.objects.object_sets import listed, plain_name
-from models.networks.geometry import Geometry
 
 BATCH = 4096  # clouds
 ABANDONED_SECONDS = 3600.0  # a file that another training writes there is younger

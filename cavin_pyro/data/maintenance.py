@@ -31,9 +31,9 @@ from cavin_pyro.data.dataset import (
     sources_of,
     write_metadata,
 )
+from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS
 from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
-from envs.workspace import MAXIMUM_OBJECTS
 
 WORLD = ("object_set", "camera", "segmentation", "ranges", "steps")  # options that merged datasets have in common
 _UNREADABLE = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError)  # what h5py raises

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from cavin_pyro.config.device import one_thread
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_points, observed_state
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.policy import Intent
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.planning.additions.touchdown import TOUCHDOWN_DISTANCE, prefer_free
+from cavin_pyro.planning.returns import best_of, squared_distance
+from cavin_pyro.planning.rollout import predict_states
+from cavin_pyro.planning.sampling import sample_each
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.models import model_of
-from envs.observation import Observation
-from envs.policy import Intent
-from models.model import Model
-from models.networks.geometry import Geometry
-from planning.additions.touchdown import TOUCHDOWN_DISTANCE, prefer_free
-from planning.returns import best_of, squared_distance
-from planning.rollout import predict_states
-from planning.sampling import sample_each
 
 
 class PushingPolicy(Protocol):

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from envs.workspace import REACH_HIGH, REACH_LOW
-from models.networks.geometry import Geometry
-from models.state import State
-from planning.additions.touchdown import ObservedPoints
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.additions.touchdown import ObservedPoints
 
 
 @torch.inference_mode()
@@ -22,7 +22,7 @@ def observed_state(
     """The planner's state, a batch of one, from an observation, without needless padding.
 
     Args:
-        observation: `centers`, `clouds` and `mask` of `envs.observation.Observation`, [M, ...].
+        observation: `centers`, `clouds` and `mask` of `cavin_pyro.envs.observation.Observation`, [M, ...].
         device: of the state; `geometry` is on the CPU.
     """
     objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1

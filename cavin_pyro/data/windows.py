@@ -28,9 +28,9 @@ from cavin_pyro.data.dataset import (
     slots_of,
 )
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.progress import progress_bar
-from models.networks.geometry import Geometry
-from models.state import State, Window
 
 SEGMENT_LENGTH = 3  # T
 NEEDED = ("centers", "visible", "mask", "actions", "unsafe", "fallen", "length", "shape", "scale")  # of a shard

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from envs.pushing import PushingEnv
-from envs.tasks import Outcome, Task, TaskReward
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.tasks import Outcome, Task, TaskReward
 
 
 class EpisodeReward:
-    """`envs.tasks.TaskReward` of the task of the environment's episode; a planner is built with it once.
+    """`cavin_pyro.envs.tasks.TaskReward` of the task of the environment's episode; a planner is built with it once.
 
     Every call reads the environment's `task`, so the tiles and the goal are always those of the current episode.
 

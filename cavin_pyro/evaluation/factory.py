@@ -19,25 +19,25 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import About, check_value
 from cavin_pyro.config.parts import check_sizes, class_of, construct, naming
 from cavin_pyro.config.world import object_ranges, part_of, task_of
+from cavin_pyro.envs.layouts import GENERATED
+from cavin_pyro.envs.objects.sampling import NoRoomError
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.tasks import GeneratedLayouts, Task
+from cavin_pyro.envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
 from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.planning import Planner
+from cavin_pyro.planning.backends import GRAPHS
+from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
+from cavin_pyro.planning.optimizers import Shooting
+from cavin_pyro.planning.protocol import RewardFunction
+from cavin_pyro.planning.returns import AUTO, END
+from cavin_pyro.planning.searching import SearchingPlanner
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.models import model_of
-from envs.layouts import GENERATED
-from envs.objects.sampling import NoRoomError
-from envs.pushing import PushingEnv
-from envs.tasks import GeneratedLayouts, Task
-from envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
-from models.model import Model
-from models.networks.geometry import Geometry
-from planning import Planner
-from planning.backends import GRAPHS
-from planning.checks import NoFiniteCandidateError, OptimizerError
-from planning.optimizers import Shooting
-from planning.protocol import RewardFunction
-from planning.returns import AUTO, END
-from planning.searching import SearchingPlanner
 
 CPU = torch.device("cpu")
 

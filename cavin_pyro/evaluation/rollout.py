@@ -13,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.data.observed import observed_points, observed_state
-from envs.pushing import ObservationDict, PushingEnv
-from envs.randomness import planner_seed
-from envs.workspace import PUSH_DECIMALS, executed_push
-from models.networks.geometry import Geometry
-from planning import Plan, Planner
-from planning.protocol import ObservingPlanner
-from planning.records import apply
+from cavin_pyro.envs.pushing import ObservationDict, PushingEnv
+from cavin_pyro.envs.randomness import planner_seed
+from cavin_pyro.envs.workspace import PUSH_DECIMALS, executed_push
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.planning import Plan, Planner
+from cavin_pyro.planning.protocol import ObservingPlanner
+from cavin_pyro.planning.records import apply
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
 
@@ -154,7 +154,7 @@ def rollout(
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
             planner that tracks the first push (`tracking_at`) is for 1.
-        push_decimals: to which planned pushes are rounded (`envs.workspace.executed_push`), so that an episode does not
+        push_decimals: to which planned pushes are rounded (`executed_push`), so that an episode does not
             depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
         callbacks: called in this order; without any, no frame is computed.

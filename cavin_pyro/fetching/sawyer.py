@@ -7,9 +7,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.envs.robots import STICK_LENGTH, STICK_RADIUS
 from cavin_pyro.fetching.install import Files, take
 from cavin_pyro.fetching.meshes import decimated, read_mesh
-from envs.robots import STICK_LENGTH, STICK_RADIUS
 
 COMMIT = "bd387981a6fbc0c63dbeabd17a3765d5527bfe94"  # release 5.3.0, the last one
 URDF = "sawyer_description/urdf/sawyer.urdf"

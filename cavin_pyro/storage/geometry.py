@@ -8,12 +8,12 @@ from typing import Any
 from cavin_pyro.config.commands import DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import Config, construct
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
-from models.model import Model
-from models.networks.geometry import Geometry
-from models.networks.pointnet import PointNet
 
-POINTNET = "models.networks.pointnet.PointNet"
+POINTNET = "cavin_pyro.models.networks.pointnet.PointNet"
 
 
 def check_fit(model: Model, geometry: Geometry, objects: int | None = None) -> None:
@@ -106,5 +106,7 @@ def pointnet_of(checkpoint: Checkpoint, where: str | Path) -> PointNet:
 
 def _frozen(geometry: Any) -> Geometry:
     if not isinstance(geometry, Geometry):
-        raise UserError(f"geometry {type(geometry).__name__} is no Geometry: derive it from models.networks.geometry")
+        raise UserError(
+            f"geometry {type(geometry).__name__} is no Geometry: derive it from cavin_pyro.models.networks.geometry"
+        )
     return geometry.requires_grad_(False).eval()

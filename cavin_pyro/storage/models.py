@@ -6,8 +6,8 @@ from pathlib import Path
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_model
+from cavin_pyro.models.model import Model
 from cavin_pyro.storage.checkpoint import Checkpoint
-from models.model import Model
 
 
 def model_of(checkpoint: Checkpoint, where: str | Path) -> Model:

@@ -8,12 +8,12 @@ import platform
 import shlex
 import subprocess
 import sys
+from glob import glob
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from cavin_pyro import __version__
-from cavin_pyro.config.application import PACKAGES
 
 
 def provenance() -> dict[str, Any]:
@@ -30,11 +30,10 @@ def provenance() -> dict[str, Any]:
 
 
 def program_fingerprint() -> str:
-    """Twelve hexadecimal digits that change when any source file of the five packages does."""
-    home, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
-    for package in ("cavin_pyro", *PACKAGES):
-        for file in sorted((home / package).rglob("*.py")):
-            digest.update(str(file.relative_to(home)).encode() + file.read_bytes())
+    """Twelve hexadecimal digits that change when any source file of the program does."""
+    home, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
+    for name in sorted(glob("**/*.py", root_dir=home, recursive=True)):
+        digest.update(name.encode() + (home / name).read_bytes())
     return digest.hexdigest()[:12]
 
 

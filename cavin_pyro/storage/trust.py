@@ -8,19 +8,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cavin_pyro.config.application import PACKAGES
 from cavin_pyro.config.errors import UserError
 
-OWN_MODULES = ("models", "guides")
+OWN_MODULES = ("cavin_pyro.models", "cavin_pyro.guides")
+OLDER_NAMES = ("models.", "guides.", "planning.", "envs.")  # of packages that had a top-level name before 0.2.0
 AUTOMATIC_GUIDES = "pyro.infer.autoguide"  # what guides/automatic.py holds; building one runs the model at most
-NEVER_SUGGESTED = {"cavin_pyro", *PACKAGES, *sys.stdlib_module_names}
-ANY = "models.model.Model"  # for sections that name no class
+NEVER_SUGGESTED = {"cavin_pyro", *sys.stdlib_module_names}
+ANY = "cavin_pyro.models.model.Model"  # for sections that name no class
 LARGEST_SIZE = 4096  # of a number in a configuration that is not compared with the weights
 DEEPEST = 20  # levels of a configuration; ours have four
 
 
 def check_targets(config: Any, path: Path, trust: Sequence[str], depth: int = 0) -> None:
-    """Check the sections of a stored configuration from which parts are built.
+    """Check the sections of a stored configuration from which parts are built; older names of classes become today's.
 
     Args:
         path: of the checkpoint, for error lines. trust: modules whose own classes may be named as well.
@@ -35,6 +35,8 @@ def check_targets(config: Any, path: Path, trust: Sequence[str], depth: int = 0)
         raise UserError(f"checkpoint {path} has an interpolation in its configuration, which is refused: {config[:80]}")
     if isinstance(config, dict):
         if "_target_" in config:
+            if str(config["_target_"]).startswith(OLDER_NAMES):
+                config["_target_"] = f"cavin_pyro.{config['_target_']}"
             _check_target(config["_target_"], path, trust)
         config = [*config, *config.values()]
     for entry in config if isinstance(config, list) else ():

@@ -11,8 +11,8 @@ import torch
 from pyro.infer import RenyiELBO, TraceGraph_ELBO
 from torch import Tensor, nn
 
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import window_terms
-from models.state import Window
 
 
 @runtime_checkable

@@ -11,8 +11,8 @@ from pyro.poutine.util import site_is_subsample
 from torch import nn
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.resume import forked
-from models.state import Window
 
 Site = Any  # of a trace: a dictionary of Pyro's
 Sites = dict[str, Site]

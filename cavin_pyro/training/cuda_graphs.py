@@ -15,11 +15,11 @@ from pyro.infer import Trace_ELBO
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
+from cavin_pyro.models.networks.layers import fixed_shapes
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.objectives import BoundObjective, Objective
 from cavin_pyro.training.resume import forked
-from models.networks.layers import fixed_shapes
-from models.state import Window
 
 
 def capturable(loss: BoundObjective, window: Window) -> bool:

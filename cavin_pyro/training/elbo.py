@@ -12,7 +12,7 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
-from models.state import Window
+from cavin_pyro.models.state import Window
 
 EFFECT_AND_MOTION_SITES = ("subgoal_centers", "subgoal_features", "actions", "effect_code", "motion_code")
 Program = Callable[..., Any]  # a Pyro program, or one with a handler around it; called with a window

@@ -20,10 +20,10 @@ from pyro.infer import (
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
-from guides.guide import Guide
-from models.model import Model
-from models.state import Window
 
 CODES = ("effect_code", "motion_code")
 COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanField_ELBO)

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.models.networks.pointnet import CLOUD_UNIT, PointNetAutoencoder, chamfer_distance
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors, resuming, section, write_resume
-from models.networks.pointnet import CLOUD_UNIT, PointNetAutoencoder, chamfer_distance
 
 CPU = torch.device("cpu")
 

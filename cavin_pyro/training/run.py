@@ -19,6 +19,9 @@ from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build
 from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint, verify_checkpoint
 from cavin_pyro.storage.files import file_digest, output_folder, write_json
 from cavin_pyro.storage.geometry import check_fit, chosen_geometry, geometry_of, part_name
@@ -27,9 +30,6 @@ from cavin_pyro.storage.run_directory import check_same_data, check_same_run, wr
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.objectives import Objective, as_objective
 from cavin_pyro.training.trainer import Trainer, fixed_windows
-from guides.guide import Guide
-from models.model import Model
-from models.networks.geometry import Geometry
 
 DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
 

@@ -23,6 +23,9 @@ from cavin_pyro.config.commands import TrainerConfig
 from cavin_pyro.config.device import send, set_matmul_precision
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import ScalarLog, progress_bar
 from cavin_pyro.training.cuda_graphs import CapturedLoss, capturable
@@ -38,9 +41,6 @@ from cavin_pyro.training.resume import (
     section,
     write_resume,
 )
-from guides.guide import Guide
-from models.model import Model
-from models.state import State, Window
 
 VALIDATION_BATCH = 1024  # windows at once, which bounds the memory
 

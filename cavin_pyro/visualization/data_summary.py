@@ -11,8 +11,8 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from cavin_pyro.data.summary import CELL, DISTANCES, SEGMENT, DataSummary
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
-from envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 
 ONE, SEVERAL = "#0072B2", "#D55E00"
 MAPS = {

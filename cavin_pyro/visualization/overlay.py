@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cavin_pyro.envs.tasks import Task
+from cavin_pyro.envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, push_endpoints, tile_center
 from cavin_pyro.evaluation.rollout import PlanRecord
-from envs.tasks import Task
-from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, push_endpoints, tile_center
 
 Pixels = NDArray[np.float64]  # [..., 2]
 

@@ -20,6 +20,11 @@ from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from cavin_pyro.envs.markings import PLACE_RADIUS
+from cavin_pyro.envs.scene import COLORS
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.tasks import Task
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord
 from cavin_pyro.visualization.overlay import (
     OBSTACLE_COLOR,
@@ -41,11 +46,6 @@ from cavin_pyro.visualization.overlay import (
     tile_corners,
 )
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
-from envs.markings import PLACE_RADIUS
-from envs.scene import COLORS
-from envs.sensors.camera import Camera
-from envs.tasks import Task
-from envs.workspace import TABLE_HIGH, TABLE_LOW
 
 PANELS = 5  # plans shown, besides the end
 CANDIDATES = 150  # dots per panel

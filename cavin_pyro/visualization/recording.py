@@ -16,6 +16,11 @@ import rerun.blueprint as rrb
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from cavin_pyro.envs.markings import PLACE_RADIUS
+from cavin_pyro.envs.pushing import ObservationDict, PushingEnv
+from cavin_pyro.envs.scene import COLORS
+from cavin_pyro.envs.tasks import Task
+from cavin_pyro.envs.workspace import TILE_SIDE, tile_center
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.overlay import (
@@ -32,11 +37,6 @@ from cavin_pyro.visualization.overlay import (
 )
 from cavin_pyro.visualization.plan import RETURNS, return_scale
 from cavin_pyro.visualization.video import FRAMES_PER_SECOND, PAUSE
-from envs.markings import PLACE_RADIUS
-from envs.pushing import ObservationDict, PushingEnv
-from envs.scene import COLORS
-from envs.tasks import Task
-from envs.workspace import TILE_SIDE, tile_center
 
 TIMELINE = "video"  # seconds; the same moments as in `episode.mp4`
 POINT_RADIUS = 0.0015  # metres

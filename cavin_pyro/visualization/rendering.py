@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.envs.goals import SUFFIXES, save_goal
+from cavin_pyro.envs.pushing import ObservationDict
+from cavin_pyro.envs.scene import Scene
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
 from cavin_pyro.visualization.video import episode_video
-from envs.goals import SUFFIXES, save_goal
-from envs.pushing import ObservationDict
-from envs.scene import Scene
 
 SAID = {  # of a push, for people
     "success": "goal reached",
@@ -143,7 +143,7 @@ def write_steps(path: Path, episode: Episode) -> None:
     its candidates that reach the goal by the model.
 
     A plan by inference (`planner.optimizer=smc`) also has its estimate of log Z, its temperature, and the fewest
-    effective samples after any segment; see `planning.protocol.Evidence`.
+    effective samples after any segment; see `cavin_pyro.planning.protocol.Evidence`.
     """
     planned = {record.step: record for record in episode.plan_records}
     with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:

@@ -14,9 +14,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from cavin_pyro.models.networks.pointnet import PointNetAutoencoder
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.training.trainer import Row
-from models.networks.pointnet import PointNetAutoencoder
 
 DOTS_PER_INCH = 120
 COLORS = {"training": "#0072B2", "validation": "#D55E00"}

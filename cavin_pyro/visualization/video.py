@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from cavin_pyro.envs.pushing import VIDEO_SIZE, ObservationDict, PushingEnv
+from cavin_pyro.envs.tasks import Task
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_overlay, return_scale
 from cavin_pyro.visualization.training import DOTS_PER_INCH
-from envs.pushing import VIDEO_SIZE, ObservationDict, PushingEnv
-from envs.tasks import Task
 
 FRAMES_PER_SECOND = 10
 PAUSE = 0.5  # seconds for which a new plan is shown before its execution

@@ -3,7 +3,7 @@
 `TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout.
 
     task: crossing            # optional
-    region: [[2, 2], [2, 3]]  # the fields of `envs.tasks.crossing.Crossing`
+    region: [[2, 2], [2, 3]]  # the fields of `cavin_pyro.envs.tasks.crossing.Crossing`
     goal: [[2, 2]]
     target_start: [[2, 3]]
     obstacle_start: [[1, 3]]
@@ -22,8 +22,8 @@ from typing import Any, get_type_hints
 import numpy as np
 import yaml
 
-from envs.tasks import TASKS, GeneratedLayouts, Task
-from envs.tasks.tiles import TileSet
+from cavin_pyro.envs.tasks import TASKS, GeneratedLayouts, Task
+from cavin_pyro.envs.tasks.tiles import TileSet
 
 RANDOM, GENERATED = "random", "generated"
 _FOLDER = Path(__file__).parent
@@ -40,7 +40,7 @@ def task_class(task: str | type[Task]) -> type[Task]:
             raise ValueError(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
         return TASKS[task]
     if not (isinstance(task, type) and issubclass(task, Task)):
-        raise ValueError(f"{task!r} is no task: derive it from envs.tasks.Task")
+        raise ValueError(f"{task!r} is no task: derive it from cavin_pyro.envs.tasks.Task")
     if task.__abstractmethods__:
         raise ValueError(f"task {task.__name__} lacks {' and '.join(sorted(task.__abstractmethods__))}")
     known = {field.name for field in fields(task)}
@@ -115,7 +115,7 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
     """A task in one of its layouts, or in that of a YAML file.
 
     Args:
-        task: a name in `envs.tasks.TASKS`, or a class. layout: a number, or the path of a YAML file.
+        task: a name in `cavin_pyro.envs.tasks.TASKS`, or a class. layout: a number, or the path of a YAML file.
         tiles: fields that replace those of the layout; None values are ignored.
 
     Raises:

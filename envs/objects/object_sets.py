@@ -11,8 +11,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from envs.files import assets_folder, process_folder
-from envs.objects.shapes import BUILTIN_NAMES, RANDOM_NAMES, Shape, builtin_shape, plain_name, random_shape, write_mesh
+from cavin_pyro.envs.files import assets_folder, process_folder
+from cavin_pyro.envs.objects.shapes import (
+    BUILTIN_NAMES,
+    RANDOM_NAMES,
+    Shape,
+    builtin_shape,
+    plain_name,
+    random_shape,
+    write_mesh,
+)
 
 SCANS = "ycb"  # the folder's name within the assets, and the prefix of its objects' names
 FARTHEST = 100.0  # metres; larger numbers are not metres
@@ -64,7 +72,7 @@ class ObjectSet(Protocol):
 
 
 class ShapeObjects:
-    """Shapes of `envs.objects.shapes`, each written to a temporary folder at its first use.
+    """Shapes of `cavin_pyro.envs.objects.shapes`, each written to a temporary folder at its first use.
 
     Args:
         names: of the objects. build: makes the shape of a name.

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.objects.object_sets import BUILTIN, ObjectSet, chosen
-from envs.objects.shapes import BUILTIN_NAMES
-from envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.objects.object_sets import BUILTIN, ObjectSet, chosen
+from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
 ATTEMPTS = 400  # arrangements sampled before an area counts as too small
 

@@ -1,7 +1,7 @@
 """The only package that calls PyBullet: bodies, steps, contacts, images and arms of a simulated world."""
 
-from envs.physics.arm import Arm, ArmDescription, Kinematics
-from envs.physics.bullet import PYBULLET_DATA
-from envs.physics.world import TIME_STEP, PhysicsWorld, Poses
+from cavin_pyro.envs.physics.arm import Arm, ArmDescription, Kinematics
+from cavin_pyro.envs.physics.bullet import PYBULLET_DATA
+from cavin_pyro.envs.physics.world import TIME_STEP, PhysicsWorld, Poses
 
 __all__ = ["PYBULLET_DATA", "TIME_STEP", "Arm", "ArmDescription", "Kinematics", "PhysicsWorld", "Poses"]

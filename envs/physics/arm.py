@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.bullet import BulletClient, connect, pybullet
-from envs.physics.world import TOOL_FRICTION, PhysicsWorld
+from cavin_pyro.envs.physics.bullet import BulletClient, connect, pybullet
+from cavin_pyro.envs.physics.world import TOOL_FRICTION, PhysicsWorld
 
 STICK, TIP = "stick", "stick_tip"  # links of the URDF: the stick, and its lower end
 MOTOR_FORCE = 1e4  # newton metres; with the effort limits of real arms heavy objects bend the line of a push

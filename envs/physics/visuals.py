@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.physics.bullet import BulletClient, pybullet
+from cavin_pyro.envs.physics.bullet import BulletClient, pybullet
 
 
 @dataclass(frozen=True)

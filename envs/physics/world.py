@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.objects.object_sets import ObjectAsset
-from envs.objects.sampling import ObjectParameters
-from envs.physics.bullet import BulletClient, connect, pybullet
-from envs.physics.visuals import Part, parts_of
-from envs.sensors.camera import FAR, NEAR, Camera
-from envs.sensors.sensor import Rendering
-from envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
+from cavin_pyro.envs.objects.object_sets import ObjectAsset
+from cavin_pyro.envs.objects.sampling import ObjectParameters
+from cavin_pyro.envs.physics.bullet import BulletClient, connect, pybullet
+from cavin_pyro.envs.physics.visuals import Part, parts_of
+from cavin_pyro.envs.sensors.camera import FAR, NEAR, Camera
+from cavin_pyro.envs.sensors.sensor import Rendering
+from cavin_pyro.envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
 
 TIME_STEP = 1.0 / 240.0  # seconds
 SOLVER_ITERATIONS = 20  # per step; 50 leave all objects within 12 mm of it, and take 1.3 to 1.5 times as long

@@ -6,12 +6,21 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from envs.physics import PhysicsWorld
-from envs.robots.arm import ArmRobot
-from envs.robots.panda import panda
-from envs.robots.robot import SETTLED_SPEED, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, Robot, Stopped, push, settle
-from envs.robots.sawyer import sawyer
-from envs.robots.stick import RETRACTED, StickRobot
+from cavin_pyro.envs.physics import PhysicsWorld
+from cavin_pyro.envs.robots.arm import ArmRobot
+from cavin_pyro.envs.robots.panda import panda
+from cavin_pyro.envs.robots.robot import (
+    SETTLED_SPEED,
+    STICK_LENGTH,
+    STICK_RADIUS,
+    TIP_HEIGHT,
+    Robot,
+    Stopped,
+    push,
+    settle,
+)
+from cavin_pyro.envs.robots.sawyer import sawyer
+from cavin_pyro.envs.robots.stick import RETRACTED, StickRobot
 
 __all__ = [
     "RETRACTED",

@@ -15,10 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
-from envs.physics import TIME_STEP, Arm, ArmDescription, Kinematics, PhysicsWorld
-from envs.robots.robot import ABOVE_HEIGHT, PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, TIP_HEIGHT, Point, Stopped
-from envs.sensors.camera import Camera
-from envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.physics import TIME_STEP, Arm, ArmDescription, Kinematics, PhysicsWorld
+from cavin_pyro.envs.robots.robot import (
+    ABOVE_HEIGHT,
+    PUSH_STEPS,
+    STICK_LENGTH,
+    STICK_RADIUS,
+    TIP_HEIGHT,
+    Point,
+    Stopped,
+)
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
 DISTANCES = np.arange(0.20, 1.001, 0.05)  # metres from the first joint's axis
 HEIGHTS = np.linspace(TIP_HEIGHT, ABOVE_HEIGHT, 4)  # metres

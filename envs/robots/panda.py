@@ -6,10 +6,10 @@ from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
-from envs.files import process_folder
-from envs.physics import PYBULLET_DATA, ArmDescription
-from envs.physics.arm import STICK, TIP
-from envs.robots.robot import STICK_LENGTH, STICK_RADIUS
+from cavin_pyro.envs.files import process_folder
+from cavin_pyro.envs.physics import PYBULLET_DATA, ArmDescription
+from cavin_pyro.envs.physics.arm import STICK, TIP
+from cavin_pyro.envs.robots.robot import STICK_LENGTH, STICK_RADIUS
 
 POSTURE = (0.0, 0.3, 0.0, -1.8, 0.0, 2.2, 0.78)  # radians
 HOME = (1.51, 0.0, -0.03, -1.92, 0.02, 1.79, 0.63)  # radians; turned to the left, beside the table

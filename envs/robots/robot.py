@@ -1,6 +1,6 @@
 """The interface of robots, which the driver of a real arm implements.
 
-`envs.robots.robot.push` makes whatever implements `Robot` push: one of `envs.robots.ROBOTS`, or a class of the user's.
+`push` makes whatever implements `Robot` push: one of `cavin_pyro.envs.robots.ROBOTS`, or a class of the user's.
 All places are those of the tool's tip, (x, y, z) metres in the robot's base frame with the table's top at z = 0, and
 the tool stands upright. No method raises for an event on the table: it reports the event and stops the robot.
 """
@@ -13,8 +13,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics import PhysicsWorld
-from envs.sensors.camera import Camera
+from cavin_pyro.envs.physics import PhysicsWorld
+from cavin_pyro.envs.sensors.camera import Camera
 
 STICK_RADIUS = 0.01  # metres
 STICK_LENGTH = 0.15  # metres

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from xml.etree import ElementTree
 
-from envs.files import assets_folder
-from envs.physics import ArmDescription
+from cavin_pyro.envs.files import assets_folder
+from cavin_pyro.envs.physics import ArmDescription
 
 URDF = Path("sawyer", "sawyer_stick.urdf")  # inside the folder of assets
 HOW_TO_GET = "get it with `python -m cavin_pyro.assets sawyer --to DIR`, then give env.assets=DIR"

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from envs.physics import TIME_STEP, PhysicsWorld
-from envs.robots.robot import PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
-from envs.sensors.camera import Camera
+from cavin_pyro.envs.physics import TIME_STEP, PhysicsWorld
+from cavin_pyro.envs.robots.robot import PUSH_STEPS, STICK_LENGTH, STICK_RADIUS, Point, Stopped
+from cavin_pyro.envs.sensors.camera import Camera
 
 RETRACTED = (0.60, 0.0, 2.0)  # metres, the tool's middle; above the camera, out of its view
 _MIDDLE = STICK_LENGTH / 2  # metres above the tip

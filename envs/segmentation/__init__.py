@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from envs.segmentation.clusters import ClusterSegmenter
-from envs.segmentation.segmenter import MaskSegmenter, Pixels, Segmenter, TrueMasks
-from envs.workspace import OBJECT_SLOTS
+from cavin_pyro.envs.segmentation.clusters import ClusterSegmenter
+from cavin_pyro.envs.segmentation.segmenter import MaskSegmenter, Pixels, Segmenter, TrueMasks
+from cavin_pyro.envs.workspace import OBJECT_SLOTS
 
 SegmenterFactory = Callable[[int], Segmenter]
 """Makes a segmenter that finds at most so many objects."""

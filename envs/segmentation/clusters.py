@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
-from envs.segmentation.height_map import (
+from cavin_pyro.envs.segmentation.height_map import (
     AROUND,
     CELL,
     MINIMUM_AREA,
@@ -32,10 +32,10 @@ from envs.segmentation.height_map import (
     nearest_owner,
     split_at_necks,
 )
-from envs.segmentation.registration import Shape, explain, shape_of
-from envs.segmentation.segmenter import Pixels
-from envs.sensors.sensor import DepthImage
-from envs.workspace import OBJECT_SLOTS
+from cavin_pyro.envs.segmentation.registration import Shape, explain, shape_of
+from cavin_pyro.envs.segmentation.segmenter import Pixels
+from cavin_pyro.envs.sensors.sensor import DepthImage
+from cavin_pyro.envs.workspace import OBJECT_SLOTS
 
 FARTHEST = 0.5  # metres; no object goes farther between two images
 REMNANT = 0.1  # of an object's former area; smaller pieces are remnants of another object

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from envs.segmentation.segmenter import Pixels
-from envs.sensors.camera import RAY_COLUMN, RAY_ROW
-from envs.sensors.sensor import DepthImage
-from envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.segmentation.segmenter import Pixels
+from cavin_pyro.envs.sensors.camera import RAY_COLUMN, RAY_ROW
+from cavin_pyro.envs.sensors.sensor import DepthImage
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
 CELL = 0.004  # metres; a little more than what a pixel of the Kinect2 shows from one metre
 MARGIN = 0.06  # metres around the table

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from envs.segmentation.height_map import AROUND, CELL, Mask
+from cavin_pyro.envs.segmentation.height_map import AROUND, CELL, Mask
 
 
 @dataclass(frozen=True)

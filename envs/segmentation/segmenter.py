@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.sensors.sensor import DepthImage
+from cavin_pyro.envs.sensors.sensor import DepthImage
 
 Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Rows and columns of an object's pixels, each [P]."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from envs.sensors.camera import Camera
-from envs.sensors.kinect2 import Kinect2
-from envs.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering, SensorFactory
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.sensors.kinect2 import Kinect2
+from cavin_pyro.envs.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering, SensorFactory
 
 CAMERAS: dict[str, SensorFactory] = {"ideal": IdealSensor, "kinect2": Kinect2}
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from envs.sensors.camera import KINECT2_HEIGHT, KINECT2_WIDTH, Camera
-from envs.sensors.sensor import DepthImage, Renderer
-from envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.sensors.camera import KINECT2_HEIGHT, KINECT2_WIDTH, Camera
+from cavin_pyro.envs.sensors.sensor import DepthImage, Renderer
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
 LATERAL_NOISE = 0.0016  # metres across the ray, standard deviation
 RANGE = (0.5, 4.5)  # metres; the sensor's working range

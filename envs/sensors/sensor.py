@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.sensors.camera import Camera
+from cavin_pyro.envs.sensors.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Rendering:
 
 
 class Renderer(Protocol):
-    """A renderer: `envs.physics.PhysicsWorld.render`."""
+    """A renderer: `cavin_pyro.envs.physics.PhysicsWorld.render`."""
 
     def __call__(self, camera: Camera, *, table: bool = True) -> Rendering:
         """Render the view of `camera`, with or without the table."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from envs.tasks.clearing import Clearing
-from envs.tasks.crossing import Crossing
-from envs.tasks.gathering import Gathering
-from envs.tasks.generated import GeneratedLayouts
-from envs.tasks.insertion import Insertion
-from envs.tasks.rearrange import Rearrange
-from envs.tasks.reward import CRITERIA, REWARD_NAMES, Outcome, TaskReward
-from envs.tasks.task import GOAL_MARKING, Marking, Step, Task
-from envs.tasks.tiles import TileSet
+from cavin_pyro.envs.tasks.clearing import Clearing
+from cavin_pyro.envs.tasks.crossing import Crossing
+from cavin_pyro.envs.tasks.gathering import Gathering
+from cavin_pyro.envs.tasks.generated import GeneratedLayouts
+from cavin_pyro.envs.tasks.insertion import Insertion
+from cavin_pyro.envs.tasks.rearrange import Rearrange
+from cavin_pyro.envs.tasks.reward import CRITERIA, REWARD_NAMES, Outcome, TaskReward
+from cavin_pyro.envs.tasks.task import GOAL_MARKING, Marking, Step, Task
+from cavin_pyro.envs.tasks.tiles import TileSet
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Clearing, Crossing, Gathering, Insertion, Rearrange)}
 

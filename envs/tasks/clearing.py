@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.tasks.generated import GeneratedLayouts, blocks, paths
-from envs.tasks.task import Marking, Step, Task, check_inside
-from envs.tasks.tiles import TileSet, table_distance
+from cavin_pyro.envs.tasks.generated import GeneratedLayouts, blocks, paths
+from cavin_pyro.envs.tasks.task import Marking, Step, Task, check_inside
+from cavin_pyro.envs.tasks.tiles import TileSet, table_distance
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from envs.tasks.generated import GeneratedLayouts, paths, reachable_tiles, starting_tiles
-from envs.tasks.task import GOAL_MARKING, Marking, Step, Task, check_apart, check_inside
-from envs.tasks.tiles import TileSet
-from envs.workspace import TILE_SIDE
+from cavin_pyro.envs.tasks.generated import GeneratedLayouts, paths, reachable_tiles, starting_tiles
+from cavin_pyro.envs.tasks.task import GOAL_MARKING, Marking, Step, Task, check_apart, check_inside
+from cavin_pyro.envs.tasks.tiles import TileSet
+from cavin_pyro.envs.workspace import TILE_SIDE
 
 PUBLISHED_TOLERANCE = 1.5 * TILE_SIDE  # metres around the bridge, in real episodes of the published implementation
 

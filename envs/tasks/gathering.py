@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from envs.tasks.task import Marking, Step, Task, check_apart
-from envs.tasks.tiles import TileSet
+from cavin_pyro.envs.tasks.task import Marking, Step, Task, check_apart
+from cavin_pyro.envs.tasks.tiles import TileSet
 
 
 @dataclass(frozen=True, kw_only=True)

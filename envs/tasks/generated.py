@@ -14,11 +14,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from envs.workspace import REACH_HIGH, REACH_LOW, TILE_COUNT, Tile, tile_center
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TILE_COUNT, Tile, tile_center
 
 ROOM = 0.05  # metres that the tool's reach extends beyond the centre of a tile that layouts use
 # Metres beyond the centre of a tile on which the target starts, so that the tool gets behind it on every side: it may
-# lie 0.05 off the centre (`envs.pushing.TARGET_JITTER`) and extend 0.05 from there, and the tool needs 0.02 more.
+# lie 0.05 off the centre (`TARGET_JITTER`) and extend 0.05 from there, and the tool needs 0.02 more.
 ROOM_AT_START = 0.12
 SHAPES = ("straight", "l", "u", "s", "winding", "block")
 ANY_SHAPE = "any"

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.tasks.generated import ANY_SHAPE, GeneratedLayouts, neighbours, reachable_tiles, starting_tiles
-from envs.tasks.task import GOAL_MARKING, Marking, Step, Task, check_apart
-from envs.tasks.tiles import TileSet
-from envs.workspace import TILE_COUNT, Tile
+from cavin_pyro.envs.tasks.generated import ANY_SHAPE, GeneratedLayouts, neighbours, reachable_tiles, starting_tiles
+from cavin_pyro.envs.tasks.task import GOAL_MARKING, Marking, Step, Task, check_apart
+from cavin_pyro.envs.tasks.tiles import TileSet
+from cavin_pyro.envs.workspace import TILE_COUNT, Tile
 
 _ROWS, _COLUMNS = TILE_COUNT  # along x, away from the robot; along y
 

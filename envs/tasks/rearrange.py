@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.goals import Goal, assign, read_goal, sample_places
-from envs.markings import Place, TileGroup
-from envs.observation import Observation
-from envs.tasks.task import Marking, Step, Task
-from envs.tasks.tiles import TileSet
-from envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.goals import Goal, assign, read_goal, sample_places
+from cavin_pyro.envs.markings import Place, TileGroup
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.tasks.task import Marking, Step, Task
+from cavin_pyro.envs.tasks.tiles import TileSet
+from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW
 
 TOLERANCE = 0.03  # metres between an object's centre and its place, on the table, at most
 LEAST_TOLERANCE = 0.01  # metres; a planner's margin leaves at least this
@@ -29,7 +29,7 @@ class Rearrange(Task):
 
     Places are for centres as observed: the mean of an object's visible points. Orientations do not count. Places in a
     file are assigned once, when the episode starts, to the objects of the most similar shape, and among objects of
-    equal shape to the nearest ones (`envs.goals.assign`). A new assignment after every push would let two objects of
+    equal shape to the nearest ones (`assign`). A new assignment after every push would let two objects of
     equal shape trade places, but noise in the outlines could then also swap objects that differ. A random goal samples
     a place for each object.
 
@@ -37,7 +37,7 @@ class Rearrange(Task):
 
     Attributes:
         region: the tiles on which random places lie.
-        goal: a file, see `envs.goals.read_goal`; None samples places in every episode, with the start's clearance.
+        goal: a file, see `read_goal`; None samples places in every episode, with the start's clearance.
         clearance: metres between random places, at least.
         places: (x, y) metres of each object, in order, instead of `goal`. Episodes have it.
     """

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.tasks.task import Step, Task
-from envs.tasks.tiles import DistanceField, grid, table_distance
-from envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.tasks.task import Step, Task
+from cavin_pyro.envs.tasks.tiles import DistanceField, grid, table_distance
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
 REWARD_NAMES = ("dense", "sparse")
 CRITERIA = ("strict", "published")

@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.markings import Place, TileGroup
-from envs.observation import Observation
-from envs.tasks.generated import GeneratedLayouts
-from envs.tasks.tiles import TileSet, box_distance, parse_tiles
-from envs.workspace import REACH_HIGH, REACH_LOW, Tile
+from cavin_pyro.envs.markings import Place, TileGroup
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.tasks.generated import GeneratedLayouts
+from cavin_pyro.envs.tasks.tiles import TileSet, box_distance, parse_tiles
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, Tile
 
 STILL = 0.005  # metres; what moves by less is taken to stay where it is
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_COUNT, TILE_SIDE, Tile, tile_center
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW, TILE_COUNT, TILE_SIDE, Tile, tile_center
 
 
 class TileSet:

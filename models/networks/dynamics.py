@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.networks.geometry import Geometry
-from models.networks.layers import ObjectPool, fully_connected, unit
-from models.state import State
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.networks.layers import ObjectPool, fully_connected, unit
+from cavin_pyro.models.state import State
 
 PUSH_RANGE = 0.15  # metres, maximum displacement by one push along an axis
 SUBGOAL_RANGE = 0.5  # metres, maximum displacement by a segment along an axis

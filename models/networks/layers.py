@@ -16,7 +16,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.state import State
+from cavin_pyro.models.state import State
 
 TABLE_CENTER = (0.6, 0.0, 0.0)  # metres, in the robot's base frame
 POSITION_UNIT = 0.1  # metres; about the length of a push, so that inputs of networks are of order one

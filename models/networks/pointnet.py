@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from models.networks.geometry import Geometry
-from models.networks.layers import fully_connected, unit
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.networks.layers import fully_connected, unit
 
 CLOUD_UNIT = 0.1  # metres; about the size of an object
 DECODED_POINTS = 64

@@ -7,9 +7,9 @@ from typing import Any
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from models.networks.layers import GaussianCode
-from models.priors.prior import LearnedPrior
-from models.state import State
+from cavin_pyro.models.networks.layers import GaussianCode
+from cavin_pyro.models.priors.prior import LearnedPrior
+from cavin_pyro.models.state import State
 
 
 class ConditionalPrior(LearnedPrior):

@@ -8,9 +8,9 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from models.networks.flows import CodeFlow
-from models.priors.prior import LearnedPrior
-from models.state import State
+from cavin_pyro.models.networks.flows import CodeFlow
+from cavin_pyro.models.priors.prior import LearnedPrior
+from cavin_pyro.models.state import State
 
 
 class FlowPrior(LearnedPrior):

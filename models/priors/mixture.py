@@ -11,9 +11,9 @@ from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.networks.layers import SCALE_FLOOR
-from models.priors.prior import LearnedPrior
-from models.state import State
+from cavin_pyro.models.networks.layers import SCALE_FLOOR
+from cavin_pyro.models.priors.prior import LearnedPrior
+from cavin_pyro.models.state import State
 
 SYMMETRY_BREAKING = 1e-3  # standard deviation of the head's first weights: equal components would stay equal
 LEAST_QUANTILE = 1e-6  # of a component's noise, so that it stays finite

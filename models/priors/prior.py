@@ -8,8 +8,8 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from models.networks.layers import fully_connected, relative_positions
-from models.state import State
+from cavin_pyro.models.networks.layers import fully_connected, relative_positions
+from cavin_pyro.models.state import State
 
 
 class Prior(Protocol):

@@ -7,7 +7,7 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from models.state import State
+from cavin_pyro.models.state import State
 
 
 class StandardPrior(nn.Module):

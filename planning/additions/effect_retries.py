@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import records
-from planning.protocol import Plan
-from planning.returns import best_of
-from planning.rollout import Candidates
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import records
+from cavin_pyro.planning.protocol import Plan
+from cavin_pyro.planning.returns import best_of
+from cavin_pyro.planning.rollout import Candidates
 
 STILL = 0.01  # metres; what moves no object by as much does nothing
 EFFECT = 0.02  # metres; an effect that moves an object farther needs a motion that moves something

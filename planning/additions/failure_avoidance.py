@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import returns
-from planning.protocol import Objective, RewardFunction, SegmentRollout
-from planning.returns import Progress, prefer
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import returns
+from cavin_pyro.planning.protocol import Objective, RewardFunction, SegmentRollout
+from cavin_pyro.planning.returns import Progress, prefer
 
 FAILURE = 1e3  # square metres, the cost of a predicted failure: more than any distance on the table
 
@@ -18,7 +18,7 @@ FAILURE = 1e3  # square metres, the cost of a predicted failure: more than any d
 class FailureState(NamedTuple):
     """The tracking cost of motion candidates, and their predicted failures; fields `[B, n]`."""
 
-    tracking: Any  # `planning.cavin.TrackingState`
+    tracking: Any  # `cavin_pyro.planning.cavin.TrackingState`
     progress: Progress
     failed_in_executed: Tensor  # bool: in the first segment, which is executed
 
@@ -41,7 +41,7 @@ class FailureState(NamedTuple):
 class AvoidFailures(NamedTuple):
     """An objective that also checks f's predictions for failures, step by step."""
 
-    objective: Objective  # `planning.cavin.TrackingCost`
+    objective: Objective  # `cavin_pyro.planning.cavin.TrackingCost`
     segments: Tensor  # [B] int64: segments until the effect plan ends; later failures do not count
     reward: RewardFunction
 

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning.protocol import DistanceToGoal, GuidingReward, Objective, RewardFunction, SegmentRollout
-from planning.returns import CumulativeReward, Progress
-from planning.rollout import select_segment
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.protocol import DistanceToGoal, GuidingReward, Objective, RewardFunction, SegmentRollout
+from cavin_pyro.planning.returns import CumulativeReward, Progress
+from cavin_pyro.planning.rollout import select_segment
 
 GUIDANCE = ("none", "layout")
 CONTINUES = 0.9  # after each segment; 1 values the last state alone
@@ -112,7 +112,7 @@ class GuidedTracking(NamedTuple):
     plans that miss the goal are guided; the motions of a plan that reaches it are ranked as without guidance.
     """
 
-    objective: Any  # `planning.cavin.TrackingCost`
+    objective: Any  # `cavin_pyro.planning.cavin.TrackingCost`
     distance_to_goal: DistanceToGoal
     guided: Tensor  # [B] bool: the chosen effect plan misses the goal
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning.protocol import RewardFunction, goal_objects
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.protocol import RewardFunction, goal_objects
 
 
 class NearestObjects(NamedTuple):

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import records, returns
-from planning.backends import Backend, eager
-from planning.checks import check_positive, check_weight
-from planning.protocol import DynamicsModel, RewardFunction
-from planning.returns import SubgoalDistance
-from planning.rollout import Candidates, actions_of, predict_states
-from planning.sampling import noise_each
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import records, returns
+from cavin_pyro.planning.backends import Backend, eager
+from cavin_pyro.planning.checks import check_positive, check_weight
+from cavin_pyro.planning.protocol import DynamicsModel, RewardFunction
+from cavin_pyro.planning.returns import SubgoalDistance
+from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states
+from cavin_pyro.planning.sampling import noise_each
 
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
 # metres, is then worth 200: a failure earns -100 instead of the +100 at the goal.
@@ -30,7 +30,7 @@ class PerturbedRollouts:
     The best of a thousand motions often exploits an error of f: a push just meets the object according to f, and just
     misses it on the table. A perturbed start reveals such pushes.
 
-    The defaults are those of the baselines; `planning.cavin.FEW_CANDIDATES` are those of `planner=cavin`.
+    The defaults are those of the baselines; `cavin_pyro.planning.cavin.FEW_CANDIDATES` are those of `planner=cavin`.
 
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best
     candidates, one in `reduction_factor`, continue with `reduction_factor` times as many rollouts each.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from planning.returns import prefer
+from cavin_pyro.planning.returns import prefer
 
 TOUCHDOWN_DISTANCE = 0.015  # metres between a push's start and a point on which it would touch down
 

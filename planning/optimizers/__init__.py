@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import inspect
 
-from planning.checks import OptimizerError
-from planning.optimizers.base import Optimizer, samples_of_iteration, search
-from planning.optimizers.cross_entropy import CrossEntropy, ImprovedCrossEntropy
-from planning.optimizers.evolution import Evolution
-from planning.optimizers.path_integral import PathIntegral
-from planning.optimizers.sequential_monte_carlo import SequentialMonteCarlo
-from planning.optimizers.shooting import Shooting
+from cavin_pyro.planning.checks import OptimizerError
+from cavin_pyro.planning.optimizers.base import Optimizer, samples_of_iteration, search
+from cavin_pyro.planning.optimizers.cross_entropy import CrossEntropy, ImprovedCrossEntropy
+from cavin_pyro.planning.optimizers.evolution import Evolution
+from cavin_pyro.planning.optimizers.path_integral import PathIntegral
+from cavin_pyro.planning.optimizers.sequential_monte_carlo import SequentialMonteCarlo
+from cavin_pyro.planning.optimizers.shooting import Shooting
 
 __all__ = [
     "OPTIMIZERS",

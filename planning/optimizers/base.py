@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from planning import records
-from planning.checks import OptimizerError
-from planning.rollout import Candidates, SearchProblem
+from cavin_pyro.planning import records
+from cavin_pyro.planning.checks import OptimizerError
+from cavin_pyro.planning.rollout import Candidates, SearchProblem
 
 
 @runtime_checkable

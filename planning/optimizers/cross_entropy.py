@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning import records
-from planning.checks import check_fraction, check_positive, check_weight
-from planning.optimizers.base import Population, best, samples_of_iteration
-from planning.rollout import SearchProblem
+from cavin_pyro.planning import records
+from cavin_pyro.planning.checks import check_fraction, check_positive, check_weight
+from cavin_pyro.planning.optimizers.base import Population, best, samples_of_iteration
+from cavin_pyro.planning.rollout import SearchProblem
 
 MINIMUM_SCALE = 1e-3  # so that a search never collapses onto a point
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning import records
-from planning.checks import check_fraction, check_positive, check_weight
-from planning.optimizers.base import Population, best, samples_of_iteration
-from planning.rollout import SearchProblem
-from planning.sampling import noise_each, uniform_each
+from cavin_pyro.planning import records
+from cavin_pyro.planning.checks import check_fraction, check_positive, check_weight
+from cavin_pyro.planning.optimizers.base import Population, best, samples_of_iteration
+from cavin_pyro.planning.rollout import SearchProblem
+from cavin_pyro.planning.sampling import noise_each, uniform_each
 
 
 @dataclass(frozen=True)

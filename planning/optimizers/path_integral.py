@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
-from planning.checks import check_fraction, check_positive
-from planning.optimizers.base import samples_of_iteration
-from planning.optimizers.weights import adapt_temperature
-from planning.rollout import SearchProblem
+from cavin_pyro.planning.checks import check_fraction, check_positive
+from cavin_pyro.planning.optimizers.base import samples_of_iteration
+from cavin_pyro.planning.optimizers.weights import adapt_temperature
+from cavin_pyro.planning.rollout import SearchProblem
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning.checks import check_fraction, check_positive
-from planning.optimizers.weights import adapt_temperature, effective_sample_size, log_mean
-from planning.protocol import Evidence
-from planning.rollout import Candidates, SearchProblem, join
-from planning.sampling import noise_each, uniform_each
+from cavin_pyro.planning.checks import check_fraction, check_positive
+from cavin_pyro.planning.optimizers.weights import adapt_temperature, effective_sample_size, log_mean
+from cavin_pyro.planning.protocol import Evidence
+from cavin_pyro.planning.rollout import Candidates, SearchProblem, join
+from cavin_pyro.planning.sampling import noise_each, uniform_each
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from planning.rollout import SearchProblem
+from cavin_pyro.planning.rollout import SearchProblem
 
 
 @dataclass(frozen=True)

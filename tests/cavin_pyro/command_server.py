@@ -51,9 +51,9 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.visualization.data_summary",
     "cavin_pyro.visualization.rendering",
     "cavin_pyro.visualization.training",
-    "guides.cascaded",
+    "cavin_pyro.guides.cascaded",
     "imageio.plugins.ffmpeg",
-    "models.cascaded",
+    "cavin_pyro.models.cascaded",
     "pandas",  # by pyarrow, which writes tables
     "torch._dynamo",  # by torch's optimizers
 )

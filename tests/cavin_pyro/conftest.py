@@ -23,10 +23,10 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.data.collection import CollectionConfig, collect
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.storage.checkpoint import save_checkpoint
-from guides.cascaded import CascadedGuide
-from models.cascaded import CascadedModel
-from models.networks.pointnet import PointNet
 from tests.cavin_pyro.shell import ENVIRONMENT, ROOT, Answer, complaints
 
 SMALL_CHECK = [  # options that make a check of all sections a matter of seconds
@@ -139,20 +139,23 @@ def small_config() -> dict[str, Any]:
     """How to build `small_parts` again."""
     sizes = {"effect_dimension": 4, "motion_dimension": 4, "feature_dimension": 64, "width": 8, "maximum_objects": 5}
     return {
-        "model": {"_target_": "models.cascaded.CascadedModel", "segment_length": 3, **sizes},
-        "guide": {"_target_": "guides.cascaded.CascadedGuide", "width": 8},
-        "prior": {"_target_": "models.priors.standard.StandardPrior"},
-        "scales": {"_target_": "models.likelihoods.LikelihoodScales"},
+        "model": {"_target_": "cavin_pyro.models.cascaded.CascadedModel", "segment_length": 3, **sizes},
+        "guide": {"_target_": "cavin_pyro.guides.cascaded.CascadedGuide", "width": 8},
+        "prior": {"_target_": "cavin_pyro.models.priors.standard.StandardPrior"},
+        "scales": {"_target_": "cavin_pyro.models.likelihoods.LikelihoodScales"},
     }
 
 
 BASELINES = {  # model= and the class of its guide, with what its section of the configuration has
-    "flat": ("guides.flat.FlatGuide", {"_target_": "models.flat.FlatModel", "motion_dimension": 4}),
-    "single_latent": (
-        "guides.single_latent.SingleLatentGuide",
-        {"_target_": "models.single_latent.SingleLatentModel", "effect_dimension": 4},
+    "flat": (
+        "cavin_pyro.guides.flat.FlatGuide",
+        {"_target_": "cavin_pyro.models.flat.FlatModel", "motion_dimension": 4},
     ),
-    "dynamics": ("guides.none.NoGuide", {"_target_": "models.dynamics_only.DynamicsModel"}),
+    "single_latent": (
+        "cavin_pyro.guides.single_latent.SingleLatentGuide",
+        {"_target_": "cavin_pyro.models.single_latent.SingleLatentModel", "effect_dimension": 4},
+    ),
+    "dynamics": ("cavin_pyro.guides.none.NoGuide", {"_target_": "cavin_pyro.models.dynamics_only.DynamicsModel"}),
 }
 
 

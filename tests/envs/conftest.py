@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from envs.objects.sampling import ObjectParameters
-from envs.objects.shapes import builtin_shape
-from envs.scene import Scene
-from envs.workspace import normalised_push
+from cavin_pyro.envs.objects.sampling import ObjectParameters
+from cavin_pyro.envs.objects.shapes import builtin_shape
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.workspace import normalised_push
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 

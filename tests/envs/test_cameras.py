@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.scene import Scene
-from envs.sensors import CAMERAS, IdealSensor, Kinect2, sensor_of
-from envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
-from envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.sensors import CAMERAS, IdealSensor, Kinect2, sensor_of
+from cavin_pyro.envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
+from cavin_pyro.envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation
 
 
 def test_the_images_up_is_x_and_its_left_is_y() -> None:

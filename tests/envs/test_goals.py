@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from PIL import Image
 from safetensors.numpy import save
 
-from envs.goals import LARGEST, SHAPE_WEIGHT, Goal, assign, read_goal, sample_places, save_goal
-from envs.layouts import parse_task
-from envs.observation import Observation
-from envs.pushing import PushingEnv
-from envs.scene import Scene
-from envs.tasks import Outcome, TaskReward
-from envs.tasks.rearrange import LEAST_TOLERANCE, TOLERANCE, Rearrange
-from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
+from cavin_pyro.envs.goals import LARGEST, SHAPE_WEIGHT, Goal, assign, read_goal, sample_places, save_goal
+from cavin_pyro.envs.layouts import parse_task
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.tasks import Outcome, TaskReward
+from cavin_pyro.envs.tasks.rearrange import LEAST_TOLERANCE, TOLERANCE, Rearrange
+from cavin_pyro.envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
 
 # Half length, half width and height in metres of a book, a can and a cube.
 BOOK, CAN, CUBE = (0.09, 0.06, 0.03), (0.035, 0.035, 0.12), (0.03, 0.03, 0.06)

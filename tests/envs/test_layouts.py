@@ -19,13 +19,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from envs.layouts import generate_task, load_task, parse_task, possible_tasks
-from envs.pushing import PushingEnv
-from envs.tasks import TASKS, GeneratedLayouts, Step, Task, TaskReward, TileSet
-from envs.tasks.crossing import Crossing
-from envs.tasks.generated import FEWEST, MOST, neighbours, paths, reachable_tiles, starting_tiles
-from envs.tasks.insertion import Insertion
-from envs.workspace import REACH_HIGH, REACH_LOW, Tile, tile_center
+from cavin_pyro.envs.layouts import generate_task, load_task, parse_task, possible_tasks
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.tasks import TASKS, GeneratedLayouts, Step, Task, TaskReward, TileSet
+from cavin_pyro.envs.tasks.crossing import Crossing
+from cavin_pyro.envs.tasks.generated import FEWEST, MOST, neighbours, paths, reachable_tiles, starting_tiles
+from cavin_pyro.envs.tasks.insertion import Insertion
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, Tile, tile_center
 
 # SHA-256 of the nine layouts of the published implementation, as listed in the paper's appendix.
 PUBLISHED = "0c9a8b56df28751c"
@@ -287,7 +287,7 @@ def test_what_is_no_whole_task_is_refused() -> None:
 
     with pytest.raises(ValueError, match=r"^task Half lacks potential$"):
         load_task(Half)
-    with pytest.raises(ValueError, match=r"is no task: derive it from envs\.tasks\.Task$"):
+    with pytest.raises(ValueError, match=r"is no task: derive it from cavin_pyro\.envs\.tasks\.Task$"):
         load_task(int)  # type: ignore[arg-type]
 
 

@@ -14,18 +14,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.objects.object_sets import ObjectSet, chosen, load_object_set
-from envs.objects.sampling import WHOLE_TABLE, Area, ObjectParameters, ObjectRanges, arrange, sample_objects
-from envs.objects.shapes import (
+from cavin_pyro.envs.objects.object_sets import ObjectSet, chosen, load_object_set
+from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectParameters, ObjectRanges, arrange, sample_objects
+from cavin_pyro.envs.objects.shapes import (
     BUILTIN_NAMES,
     RANDOM_NAMES,
     Shape,
     builtin_shape,
     random_shape,
 )
-from envs.robots import SETTLED_SPEED
-from envs.scene import Scene
-from envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.robots import SETTLED_SPEED
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
 # Millimetres and grams as published with the YCB Object and Model Set (Calli et al. 2015): the sides of the
 # boxes, smallest first; diameter and height of what is round; thickness and length of the banana.

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.objects.sampling import Area, ObjectRanges
-from envs.observation import Observation
-from envs.policy import START_CLEARANCE, HeuristicPushingPolicy
-from envs.robots import STICK_RADIUS
-from envs.scene import Scene
-from envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
+from cavin_pyro.envs.objects.sampling import Area, ObjectRanges
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.policy import START_CLEARANCE, HeuristicPushingPolicy
+from cavin_pyro.envs.robots import STICK_RADIUS
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
 
 SEEDS = st.integers(0, 2**32 - 1)
 REACHABLE: Area = (((0.40, -0.40), (0.70, 0.40)),)

@@ -13,14 +13,14 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from envs.layouts import layout_numbers
-from envs.objects.sampling import ObjectParameters, ObjectRanges
-from envs.observation import Observation
-from envs.policy import HeuristicPushingPolicy
-from envs.pushing import PushingEnv
-from envs.tasks import TASKS, TaskReward
-from envs.tasks.crossing import Crossing
-from envs.workspace import TABLE_HIGH, TABLE_LOW, normalised_push, tile_center
+from cavin_pyro.envs.layouts import layout_numbers
+from cavin_pyro.envs.objects.sampling import ObjectParameters, ObjectRanges
+from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.policy import HeuristicPushingPolicy
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.tasks import TASKS, TaskReward
+from cavin_pyro.envs.tasks.crossing import Crossing
+from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW, normalised_push, tile_center
 
 NOTHING = np.array([-1.0, -1.0, 0.0, 0.0], dtype=np.float32)  # in a corner where no builtin task starts objects
 LYING_ALONG_Y = (-0.5, -0.5, -0.5, 0.5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numpy.random import Generator, SeedSequence, default_rng
 
-from envs.randomness import GOAL, LAYOUT, SENSOR, collection_streams, named_stream, planner_seed
+from cavin_pyro.envs.randomness import GOAL, LAYOUT, SENSOR, collection_streams, named_stream, planner_seed
 
 
 def first(generator: Generator) -> int:

@@ -10,14 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from envs.layouts import load_task, parse_task
-from envs.tasks import Outcome, Task, TaskReward
-from envs.tasks.clearing import Clearing
-from envs.tasks.crossing import Crossing
-from envs.tasks.gathering import Gathering
-from envs.tasks.insertion import Insertion
-from envs.tasks.tiles import SPACING
-from envs.workspace import TILE_SIDE, Tile, tile_center
+from cavin_pyro.envs.layouts import load_task, parse_task
+from cavin_pyro.envs.tasks import Outcome, Task, TaskReward
+from cavin_pyro.envs.tasks.clearing import Clearing
+from cavin_pyro.envs.tasks.crossing import Crossing
+from cavin_pyro.envs.tasks.gathering import Gathering
+from cavin_pyro.envs.tasks.insertion import Insertion
+from cavin_pyro.envs.tasks.tiles import SPACING
+from cavin_pyro.envs.workspace import TILE_SIDE, Tile, tile_center
 
 # A square of four tiles in the table's middle, x 0.37 to 0.67 and y -0.11 to 0.19.
 SQUARE = ((1, 3), (1, 4), (2, 3), (2, 4))

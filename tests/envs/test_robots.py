@@ -13,12 +13,12 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.robots import TIP_HEIGHT, push
-from envs.robots.arm import inverse_kinematics
-from envs.robots.robot import ABOVE_HEIGHT
-from envs.robots.sawyer import sawyer
-from envs.scene import Scene
-from envs.workspace import REACH_HIGH, REACH_LOW
+from cavin_pyro.envs.robots import TIP_HEIGHT, push
+from cavin_pyro.envs.robots.arm import inverse_kinematics
+from cavin_pyro.envs.robots.robot import ABOVE_HEIGHT
+from cavin_pyro.envs.robots.sawyer import sawyer
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW
 from tests.real_assets import REAL_ASSETS
 
 NO_SAWYER = "the Sawyer's URDF lies neither in ../shared/assets nor where CAVIN_ASSETS says"

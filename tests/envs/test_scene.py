@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from envs.layouts import load_task
-from envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
-from envs.objects.shapes import BUILTIN_NAMES
-from envs.physics import PhysicsWorld
-from envs.physics.visuals import Part
-from envs.pushing import VIDEO_SIZE, PushingEnv
-from envs.robots import SETTLED_SPEED, STICK_RADIUS
-from envs.scene import Scene
-from envs.sensors.camera import Camera
-from envs.tasks import GOAL_MARKING, TileSet
-from envs.workspace import (
+from cavin_pyro.envs.layouts import load_task
+from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
+from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.physics import PhysicsWorld
+from cavin_pyro.envs.physics.visuals import Part
+from cavin_pyro.envs.pushing import VIDEO_SIZE, PushingEnv
+from cavin_pyro.envs.robots import SETTLED_SPEED, STICK_RADIUS
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.tasks import GOAL_MARKING, TileSet
+from cavin_pyro.envs.workspace import (
     OBJECT_SLOTS,
     POINTS_PER_OBJECT,
     TILE_COUNT,

@@ -11,14 +11,14 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.objects.sampling import ObjectParameters
-from envs.pushing import PushingEnv
-from envs.scene import Scene
-from envs.segmentation import ClusterSegmenter, MaskSegmenter
-from envs.segmentation.height_map import fit_table, split_at_necks
-from envs.segmentation.registration import explain, shape_of
-from envs.sensors import DepthImage
-from envs.sensors.camera import Camera
+from cavin_pyro.envs.objects.sampling import ObjectParameters
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.segmentation import ClusterSegmenter, MaskSegmenter
+from cavin_pyro.envs.segmentation.height_map import fit_table, split_at_necks
+from cavin_pyro.envs.segmentation.registration import explain, shape_of
+from cavin_pyro.envs.sensors import DepthImage
+from cavin_pyro.envs.sensors.camera import Camera
 
 CAMERA = Camera(256, 212, rotation=(0.02, -0.02, 0.01))
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from envs.tasks.tiles import TileSet, table_distance
-from envs.workspace import (
+from cavin_pyro.envs.tasks.tiles import TileSet, table_distance
+from cavin_pyro.envs.workspace import (
     MAXIMUM_MOTION,
     REACH_HIGH,
     REACH_LOW,

@@ -13,7 +13,7 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
-from models.state import State, Window
+from cavin_pyro.models.state import State, Window
 
 TABLE = torch.tensor([0.6, 0.0, 0.0], dtype=torch.float64)
 Scene = tuple[list[Tensor], list[Tensor]]  # centers and features of the real objects

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from models.state import State, Window
+from cavin_pyro.models.state import State, Window
 
 
 @pytest.fixture(autouse=True)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from guides.cascaded import CascadedGuide
-from guides.flat import FlatGuide
-from guides.flow import FlowGuide
-from guides.guide import Guide
-from guides.none import NoGuide
-from guides.single_latent import SingleLatentGuide
-from models.cascaded import CascadedModel
-from models.dynamics_only import DynamicsModel
-from models.flat import FlatModel
-from models.model import Model
-from models.single_latent import SingleLatentModel
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.guides.flat import FlatGuide
+from cavin_pyro.guides.flow import FlowGuide
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.guides.none import NoGuide
+from cavin_pyro.guides.single_latent import SingleLatentGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.dynamics_only import DynamicsModel
+from cavin_pyro.models.flat import FlatModel
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.single_latent import SingleLatentModel
 
 DIMENSION = {"effect_code": 5, "motion_code": 4}
 EFFECT, MOTION = {"effect_dimension": 5}, {"motion_dimension": 4}

@@ -10,9 +10,9 @@ import torch
 from pyro.infer import Trace_ELBO
 from pyro.infer.autoguide import AutoIAFNormal, AutoLowRankMultivariateNormal, AutoNormal, AutoStructured
 
+from cavin_pyro.guides.automatic import AutomaticGuide
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import elbo_terms
-from guides.automatic import AutomaticGuide
-from models.state import Window
 from tests.guides.programs import make_model
 
 

@@ -12,14 +12,14 @@ from pyro.distributions import Normal
 from pyro.infer import RenyiELBO, Trace_ELBO, TraceMeanField_ELBO
 from torch import Tensor, nn
 
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.priors.conditional import ConditionalPrior
+from cavin_pyro.models.priors.flow import FlowPrior
+from cavin_pyro.models.priors.mixture import ObjectMixturePrior
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.bounds import DifferentiableRenyiELBO
-from guides.cascaded import CascadedGuide
-from guides.guide import Guide
-from models.model import Model
-from models.priors.conditional import ConditionalPrior
-from models.priors.flow import FlowPrior
-from models.priors.mixture import ObjectMixturePrior
-from models.state import Window
 from tests.guides import by_hand
 from tests.guides.by_hand import Example, Weights, effects, encode, log_pushes, pushes, q_g, q_h
 from tests.guides.programs import make, make_model

@@ -13,11 +13,11 @@ from pyro import poutine
 from pyro.infer import SVI, Trace_ELBO, TraceMeanField_ELBO
 from torch import Tensor, nn
 
-from guides.cascaded import CascadedGuide
-from guides.flow import FlowGuide
-from guides.guide import Guide, MotionInference
-from models.model import Model
-from models.state import State, Window
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.guides.flow import FlowGuide
+from cavin_pyro.guides.guide import Guide, MotionInference
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.state import State, Window
 from tests.guides.programs import DIMENSION, GUIDES, MISFITS, MODELS, PAIRS, make, make_model
 
 Pair = tuple[str, str]

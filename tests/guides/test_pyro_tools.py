@@ -12,9 +12,9 @@ from pyro import infer, poutine
 from pyro.infer import MCMC, NUTS, Importance, Predictive
 from pyro.infer.reparam import LocScaleReparam
 
-from guides.cascaded import CascadedGuide
-from models.likelihoods import LikelihoodScales
-from models.state import Window
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.likelihoods import LikelihoodScales
+from cavin_pyro.models.state import Window
 from tests.guides.programs import make, make_model
 
 PROGRAMS = [("cascaded", "cascaded"), ("single_latent", "single_latent"), ("flat", "flat"), ("dynamics", "none")]

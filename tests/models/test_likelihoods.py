@@ -8,8 +8,8 @@ import torch
 from pyro import distributions
 from torch import Tensor
 
-from models.likelihoods import IsotropicNormal, IsotropicStudentT, LikelihoodScales
-from models.state import State
+from cavin_pyro.models.likelihoods import IsotropicNormal, IsotropicStudentT, LikelihoodScales
+from cavin_pyro.models.state import State
 
 
 def numbers(*shape: int) -> Tensor:

@@ -10,11 +10,11 @@ from pyro.distributions import Normal
 from torch import Tensor, nn
 from torch.distributions import Categorical, Independent, MixtureSameFamily
 
-from models.priors.conditional import ConditionalPrior
-from models.priors.flow import FlowPrior
-from models.priors.mixture import GaussianMixture, ObjectMixturePrior
-from models.priors.standard import StandardPrior
-from models.state import State
+from cavin_pyro.models.priors.conditional import ConditionalPrior
+from cavin_pyro.models.priors.flow import FlowPrior
+from cavin_pyro.models.priors.mixture import GaussianMixture, ObjectMixturePrior
+from cavin_pyro.models.priors.standard import StandardPrior
+from cavin_pyro.models.state import State
 
 SIZES = {"dimension": 4, "feature_dimension": 6, "width": 8}
 PRIORS = (ConditionalPrior, FlowPrior, ObjectMixturePrior)

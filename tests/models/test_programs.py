@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from pyro import distributions, poutine
 from torch import Tensor, nn
 
-from models.cascaded import CascadedModel
-from models.dynamics_only import DynamicsModel
-from models.flat import FlatModel
-from models.likelihoods import LearnedScales, LikelihoodScales, PredictedScales
-from models.model import Model
-from models.networks.contact.dynamics import ContactDynamics
-from models.networks.outline import Outline
-from models.priors.standard import StandardPrior
-from models.single_latent import SingleLatentModel
-from models.state import State, Window
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.dynamics_only import DynamicsModel
+from cavin_pyro.models.flat import FlatModel
+from cavin_pyro.models.likelihoods import LearnedScales, LikelihoodScales, PredictedScales
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
+from cavin_pyro.models.networks.outline import Outline
+from cavin_pyro.models.priors.standard import StandardPrior
+from cavin_pyro.models.single_latent import SingleLatentModel
+from cavin_pyro.models.state import State, Window
 
 SIZES = {"feature_dimension": 6, "width": 8}
 TRANSITIONS = {"next_centers": (4, 3, 4, 3), "next_features": (4, 3, 4, 6)}

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
-from models.state import State
-from planning import CavinPlanner, searching
-from planning.protocol import PlanningModel, RewardFunction, SegmentRollout
-from planning.sampling import noise_each
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner, searching
+from cavin_pyro.planning.protocol import PlanningModel, RewardFunction, SegmentRollout
+from cavin_pyro.planning.sampling import noise_each
 
 REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1
 

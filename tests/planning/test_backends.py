@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from models.state import State
-from planning.backends import Compiled, make_backend
-from planning.rollout import extend_segment
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.backends import Compiled, make_backend
+from cavin_pyro.planning.rollout import extend_segment
 
 
 def test_a_whole_number_becomes_a_tensor_so_that_one_version_serves_every_segment() -> None:
@@ -46,8 +46,8 @@ def test_compiled_plans_agree_with_eager_plans(toy: SimpleNamespace) -> None:
 
 def test_one_segment_is_traced_as_a_whole(toy: SimpleNamespace) -> None:
     """Without the generation of code, which takes long: torch reads the functions of a plan without a break."""
-    from planning.cavin import EffectSpace
-    from planning.returns import CumulativeReward
+    from cavin_pyro.planning.cavin import EffectSpace
+    from cavin_pyro.planning.returns import CumulativeReward
 
     state: State = toy.scenes([[(0.0, 0.02)]]).expand_plans(8)
     space, objective = EffectSpace(toy.PointMass()), CumulativeReward(toy.GoalDisc(goal=(0.25, 0.05)))

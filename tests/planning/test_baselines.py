@@ -13,8 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import (
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import (
     CavinWithoutEffectsPlanner,
     CvaeMpcPlanner,
     MpcPlanner,
@@ -23,8 +23,8 @@ from planning import (
     RandomPlanner,
     SectarPlanner,
 )
-from planning.optimizers import Shooting
-from planning.searching import SearchingPlanner
+from cavin_pyro.planning.optimizers import Shooting
+from cavin_pyro.planning.searching import SearchingPlanner
 
 EFFECTS = [[-0.75, 0.5, -2.0], [0.5, 0.25, 1.0]]
 RETURNS = [-2.0 - 1.0 + 99.0, -4.0, -2.0 + 99.0]

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import Plan, RewardFunction
-from planning.checks import NoFiniteCandidateError, check_scenes
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import Plan, RewardFunction
+from cavin_pyro.planning.checks import NoFiniteCandidateError, check_scenes
 from tests.planning.conftest import same, tensors
 
 START = (0.0, 0.02)  # metres; close above the forbidden half-plane y < 0 of `near_the_edge`

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from torch import Tensor
 
-from planning import Plan
-from planning.optimizers import Shooting
+from cavin_pyro.planning import Plan
+from cavin_pyro.planning.optimizers import Shooting
 
 # Segment 1, from x = 0: plan 0 dies at its second step (-0.75), plan 1 gets to 0.5, plan 2 dies at its first
 # step (-1.0). So plans 0 and 2 become copies of plan 1, and segment 2 starts at x = 0.5 for all: plan 0

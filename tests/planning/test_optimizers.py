@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from planning import MpcPlanner
-from planning.optimizers import OPTIMIZERS, make_optimizer, search
-from planning.optimizers.cross_entropy import coloured
-from planning.returns import CumulativeReward
-from planning.rollout import Candidates, SearchProblem
+from cavin_pyro.planning import MpcPlanner
+from cavin_pyro.planning.optimizers import OPTIMIZERS, make_optimizer, search
+from cavin_pyro.planning.optimizers.cross_entropy import coloured
+from cavin_pyro.planning.returns import CumulativeReward
+from cavin_pyro.planning.rollout import Candidates, SearchProblem
 
 TOP = (0.8, -0.6)
 SAMPLES = 512

@@ -9,14 +9,14 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, ExpTransform, Independent, Normal, TransformedDistribution, Uniform
 
-from models.cascaded import CascadedModel
-from models.priors.conditional import ConditionalPrior
-from models.priors.flow import FlowPrior
-from models.priors.mixture import ObjectMixturePrior
-from models.priors.standard import StandardPrior
-from models.state import State
-from planning import CavinPlanner
-from planning.sampling import noise_each, reparameterize, reparameterize_each, sample_each
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.priors.conditional import ConditionalPrior
+from cavin_pyro.models.priors.flow import FlowPrior
+from cavin_pyro.models.priors.mixture import ObjectMixturePrior
+from cavin_pyro.models.priors.standard import StandardPrior
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning.sampling import noise_each, reparameterize, reparameterize_each, sample_each
 
 each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior, ObjectMixturePrior])
 

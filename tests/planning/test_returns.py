@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from planning import returns
-from planning.protocol import Outcome
-from planning.returns import StrideLimits
+from cavin_pyro.planning import returns
+from cavin_pyro.planning.protocol import Outcome
+from cavin_pyro.planning.returns import StrideLimits
 
 POSITIONS = st.floats(-2.0, 2.0, width=32)
 

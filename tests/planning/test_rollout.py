@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from planning.returns import CumulativeReward
-from planning.rollout import Candidates, SearchProblem, choose_ancestors, join
+from cavin_pyro.planning.returns import CumulativeReward
+from cavin_pyro.planning.rollout import Candidates, SearchProblem, choose_ancestors, join
 
 
 def search(toy: SimpleNamespace, *, dense: bool = True, environments: slice = slice(0, 2)) -> SearchProblem:

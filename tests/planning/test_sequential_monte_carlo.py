@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning.optimizers import SequentialMonteCarlo, search
-from planning.optimizers.sequential_monte_carlo import active_returns
-from planning.protocol import Evidence, SegmentRollout
-from planning.returns import CumulativeReward
-from planning.rollout import Candidates, SearchProblem
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.optimizers import SequentialMonteCarlo, search
+from cavin_pyro.planning.optimizers.sequential_monte_carlo import active_returns
+from cavin_pyro.planning.protocol import Evidence, SegmentRollout
+from cavin_pyro.planning.returns import CumulativeReward
+from cavin_pyro.planning.rollout import Candidates, SearchProblem
 
 TOP = (0.8, -0.6)
 SEGMENTS = 3

@@ -7,8 +7,8 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from planning.optimizers.base import samples_of_iteration
-from planning.optimizers.weights import (
+from cavin_pyro.planning.optimizers.base import samples_of_iteration
+from cavin_pyro.planning.optimizers.weights import (
     RANGE,
     SAME,
     TEMPERATURES,

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from models.networks.contact.geometry import (
+from cavin_pyro.models.networks.contact.geometry import (
     DISPLACEMENT_UNIT,
     MEASURES,
     PAIR_MEASURES,
@@ -18,10 +18,10 @@ from models.networks.contact.geometry import (
     in_reach,
     pair_contact,
 )
-from models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
-from models.networks.dynamics import PushOutcome
-from models.networks.layers import fully_connected, relative_positions, shapes_are_fixed
-from models.networks.outline import (
+from cavin_pyro.models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
+from cavin_pyro.models.networks.dynamics import PushOutcome
+from cavin_pyro.models.networks.layers import fully_connected, relative_positions, shapes_are_fixed
+from cavin_pyro.models.networks.outline import (
     FEATURES,
     HEIGHTS,
     OUTLINES,
@@ -36,7 +36,7 @@ from models.networks.outline import (
     turned,
     turned_moments,
 )
-from models.state import State
+from cavin_pyro.models.state import State
 
 MAXIMUM_DISPLACEMENT = 0.2  # metres, by one push, along each axis
 PLACE = 4  # numbers that say where on the table an object lies, and where a push points to
@@ -44,7 +44,7 @@ INPUTS = 5 + (OUTLINES * PER_OUTLINE + HEIGHTS) + MEASURES + PLACE
 
 
 class ContactDynamics(PushOutcome):
-    """f: mean and scale of the state after one push, from outlines of objects (`models.networks.outline.Outline`).
+    """f: mean and scale of the state after one push, from outlines of objects (`Outline`).
 
     In the frame of the push, whose origin is its start and whose x axis is its direction:
     contact_i  = where the tool would meet outline i, and how (`contact.geometry.ToolContact`)

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from models.networks.contact.rows import Pairs, Rows
-from models.networks.outline import (
+from cavin_pyro.models.networks.contact.rows import Pairs, Rows
+from cavin_pyro.models.networks.outline import (
     DIRECTIONS,
     HARMONICS,
     OUTLINE_UNIT,

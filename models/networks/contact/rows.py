@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.networks.layers import nearest_pairs
+from cavin_pyro.models.networks.layers import nearest_pairs
 
 
 class Pairs(NamedTuple):

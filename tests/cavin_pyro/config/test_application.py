@@ -18,7 +18,7 @@ import torch
 
 from cavin_pyro import __main__ as listing
 from cavin_pyro import __version__
-from cavin_pyro.config.application import PACKAGES, Interruption, check_packages, guarded, read_command_line
+from cavin_pyro.config.application import Interruption, guarded, read_command_line
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.storage.files import atomic_write
@@ -130,18 +130,18 @@ def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None
         raise KeyError("a bug")
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_a_foreign_package_of_the_same_name_is_refused(
-    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    check_packages()
-    (tmp_path / package).mkdir()
-    (tmp_path / package / "__init__.py").touch()
-    monkeypatch.syspath_prepend(tmp_path)
-    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
-        monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(UserError, match=f"^the package '{package}' of this program is hidden by {tmp_path / package}"):
-        check_packages()
+def test_packages_of_the_users_own_do_not_disturb_a_command(tmp_path: Path) -> None:
+    """Neither beside it nor anywhere on the path: `cavin_pyro` is the only name that the program takes."""
+    for name in ("models", "guides"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise AssertionError")
+    for name in ("planning", "envs"):
+        (tmp_path / f"{name}.py").write_text("raise AssertionError")
+    names = ["plan", "train", "planning.cavin", "planning.optimizers", "envs.tasks", "guides.cascaded", "models.flat"]
+    program = "\n".join(f"import cavin_pyro.{name}" for name in names)
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    command, environment = [sys.executable, "-c", program], {**os.environ, "PYTHONPATH": path}
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True)
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_a_class_of_the_users_takes_the_place_of_a_part() -> None:
 def test_presets_of_the_users_own_lie_in_a_folder(tmp_path: Path) -> None:
     folder = tmp_path / "bücher (1)" / "planner"
     folder.mkdir(parents=True)
-    (folder / "mine.yaml").write_text("_target_: planning.RandomPlanner\nmodel_free: true\n")
+    (folder / "mine.yaml").write_text("_target_: cavin_pyro.planning.RandomPlanner\nmodel_free: true\n")
     config, choices = composed("plan", ["planner=mine"], str(folder.parent))
     assert choices["planner"] == "mine" and config.checkpoint == "cavin"
     assert config.output == "runs/plan/crossing-sparse-3-mine-0"

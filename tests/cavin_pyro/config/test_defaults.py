@@ -18,8 +18,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured, constructor_options, options
 from cavin_pyro.config.parts import build_model, construct
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
-from envs.pushing import PushingEnv
-from planning import CavinPlanner
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.planning import CavinPlanner
 
 PAPER = {  # Algorithm 1 as it is printed
     "planner.motion_horizon": "full_horizon",
@@ -29,7 +29,7 @@ PAPER = {  # Algorithm 1 as it is printed
     "planner.touchdown_distance": 0.0,
     "planner.tracking_at": "end",
     "planner.nearest_objects": None,
-    "planner.optimizer._target_": "planning.optimizers.Shooting",
+    "planner.optimizer._target_": "cavin_pyro.planning.optimizers.Shooting",
     "pushes_per_plan": None,
     "push_decimals": None,
     "margin": 0.0,
@@ -73,7 +73,7 @@ def test_an_environment_without_options_is_that_of_the_command() -> None:
         assert config[name] == defaults[name].default
     for name in ("robot", "camera", "segmentation"):
         assert config.env[name] == defaults[name].default
-    assert config.task._target_ == "envs.tasks.crossing.Crossing"
+    assert config.task._target_ == "cavin_pyro.envs.tasks.crossing.Crossing"
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS.rglob("*.yaml")), ids=lambda path: str(path.relative_to(PRESETS)))

@@ -11,13 +11,13 @@ from pyro.infer import Trace_ELBO
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model, construct
+from cavin_pyro.models.likelihoods import PredictedScales
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.outline import Outline
+from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.storage.geometry import check_fit
 from cavin_pyro.training.run import build_objective
-from models.likelihoods import PredictedScales
-from models.model import Model
-from models.networks.outline import Outline
-from models.networks.pointnet import PointNet
 
 
 class AnotherModel(Model):
@@ -58,12 +58,12 @@ def test_presets_of_priors_and_guides_build_what_a_checkpoint_builds_again(
     [
         ({"width": 0}, "^prior.width must be at least 1, not 0$"),
         ({"transforms": -1}, "^prior.transforms must be at least 1, not -1$"),
-        ({"depth": 3}, "models.priors.flow.FlowPrior cannot be built: .*'depth'"),
+        ({"depth": 3}, "cavin_pyro.models.priors.flow.FlowPrior cannot be built: .*'depth'"),
     ],
 )
 def test_options_that_a_prior_does_not_take_are_named(option: dict, said: str, small: SimpleNamespace) -> None:
     config = small.config()
-    config["prior"] = {"_target_": "models.priors.flow.FlowPrior", **option}
+    config["prior"] = {"_target_": "cavin_pyro.models.priors.flow.FlowPrior", **option}
     with pytest.raises(UserError, match=said) as caught:
         build_model(config)
     assert "\n" not in str(caught.value)
@@ -73,7 +73,7 @@ def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNam
     with pytest.raises(UserError) as caught:
         build_guide(small.config(), AnotherModel())
     assert str(caught.value) == (
-        "guide guides.cascaded.CascadedGuide does not fit model AnotherModel (it fits cascaded): "
+        "guide cavin_pyro.guides.cascaded.CascadedGuide does not fit model AnotherModel (it fits cascaded): "
         "choose guide= from none of ours"
     )
 
@@ -81,13 +81,13 @@ def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNam
 @pytest.mark.parametrize(
     ("part", "said"),
     [
-        ({"_target_": "models.nothing.Nothing"}, "models.nothing.Nothing cannot be built"),
+        ({"_target_": "cavin_pyro.models.nothing.Nothing"}, "cavin_pyro.models.nothing.Nothing cannot be built"),
         (
-            {"_target_": "models.networks.pointnet.PointNet", "depth": 3},
-            "models.networks.pointnet.PointNet cannot be built: .*'depth'",
+            {"_target_": "cavin_pyro.models.networks.pointnet.PointNet", "depth": 3},
+            "cavin_pyro.models.networks.pointnet.PointNet cannot be built: .*'depth'",
         ),
         (
-            {"_target_": "planning.RandomPlanner", "segment_length": 0},
+            {"_target_": "cavin_pyro.planning.RandomPlanner", "segment_length": 0},
             "^segment_length must be at least 1, not 0$",
         ),
         ({"depth": 3}, "a part has no _target_"),
@@ -117,7 +117,7 @@ def test_a_model_must_take_the_features_and_the_objects_that_there_are(small: Si
 
 def test_an_f_that_reads_outlines_needs_them(small: SimpleNamespace) -> None:
     config = small.config() | {
-        "dynamics": {"_target_": "models.networks.contact.dynamics.ContactDynamics", "object_width": 8}
+        "dynamics": {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics", "object_width": 8}
     }
     model = build_model(config)
     check_fit(model, Outline(), 5)
@@ -128,15 +128,15 @@ def test_an_f_that_reads_outlines_needs_them(small: SimpleNamespace) -> None:
 
 
 def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> None:
-    config = small.config() | {"scales": {"_target_": "models.likelihoods.PredictedScales"}}
+    config = small.config() | {"scales": {"_target_": "cavin_pyro.models.likelihoods.PredictedScales"}}
     with pytest.raises(UserError, match="scales=predicted needs an f that predicts them: dynamics=contact"):
         build_model(config)
-    contact = {"dynamics": {"_target_": "models.networks.contact.dynamics.ContactDynamics"}}
+    contact = {"dynamics": {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics"}}
     assert isinstance(build_model(config | contact).scales, PredictedScales)
 
 
 @pytest.mark.parametrize("margin", [-1, -0.01])
 def test_a_negative_reach_margin_is_named_as_users_type_it(small: SimpleNamespace, margin: float) -> None:
-    contact = {"_target_": "models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
+    contact = {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
     with pytest.raises(UserError, match=f"^dynamics.reach_margin must be null or at least 0 metres, not {margin}$"):
         build_model(small.config() | {"dynamics": contact})

@@ -14,12 +14,12 @@ from torch import Tensor
 from cavin_pyro.criticism.guide import simulate
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import seeded
-from guides.cascaded import CascadedGuide
-from models.cascaded import CascadedModel
-from models.dynamics_only import DynamicsModel
-from models.likelihoods import LikelihoodScales
-from models.networks.pointnet import PointNet
-from models.state import State, Window
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.dynamics_only import DynamicsModel
+from cavin_pyro.models.likelihoods import LikelihoodScales
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.models.state import State, Window
 
 NOISE = 0.5
 PRECISION = 1 / NOISE**2

@@ -16,9 +16,9 @@ from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.criticism.predictive import assess_predictive, compare, effect_size, replicate
 from cavin_pyro.criticism.pushing import Nearness, statistics_of
 from cavin_pyro.criticism.windows import Outcome, generated, observed, seeded
-from envs.workspace import normalised_push
-from models.cascaded import CascadedModel
-from models.state import State, Window
+from cavin_pyro.envs.workspace import normalised_push
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.state import State, Window
 
 NEAR = Nearness(pair=0.05, tool=0.04)
 

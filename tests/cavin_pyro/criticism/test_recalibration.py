@@ -28,15 +28,15 @@ from cavin_pyro.criticism.recalibration import (
     sleep_loss,
 )
 from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.guides.none import NoGuide
+from cavin_pyro.models.dynamics_only import DynamicsModel
+from cavin_pyro.models.likelihoods import PredictedScales
+from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
+from cavin_pyro.models.networks.outline import Outline
+from cavin_pyro.models.state import State, Window, stack_steps
 from cavin_pyro.storage.checkpoint import load_checkpoint
 from cavin_pyro.storage.files import file_digest
 from cavin_pyro.training.run import train
-from guides.none import NoGuide
-from models.dynamics_only import DynamicsModel
-from models.likelihoods import PredictedScales
-from models.networks.contact.dynamics import ContactDynamics
-from models.networks.outline import Outline
-from models.state import State, Window, stack_steps
 from tests.cavin_pyro.conftest import WINDOWS
 
 

@@ -26,11 +26,11 @@ from cavin_pyro.criticism.subgoals import (
     subgoal_rollouts,
 )
 from cavin_pyro.data.collection import CollectionConfig
-from envs.objects.sampling import ObjectRanges
-from envs.policy import HeuristicPushingPolicy
-from envs.scene import Scene
-from models.networks.pointnet import PointNet
-from models.state import State
+from cavin_pyro.envs.objects.sampling import ObjectRanges
+from cavin_pyro.envs.policy import HeuristicPushingPolicy
+from cavin_pyro.envs.scene import Scene
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.models.state import State
 
 SCENES, OBJECTS, SEED = 3, 2, 4
 

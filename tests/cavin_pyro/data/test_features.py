@@ -11,8 +11,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data import features
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.features import cloud_features, geometry_fingerprint, sample_clouds, shard_features
-from envs.objects.shapes import BUILTIN_NAMES
-from models.networks.pointnet import PointNet
+from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.models.networks.pointnet import PointNet
 
 
 def test_features_are_pointnets_output_for_each_cloud(pushes: Path, monkeypatch: pytest.MonkeyPatch) -> None:

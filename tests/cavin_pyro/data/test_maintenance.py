@@ -29,7 +29,7 @@ from cavin_pyro.data.dataset import (
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.data.summary import summarize_data
 from cavin_pyro.data.windows import load_windows
-from models.networks.pointnet import PointNet
+from cavin_pyro.models.networks.pointnet import PointNet
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path
 from cavin_pyro.data.summary import CELL, DISTANCES, DataSummary, summarize_data
-from envs.workspace import TABLE_LOW, normalised_push
+from cavin_pyro.envs.workspace import TABLE_LOW, normalised_push
 
 PLACE = (0.50, 0.10)  # metres
 

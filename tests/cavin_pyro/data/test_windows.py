@@ -13,7 +13,7 @@ from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.dataset import Arrays, write_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
-from models.networks.pointnet import PointNet
+from cavin_pyro.models.networks.pointnet import PointNet
 from tests.cavin_pyro.data.conftest import OBJECTS, STEPS, made_up_episodes, write_dataset
 
 POSITIONS = STEPS + 1

@@ -12,6 +12,8 @@ import torch
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_state
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.workspace import executed_push
 from cavin_pyro.evaluation.evaluation import episode_row, evaluate
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import (
@@ -22,11 +24,9 @@ from cavin_pyro.evaluation.rollout import (
     Transition,
     rollout,
 )
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.planning import CavinPlanner, Plan, RandomPlanner
 from cavin_pyro.storage.checkpoint import save_checkpoint
-from envs.pushing import PushingEnv
-from envs.workspace import executed_push
-from models.networks.pointnet import PointNet
-from planning import CavinPlanner, Plan, RandomPlanner
 
 
 @pytest.fixture

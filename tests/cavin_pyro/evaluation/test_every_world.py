@@ -16,8 +16,8 @@ from gymnasium.utils.env_checker import check_env
 from cavin_pyro.config.commands import WorldConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import options
+from cavin_pyro.envs.tasks import TASKS
 from cavin_pyro.evaluation.factory import make_runner
-from envs.tasks import TASKS
 from tests.real_assets import REAL_ASSETS
 
 CHOICES = [f"env.{one.name}={name}" for one in options(WorldConfig) for name in one.about.names or ()]

@@ -15,11 +15,11 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, rollout
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning.optimizers import OPTIMIZERS
 from cavin_pyro.storage.checkpoint import save_checkpoint
 from cavin_pyro.visualization.plan import draw_plan
-from models.networks.pointnet import PointNet
-from planning import CavinPlanner
-from planning.optimizers import OPTIMIZERS
 
 FITTING = {
     "cavin": "cascaded",

@@ -160,7 +160,10 @@ def test_an_evaluation_is_compared_on_the_command_line(shell: SimpleNamespace, t
     found = json.loads((tmp_path / "two" / "results.json").read_text())["comparison"]
     assert found == {"against": "one", "both": 0, "one_alone": 0, "other_alone": 0, "neither": 2, "p_value": 1.0}
     for more, said in (
-        (["compare=one", "task=clearing"], "compare=one has task._target_=envs.tasks.crossing.Crossing, not"),
+        (
+            ["compare=one", "task=clearing"],
+            "compare=one has task._target_=cavin_pyro.envs.tasks.crossing.Crossing, not",
+        ),
         (["compare=nowhere"], "compare=nowhere is no finished evaluation"),
     ):
         answer = evaluation("episodes=2", "output=three", *more)

@@ -18,12 +18,12 @@ import pytest
 import trimesh
 
 from cavin_pyro.assets import main
+from cavin_pyro.envs.objects.object_sets import load_object_set
+from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.robots import STICK_LENGTH
 from cavin_pyro.fetching.meshes import closed, convex_parts
 from cavin_pyro.fetching.sawyer import COMMIT, PACKAGE, SawyerRobot
 from cavin_pyro.fetching.ycb import PUBLISHED, YcbObjects
-from envs.objects.object_sets import load_object_set
-from envs.objects.shapes import BUILTIN_NAMES
-from envs.robots import STICK_LENGTH
 
 pytest.importorskip("pooch", reason="pooch is not installed: it comes with the extras assets and test")
 

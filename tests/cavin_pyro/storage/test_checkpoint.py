@@ -8,9 +8,9 @@ import torch
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.storage.geometry import load_pointnet
-from models.networks.pointnet import PointNet
 
 
 def test_weights_configuration_and_provenance_survive_a_round_trip(small: SimpleNamespace, tmp_path: Path) -> None:

@@ -21,13 +21,13 @@ from cavin_pyro.config.commands import TrainerConfig, WindowConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.models.state import Window
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.elbo import elbo_terms
 from cavin_pyro.training.run import build_objective
 from cavin_pyro.training.trainer import Trainer
-from guides.cascaded import CascadedGuide
-from models.networks.pointnet import PointNet
-from models.state import Window
 
 CONF = Path(building.__file__).parent / "presets"
 MODELS, GUIDES, PRIORS, OBJECTIVES = (

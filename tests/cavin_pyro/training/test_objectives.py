@@ -20,13 +20,13 @@ from torch import Tensor, nn
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.models.networks.layers import fixed_shapes
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.bounds import DifferentiableRenyiELBO
 from cavin_pyro.training.cuda_graphs import capturable, capturable_loss
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, term_counts
 from cavin_pyro.training.objectives import BoundObjective, Objective, as_objective, counterfactual_loss, rollout_loss
 from cavin_pyro.training.run import build_objective
-from models.networks.layers import fixed_shapes
-from models.state import State, Window
 
 Programs = tuple[nn.Module, nn.Module]
 LATENT = {"nll_subgoal_centers", "nll_subgoal_features", "nll_actions", "kl_effect_code", "kl_motion_code"}

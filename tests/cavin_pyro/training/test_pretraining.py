@@ -14,10 +14,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.models.networks.pointnet import PointNet, PointNetAutoencoder
 from cavin_pyro.training import pretraining
 from cavin_pyro.training.pretraining import _augment, _rate_after, pretrain
 from cavin_pyro.training.resume import write_resume
-from models.networks.pointnet import PointNet, PointNetAutoencoder
 
 
 def clouds(count: int = 60) -> NDArray[np.float32]:

@@ -11,19 +11,19 @@ import torch
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.loading import load_programs
+from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.factory import make_runner
+from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
+from cavin_pyro.models.networks.contact.geometry import REACH, endpoints
+from cavin_pyro.models.networks.outline import Outline
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint
 from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.training.run import train
 from cavin_pyro.training.trainer import Trainer, reflect
-from envs.sensors.camera import Camera
-from envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
-from models.networks.contact.dynamics import ContactDynamics
-from models.networks.contact.geometry import REACH, endpoints
-from models.networks.outline import Outline
-from models.networks.pointnet import PointNet
-from models.state import State, Window
 
 CONTACT = ("geometry=outline", "dynamics=contact", "scales=predicted", "dynamics.object_width=16")
 SMALL = (

@@ -20,6 +20,7 @@ from torch.nn import functional
 from cavin_pyro.config.commands import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
+from cavin_pyro.models.state import State
 from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.training import trainer as trainer_module
@@ -28,7 +29,6 @@ from cavin_pyro.training.objectives import Objective
 from cavin_pyro.training.resume import load_optimizer, optimizer_tensors
 from cavin_pyro.training.run import _keep_best
 from cavin_pyro.training.trainer import Row, Trainer, read_rows
-from models.state import State
 
 SHORT = TrainerConfig(steps=8, batch_size=4, validate_every=2, validation_windows=10, learning_rate=1e-2)
 Hook = Callable[[Trainer, int], None]

@@ -11,7 +11,14 @@ import torch
 from matplotlib import colors
 from numpy.typing import NDArray
 
+from cavin_pyro.envs.layouts import load_task
+from cavin_pyro.envs.scene import COLORS
+from cavin_pyro.envs.sensors.camera import Camera
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord, Transition
+from cavin_pyro.models.networks.pointnet import PointNetAutoencoder
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import Plan, RandomPlanner
+from cavin_pyro.planning.protocol import Evidence
 from cavin_pyro.visualization import plan as figures_plan
 from cavin_pyro.visualization import training as figures
 from cavin_pyro.visualization.overlay import (
@@ -24,13 +31,6 @@ from cavin_pyro.visualization.overlay import (
 from cavin_pyro.visualization.plan import FAILURE_COLOR, SUCCESS_COLOR, Map, draw_plan
 from cavin_pyro.visualization.rendering import write_steps
 from cavin_pyro.visualization.training import compare_runs, draw_reconstructions, draw_training
-from envs.layouts import load_task
-from envs.scene import COLORS
-from envs.sensors.camera import Camera
-from models.networks.pointnet import PointNetAutoencoder
-from models.state import State
-from planning import Plan, RandomPlanner
-from planning.protocol import Evidence
 
 CAMERA = Camera().resized(512, 424)
 OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavin_pyro.envs.pushing import VIDEO_SIZE, PushingEnv
+from cavin_pyro.envs.sensors.camera import Camera
 from cavin_pyro.evaluation.rollout import rollout
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.planning import RandomPlanner
 from cavin_pyro.visualization.video import FRAMES_PER_SECOND, episode_video
-from envs.pushing import VIDEO_SIZE, PushingEnv
-from envs.sensors.camera import Camera
-from models.networks.pointnet import PointNet
-from planning import RandomPlanner
 
 
 def read(path: Path) -> list[NDArray[np.uint8]]:

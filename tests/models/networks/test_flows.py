@@ -12,7 +12,7 @@ from pyro.distributions import Normal
 from torch import Tensor
 from torch.autograd.functional import jacobian
 
-from models.networks.flows import CodeFlow
+from cavin_pyro.models.networks.flows import CodeFlow
 
 both_ways = pytest.mark.parametrize("from_base", [True, False])
 
@@ -121,8 +121,8 @@ def test_arguments_of_distributions_are_checked_as_before() -> None:
         "from torch.distributions import Distribution, Normal\n"
         "for checked in (True, False):\n"
         "    Distribution.set_default_validate_args(checked)\n"
-        "    [sys.modules.pop(name) for name in list(sys.modules) if name.startswith(('zuko', 'models'))]\n"
-        "    import models.networks.flows\n"
+        "    [sys.modules.pop(name) for name in list(sys.modules) if name.startswith(('zuko', 'cavin_pyro.models'))]\n"
+        "    import cavin_pyro.models.networks.flows\n"
         "    assert Normal(0.0, 1.0)._validate_args is checked, checked\n"
     )
     subprocess.run([sys.executable, "-c", f"import pyro, sys\n{program}"], check=True)

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from envs.robots import STICK_RADIUS
-from envs.workspace import TABLE_CENTER as CENTER
-from models.networks.contact.geometry import TOOL_RADIUS
-from models.networks.dynamics import (
+from cavin_pyro.envs.robots import STICK_RADIUS
+from cavin_pyro.envs.workspace import TABLE_CENTER as CENTER
+from cavin_pyro.models.networks.contact.geometry import TOOL_RADIUS
+from cavin_pyro.models.networks.dynamics import (
     PUSH_RANGE,
     SUBGOAL_RANGE,
     ActionGenerator,
@@ -21,9 +21,9 @@ from models.networks.dynamics import (
     MetaDynamics,
     StateChange,
 )
-from models.networks.layers import TABLE_CENTER, StateEncoder, neighbours
-from models.networks.pointnet import PointNet, PointNetAutoencoder, chamfer_distance
-from models.state import State
+from cavin_pyro.models.networks.layers import TABLE_CENTER, StateEncoder, neighbours
+from cavin_pyro.models.networks.pointnet import PointNet, PointNetAutoencoder, chamfer_distance
+from cavin_pyro.models.state import State
 
 SIZES = {"feature_dimension": 6, "width": 8}
 ORDER = torch.tensor([2, 0, 3, 1])

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.networks.outline import (
+from cavin_pyro.models.networks.outline import (
     OUTLINE_UNIT,
     OUTLINES,
     PER_OUTLINE,

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.state import State
-from planning import CavinPlanner
-from planning.additions.effect_retries import is_unmoved, leave_out_similar
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning.additions.effect_retries import is_unmoved, leave_out_similar
 
 GOAL = (0.5, 0.0)
 

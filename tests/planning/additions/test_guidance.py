@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from envs.layouts import parse_task
-from envs.tasks import TaskReward
-from envs.workspace import tile_center
-from models.state import State
-from planning import CavinPlanner, CvaeMpcPlanner
-from planning.additions.guidance import GuidedReturn, GuidedTracking
-from planning.cavin import TrackingState
-from planning.protocol import SegmentRollout
-from planning.returns import CumulativeReward, Progress
+from cavin_pyro.envs.layouts import parse_task
+from cavin_pyro.envs.tasks import TaskReward
+from cavin_pyro.envs.workspace import tile_center
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner, CvaeMpcPlanner
+from cavin_pyro.planning.additions.guidance import GuidedReturn, GuidedTracking
+from cavin_pyro.planning.cavin import TrackingState
+from cavin_pyro.planning.protocol import SegmentRollout
+from cavin_pyro.planning.returns import CumulativeReward, Progress
 
 ARM = [[1, column] for column in range(1, 6)]
 U = [*ARM, [2, 5], *[[3, column] for column in range(5, 0, -1)]]  # eleven tiles from (1, 1) round to (3, 1)

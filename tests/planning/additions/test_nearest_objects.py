@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from envs.layouts import load_task
-from envs.tasks import TaskReward
-from models.state import State
-from planning import CavinPlanner
-from planning.additions.nearest_objects import NearestObjects, nearest_objects
+from cavin_pyro.envs.layouts import load_task
+from cavin_pyro.envs.tasks import TaskReward
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning.additions.nearest_objects import NearestObjects, nearest_objects
 
 PLACES = [(0.0, 0.0), (0.9, 0.0), (0.1, 0.1), (0.8, 0.0), (0.2, 0.0), (0.0, 0.3)]  # metres; 0, 2, 4, 5 are nearest
 

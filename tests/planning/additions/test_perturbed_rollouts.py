@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Normal
 
-from models.state import State
-from planning import PerturbedRollouts
-from planning.additions.perturbed_rollouts import sequential_halving
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import PerturbedRollouts
+from cavin_pyro.planning.additions.perturbed_rollouts import sequential_halving
 
 SAMPLES = 64
 

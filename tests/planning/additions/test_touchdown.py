@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from cavin_pyro.data.observed import observed_points
-from envs.pushing import PushingEnv
-from models.state import State
-from planning import CavinPlanner, CvaeMpcPlanner, SectarPlanner
-from planning.additions.touchdown import ObservedPoints, prefer_free
+from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner, CvaeMpcPlanner, SectarPlanner
+from cavin_pyro.planning.additions.touchdown import ObservedPoints, prefer_free
 
 LOW, HIGH = torch.tensor([[0.0, -1.0]]), torch.tensor([[1.0, 1.0]])  # metres
 

@@ -8,10 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
-from models.networks.contact.geometry import CORNER, DISPLACEMENT_UNIT, PUSH_UNIT, REACH_HIGH, REACH_LOW, TOOL_RADIUS
-from models.networks.layers import POSITION_UNIT, TABLE_CENTER
-from models.networks.outline import (
+from cavin_pyro.models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
+from cavin_pyro.models.networks.contact.geometry import (
+    CORNER,
+    DISPLACEMENT_UNIT,
+    PUSH_UNIT,
+    REACH_HIGH,
+    REACH_LOW,
+    TOOL_RADIUS,
+)
+from cavin_pyro.models.networks.layers import POSITION_UNIT, TABLE_CENTER
+from cavin_pyro.models.networks.outline import (
     DIRECTIONS,
     HEIGHT_MEANS,
     HEIGHT_SPREADS,

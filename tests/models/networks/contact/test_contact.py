@@ -12,10 +12,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
-from envs.workspace import push_endpoints
-from models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
-from models.networks.contact.geometry import (
+from cavin_pyro.envs.workspace import push_endpoints
+from cavin_pyro.models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
+from cavin_pyro.models.networks.contact.geometry import (
     CARRIED,
     DISPLACEMENT_UNIT,
     PAIR_MEASURES,
@@ -28,10 +27,11 @@ from models.networks.contact.geometry import (
     endpoints,
     pair_contact,
 )
-from models.networks.contact.rows import Rows
-from models.networks.layers import fixed_shapes
-from models.networks.outline import DIRECTIONS, PER_OUTLINE, Outline, mean_extent
-from models.state import State
+from cavin_pyro.models.networks.contact.rows import Rows
+from cavin_pyro.models.networks.layers import fixed_shapes
+from cavin_pyro.models.networks.outline import DIRECTIONS, PER_OUTLINE, Outline, mean_extent
+from cavin_pyro.models.state import State
+from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
 from tests.models.networks.contact import by_hand
 
 MARGIN = 0.01
