@@ -28,16 +28,14 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 from pyro import poutine
 
-from cavin_pyro.criticism.loading import load_programs
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene, pushing_policy
 from cavin_pyro.data.features import cloud_features
 from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.randomness import collection_streams
 from cavin_pyro.envs.scene import FALLEN, Scene
 from cavin_pyro.models.state import State, Window, stack_steps
-from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
+from cavin_pyro.storage.checkpoint import load
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.storage.progress import progress_bar
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -125,10 +123,8 @@ def segments(
 @torch.inference_mode()
 def predictions(path: str, episodes: Sequence[tuple[list[str], list[Push]]]) -> dict[int, dict[str, Predictions]]:
     """Centres that a checkpoint predicts, by the number of pushes and the predictor."""
-    file = find_checkpoint(path)
-    checkpoint = load_checkpoint(file)
-    model, guide = load_programs(checkpoint, file)
-    geometry = geometry_of(checkpoint, file)
+    trained = load(path)
+    model, guide, geometry = trained.model, trained.guide, trained.geometry
 
     def state(seen: Observation) -> State:
         features = torch.from_numpy(cloud_features(geometry, (seen.clouds - seen.centers[:, None])[None]))
@@ -148,7 +144,10 @@ def predictions(path: str, episodes: Sequence[tuple[list[str], list[Push]]]) -> 
                 window = Window(states, actions, torch.ones(1, T, dtype=torch.bool), torch.ones(1, dtype=torch.bool))
                 site: Any = poutine.trace(guide).get_trace(window).nodes["effect_code"]
                 inferred.append(model.subgoal(first, site["fn"].mean).centers[0].numpy())
-        found[ahead] = {f"{file.stem}, f": rolled, **({f"{file.stem}, h": inferred} if inferred else {})}
+        found[ahead] = {
+            f"{trained.path.stem}, f": rolled,
+            **({f"{trained.path.stem}, h": inferred} if inferred else {}),
+        }
     return found
 
 

@@ -16,7 +16,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.config.parts import check_sizes, construct, naming
     from cavin_pyro.data.features import sample_clouds
-    from cavin_pyro.storage.checkpoint import save_checkpoint
+    from cavin_pyro.storage.checkpoint import save
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -51,8 +51,8 @@ def main(config: DictConfig) -> None:
             device=device,
         )
         record = {**provenance(), "clouds": len(clouds), "losses": losses}
-        parts = {"pointnet": autoencoder.encoder, "decoder": autoencoder.decoder}
-        save_checkpoint(folder / "pointnet.safetensors", parts=parts, config=stored_config, provenance=record)
+        parts = {"geometry": autoencoder.encoder, "decoder": autoencoder.decoder}
+        save(folder / "pointnet.safetensors", **parts, config=stored_config, provenance=record)
         write_json(folder / "metrics.json", record)
         draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
         print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")

@@ -12,6 +12,7 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 
+from cavin_pyro.models.part import Part
 from cavin_pyro.models.state import State
 
 Self = TypeVar("Self", bound="Isotropic")
@@ -106,7 +107,7 @@ class PredictedScales(LikelihoodScales):
         return IsotropicStudentT(self.degrees_of_freedom, mean, predicted)
 
 
-class LearnedScales(Scales, nn.Module):
+class LearnedScales(Scales, Part):
     """Learned standard deviations, shared by f and h, and by all windows. For their units see `Scales`."""
 
     def __init__(

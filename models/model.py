@@ -10,15 +10,16 @@ import pyro
 import torch
 from pyro import poutine
 from pyro.distributions import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from cavin_pyro.models.networks.dynamics import Dynamics, PushOutcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes, unit
+from cavin_pyro.models.part import Part
 from cavin_pyro.models.state import State, Window, stack_steps
 
 
-class Program(nn.Module):
+class Program(Part):
     """A Pyro program whose networks are its submodules.
 
     Each call registers the parameters with `pyro.module`, because `SVI` and Pyro's optimizers find them in Pyro's

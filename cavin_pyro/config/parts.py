@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from typing import Any
 
 import yaml
@@ -14,8 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line
+from cavin_pyro.config.options import constructor_options
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.part import Part
 
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "cavin_pyro.models.priors.standard.StandardPrior"
@@ -91,11 +97,14 @@ def build_model(config: Config) -> Model:
     """The model program with its parts, from the sections `model`, `prior`, `scales` and `dynamics`.
 
     A model gets a prior for each of its codes, that is, for each of `effect_dimension` and `motion_dimension`
-    that its section has: `model.prior` where that names a class, else the section `prior`.
+    that its section has: `model.prior` where that names a class, else the section `prior`. Without that section,
+    `model` itself has the parts, as `describe` writes it.
 
     Raises:
         UserError: a part that cannot be built, or a section without a required number.
     """
+    if "prior" not in config:
+        return _checked_model(build_part("model", config["model"]))
     sizes = dict(config["model"])
     own_prior = sizes.pop("prior", None) or {}
     check_sizes("model", sizes)
@@ -117,11 +126,17 @@ def build_model(config: Config) -> Model:
     except KeyError as error:
         raise UserError(f"the configuration of the model lacks {error}") from error
     scales = build_part("scales", config.get("scales") or FIXED_SCALES)
-    model = build_part("model", sizes, **parts, scales=scales, dynamics=dynamics)
-    if not isinstance(model, Model):
-        raise UserError(f"model {sizes['_target_']} is no model program: derive it from cavin_pyro.models.model.Model")
+    model = _checked_model(build_part("model", sizes, **parts, scales=scales, dynamics=dynamics))
     if not parts and config["prior"]["_target_"] != STANDARD_PRIOR:
         raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
+    return model
+
+
+def _checked_model(model: Any) -> Model:
+    if not isinstance(model, Model):
+        raise UserError(
+            f"model {type(model).__name__} is no model program: derive it from cavin_pyro.models.model.Model"
+        )
     return model
 
 
@@ -162,3 +177,47 @@ def _guides() -> dict[str, type[Guide]]:
     """The classes of `guide=`."""
     files = sorted((PRESETS / "guide").glob("*.yaml"))
     return {file.stem: class_of(yaml.safe_load(file.read_text(encoding="utf-8"))) for file in files}
+
+
+def describe(*, model: Model, guide: Guide | None = None, geometry: Geometry | None = None) -> dict[str, Any]:
+    """The sections `model`, `guide` and `geometry`, from which the same parts can be built.
+
+    Raises:
+        UserError: a part has an argument that no file can hold, or is of a class that no other program can import.
+    """
+    parts = {"model": model, "guide": guide, "geometry": geometry}
+    return {name: _described(part, name, model) for name, part in parts.items() if part is not None}
+
+
+def _described(value: Any, place: str, model: Model) -> Any:
+    """A part or one of its arguments as plain data; a guide's `model` is left out, as `build_guide` gives it."""
+    if isinstance(value, Part):
+        target = _dotted(type(value), place)
+        named = {name: one.default for name, one in constructor_options(target).items() if one.default is not one.empty}
+        named |= dict(zip(inspect.signature(type(value)).parameters, value.by_position, strict=False))
+        given = {name: one for name, one in {**named, **value.by_keyword}.items() if one is not model}
+        return {"_target_": target, **{name: _described(one, f"{place}.{name}", model) for name, one in given.items()}}
+    if isinstance(value, type | functools.partial):
+        function = value if isinstance(value, type) else value.func
+        options = {} if isinstance(value, type) else value.keywords
+        return {"_target_": _dotted(function, place), "_partial_": True, **options}
+    if is_dataclass(value):
+        return {"_target_": _dotted(type(value), place), **vars(value)}
+    if isinstance(value, list | tuple):
+        return [_described(one, place, model) for one in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise UserError(
+        f"{place} is a {type(value).__name__}, which a checkpoint cannot describe: derive it from "
+        "cavin_pyro.models.part.Part, or give save(config=...) the sections of train"
+    )
+
+
+def _dotted(found: Any, place: str) -> str:
+    """The path by which another program imports a class."""
+    if found.__module__ == "__main__" or "<locals>" in found.__qualname__:
+        raise UserError(
+            f"{place} is of class {found.__qualname__}, which no other program can import: move it into a module, and "
+            "name that in load(trust=[...])"
+        )
+    return f"{found.__module__}.{found.__qualname__}"

@@ -66,7 +66,7 @@ def load_pair(config: DictConfig, accept: Accept | None = None) -> dict[str, tup
     """
     world = collecting_world(config.env)
     both = {name: load_trained(config, config[name], accept) for name in ("a", "b")}
-    choices = [(one.model.segment_length, list(one.selection.held_out_objects)) for one in both.values()]
+    choices = [(one.checkpoint.model.segment_length, list(one.selection.held_out_objects)) for one in both.values()]
     if choices[0] != choices[1]:
         raise UserError(
             "a and b cannot be compared on the same windows: they have segments of "

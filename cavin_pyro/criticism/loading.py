@@ -15,7 +15,6 @@ from torch import Tensor
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured
-from cavin_pyro.config.parts import amortized_guides, build_guide
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.dataset import content_records, read_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
@@ -23,11 +22,10 @@ from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.state import Window
-from cavin_pyro.storage.checkpoint import Checkpoint, find_checkpoint, load_checkpoint
+from cavin_pyro.storage.checkpoint import Checkpoint, load
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import file_digest
-from cavin_pyro.storage.geometry import check_fit, geometry_of
-from cavin_pyro.storage.models import model_of
+from cavin_pyro.storage.geometry import check_fit
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.run import data_folders
 
@@ -84,15 +82,11 @@ class CheckContext:
 class Loaded(NamedTuple):
     """A checkpoint with its data.
 
-    path: of the file. selection: the options by which its training selected windows. table: all windows of `folders`,
-    as its own training selected and split them.
+    selection: the options by which its training selected windows. table: all windows of `folders`, as its own training
+    selected and split them.
     """
 
-    path: Path
     checkpoint: Checkpoint
-    model: Model
-    guide: Guide
-    geometry: Geometry
     selection: WindowConfig
     table: WindowTable
     folders: list[Path]
@@ -127,27 +121,27 @@ def load_trained(config: DictConfig, name: str, accept: Accept | None = None) ->
     Raises:
         UserError: as `load_context`.
     """
-    path = find_checkpoint(name)
-    checkpoint = load_checkpoint(path, trust=list(config.trust))
-    model, guide = load_programs(checkpoint, path)
+    checkpoint = load(name, trust=list(config.trust))
     if accept is not None:
-        accept(model)
-    geometry = geometry_of(checkpoint, path)
-    check_fit(model, geometry)
-    selection, segment_length, split = trained_windows(checkpoint, path)
+        accept(checkpoint.model)
+    check_fit(checkpoint.model, checkpoint.geometry)
+    selection, segment_length, split = trained_windows(checkpoint)
     folders = data_folders(config.data)
     for folder in folders:
         compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
     storage = Path(config.output) if Path(config.output).is_dir() else None
-    table = load_windows(folders, geometry, selection, segment_length=segment_length, seed=split, storage=storage)
-    return Loaded(path, checkpoint, model, guide, geometry, selection, table, folders)
+    table = load_windows(
+        folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
+    )
+    return Loaded(checkpoint, selection, table, folders)
 
 
 def context_of(
     config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: Tensor
 ) -> tuple[CheckContext, dict[str, Any]]:
     """The context of a checkpoint and its data, and `about`; `held_out`: indices of windows for validation."""
-    path, checkpoint, model, guide, geometry, selection, table, folders = loaded
+    checkpoint, selection, table, folders = loaded
+    path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
     chosen = {
         "training": sample_windows(table, table.training, config.windows, seed=[config.seed, 0]),
         "validation": sample_windows(table, held_out, config.windows, seed=[config.seed, 1]),
@@ -156,7 +150,7 @@ def context_of(
     context = CheckContext(
         model,
         guide,
-        geometry,
+        checkpoint.geometry,
         table.batch(chosen["training"]),
         table.batch(chosen["validation"]),
         seed=config.seed,
@@ -171,7 +165,7 @@ def context_of(
         "weights": file_digest(path)[:12],
         "model": type(model).__name__,
         "guide": type(guide).__name__,
-        "prior": _last(own_prior or checkpoint.config["prior"].get("_target_")),
+        "prior": _last(own_prior or (checkpoint.config.get("prior") or {}).get("_target_")),
         "trained": checkpoint.provenance,
         "data": [compare_data(folder, checkpoint.provenance) for folder in folders],
         "windows": {name: len(indices) for name, indices in chosen.items()},
@@ -215,26 +209,7 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def load_programs(checkpoint: Checkpoint, where: str | Path) -> tuple[Model, Guide]:
-    """Model and guide of a checkpoint, in evaluation mode and without gradients.
-
-    Raises:
-        UserError: there is no model or no guide in it, or one of another architecture.
-    """
-    model = model_of(checkpoint, where)
-    guide = build_guide(checkpoint.config, model) if "guide" in checkpoint.config else None
-    if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in checkpoint.tensors)):
-        raise UserError(f"checkpoint {where} holds no guide: give one that train has written")
-    if not guide.amortized:
-        raise UserError(
-            f"checkpoint {where} has guide {type(guide).__name__}, with parameters for windows of its training alone: "
-            f"check infers others, so train with guide= one of {', '.join(amortized_guides(model.name))}"
-        )
-    checkpoint.load_into("guide", guide, where)
-    return model, guide.requires_grad_(False).eval()
-
-
-def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowConfig, int, int]:
+def trained_windows(checkpoint: Checkpoint) -> tuple[WindowConfig, int, int]:
     """Which windows a checkpoint was trained on: their configuration, T, and the seed of the split.
 
     Raises:
@@ -247,7 +222,7 @@ def trained_windows(checkpoint: Checkpoint, where: str | Path) -> tuple[WindowCo
         return windows, int(checkpoint.config["model"]["segment_length"]), int(checkpoint.config["seed"])
     except (AttributeError, KeyError, TypeError) as error:
         raise UserError(
-            f"checkpoint {where} does not tell which windows its training held out (its configuration lacks "
+            f"checkpoint {checkpoint.path} does not tell which windows its training held out (its configuration lacks "
             f"{' '.join(str(error).split())}): give one that train has written"
         ) from error
 

@@ -81,14 +81,14 @@ def write_calibrated(folder: Path, config: DictConfig, loaded: Loaded, measured:
     was calibrated (`checkpoint`), fingerprints of the data, and what was `measured`, without `losses`.
     """
     checkpoint, path = loaded.checkpoint, folder / "checkpoint.safetensors"
-    parts = {"guide": loaded.guide, "model": loaded.model}
+    parts = {"guide": checkpoint.guide, "model": checkpoint.model}
     now = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
     changed = {name: value.detach().contiguous() for name, value in now.items() if name in checkpoint.tensors}
     record = {
         **provenance(),
         "parts": list(config.parts),
         **{name: config[name] for name in OPTIONS},
-        "checkpoint": file_digest(loaded.path),
+        "checkpoint": file_digest(checkpoint.path),
         "data": [one["fingerprint"] for data in loaded.folders for one in content_records(data)],
         **{name: value for name, value in measured.items() if name != "losses"},
     }
@@ -111,8 +111,8 @@ def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = C
 
     Model and guide are on the CPU before and after.
     """
+    model, guide = loaded.checkpoint.model.to(device), loaded.checkpoint.guide.to(device)
     place(loaded.table, device)
-    loaded.model.to(device), loaded.guide.to(device)
     generator = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)
 
@@ -121,8 +121,8 @@ def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = C
 
     options = {name: config[name] for name in ("steps", "learning_rate", "wake_weight")}
     with unchecked_programs():
-        losses = sleep(loaded.model, loaded.guide, batch, **options)
-    loaded.model.to(CPU), loaded.guide.to(CPU)
+        losses = sleep(model, guide, batch, **options)
+    model.to(CPU), guide.to(CPU)
     return losses
 
 

@@ -24,9 +24,7 @@ from cavin_pyro.planning.additions.touchdown import TOUCHDOWN_DISTANCE, prefer_f
 from cavin_pyro.planning.returns import best_of, squared_distance
 from cavin_pyro.planning.rollout import predict_states
 from cavin_pyro.planning.sampling import sample_each
-from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
-from cavin_pyro.storage.geometry import geometry_of
-from cavin_pyro.storage.models import model_of
+from cavin_pyro.storage.checkpoint import load
 
 
 class PushingPolicy(Protocol):
@@ -88,10 +86,10 @@ def load_pusher(name: str) -> tuple[Model, Geometry]:
     Raises:
         UserError: it cannot be used, or its model has not both codes.
     """
-    path = find_checkpoint(name)
-    checkpoint = load_checkpoint(path)
-    geometry = geometry_of(checkpoint, path)
-    model = model_of(checkpoint, path)
+    trained = load(name)
+    model = trained.model
     if model.codes != ("effect_code", "motion_code"):
-        raise UserError(f"policy=model needs a cascade, and checkpoint {path} has model {model.name}: choose cavin")
-    return model, geometry
+        raise UserError(
+            f"policy=model needs a cascade, and checkpoint {trained.path} has model {model.name}: choose cavin"
+        )
+    return model, trained.geometry

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.device import send
@@ -50,20 +51,90 @@ class WindowTable:
     """
 
     def __init__(
-        self, states: State, actions: Tensor, transition_mask: Tensor, segment_length: int = SEGMENT_LENGTH
+        self,
+        states: State,
+        actions: Tensor,
+        transition_mask: Tensor,
+        *,
+        starts: Tensor,
+        sequence_mask: Tensor,
+        episodes: Tensor,
+        held_out: Tensor,
+        segment_length: int = SEGMENT_LENGTH,
     ) -> None:
-        """States, actions and transition_mask have leading dimension [P], positions in time, episode after episode."""
+        """W windows of P positions in time, which are stored episode after episode.
+
+        Args:
+            states, actions, transition_mask: `[P, ...]`.
+            starts: position of each window's first state, `[W]`. sequence_mask, episodes: `[W]`.
+            held_out: which windows are for validation, `[W]` bool.
+            segment_length: T.
+        """
         self._states, self._actions, self._transition_mask = states, actions, transition_mask
         self.device = torch.device("cpu")
         self._steps = torch.arange(segment_length + 1)
-        self.starts = torch.empty(0, dtype=torch.int64)
-        self.sequence_mask = torch.empty(0, dtype=torch.bool)
-        self.episodes = torch.empty(0, dtype=torch.int64)
-        self.training = torch.empty(0, dtype=torch.int64)
-        self.validation = torch.empty(0, dtype=torch.int64)
+        self.starts, self.sequence_mask, self.episodes = starts, sequence_mask, episodes
+        self.training, self.validation = (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
         # Objects up to the last real one, at each position; piece by piece, since the states may be larger than memory.
         slots = torch.arange(1, states.objects + 1, dtype=torch.uint8)
         self._objects = torch.cat([(part * slots).amax(-1) for part in states.mask.split(2**16)])
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        centers: ArrayLike,
+        features: ArrayLike,
+        actions: ArrayLike,
+        mask: ArrayLike | None = None,
+        transition_mask: ArrayLike | None = None,
+        sequence_mask: ArrayLike | None = None,
+        episodes: ArrayLike | None = None,
+        validation_fraction: float = 0.1,
+        seed: int = 0,
+    ) -> WindowTable:
+        """Windows from arrays or tensors of one's own, for `cavin_pyro.fit`.
+
+        windows = WindowTable.from_arrays(centers=centers, features=features, actions=actions)
+
+        Args:
+            centers: metres, `[W, T + 1, M, 3]`. features: of unit length, `[W, T + 1, M, F]`.
+            actions: normalised pushes, `[W, T, 4]`.
+            mask: real objects, `[W, T + 1, M]` bool; by default all.
+            transition_mask: pushes that f learns from, `[W, T]` bool. sequence_mask: windows that h, g and the guide
+                learn from, `[W]` bool. By default all.
+            episodes: number of each window's episode, `[W]`; by default every window is one. Of the episodes, at least
+                one and about `validation_fraction` are for validation, which `seed` chooses.
+
+        Raises:
+            UserError: shapes that do not fit together, numbers that are not finite, or nothing to train on.
+        """
+        pushes = _checked("actions", actions, torch.float32, (None, None, 4))
+        W, T = pushes.shape[:2]
+        places = _checked("centers", centers, torch.float32, (W, T + 1, None, 3))
+        real = _checked("mask", mask, torch.bool, places.shape[:3])
+        outlines = _checked("features", features, torch.float32, (*places.shape[:3], None))
+        transitions = _checked("transition_mask", transition_mask, torch.bool, (W, T))
+        sequences = _checked("sequence_mask", sequence_mask, torch.bool, (W,))
+        numbers = _checked("episodes", range(W) if episodes is None else episodes, torch.int64, (W,))
+        distinct = numbers.unique()
+        if len(distinct) < 2 or not 0 < validation_fraction < 1 or T == 0:
+            raise UserError(
+                f"windows of {len(distinct)} episodes with {T} pushes and validation_fraction={validation_fraction:g}: "
+                "give at least two episodes and a push, and a fraction between 0 and 1"
+            )
+        count = min(max(1, round(validation_fraction * len(distinct))), len(distinct) - 1)
+        order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
+        return cls(
+            State(places, outlines, real).map(lambda field: field.flatten(0, 1)),
+            functional.pad(pushes, (0, 0, 0, 1)).flatten(0, 1),  # after a window's last state there is no push
+            functional.pad(transitions, (0, 1)).flatten(),
+            starts=torch.arange(W) * (T + 1),
+            sequence_mask=sequences,
+            episodes=numbers,
+            held_out=torch.isin(numbers, distinct[order[:count]]),
+            segment_length=T,
+        )
 
     def move(self, device: torch.device, room: int) -> bool:
         """Give batches on a device; also keep states and pushes there if they take at most `room` bytes.
@@ -160,6 +231,18 @@ def load_windows(
     return found.table()
 
 
+def _checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | None]) -> Tensor:
+    """The array as a tensor of this shape, in which None stands for any size; without an array, ones."""
+    tensor = torch.as_tensor(np.ones(shape, bool) if array is None else array, dtype=dtype)
+    fits = tensor.dim() == len(shape)
+    if not fits or any(want not in (None, have) for have, want in zip(tensor.shape, shape, strict=True)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise UserError(f"{name} has shape {[*tensor.shape]}, and must have [{wanted}]")
+    if not tensor.isfinite().all():
+        raise UserError(f"{name} has numbers that are not finite: leave those windows out")
+    return tensor
+
+
 class _Finder:
     """Finds the windows in one shard after another, and holds no more of them than where they start."""
 
@@ -178,7 +261,9 @@ class _Finder:
         self._slots, self._states, self._storage = slots, states, storage
         self._turns = np.random.default_rng(seed)
         self._stored: Arrays = {}  # positions in time, episode after episode
-        self._windows: dict[str, list[NDArray[Any]]] = {"start": [], "counts": [], "episode": [], "validation": []}
+        self._windows: dict[str, list[NDArray[Any]]] = {
+            name: [] for name in ("starts", "sequence_mask", "episodes", "held_out")
+        }
         self._episodes = self._filled = 0
 
     def add(self, episodes: Arrays) -> None:
@@ -213,8 +298,8 @@ class _Finder:
 
         episode, start = np.nonzero(chosen)
         episode += self._episodes
-        found = {"start": episode * positions + start, "counts": informative[chosen]}
-        for name, values in {**found, "episode": episode, "validation": validation[chosen]}.items():
+        found = {"starts": episode * positions + start, "sequence_mask": informative[chosen]}
+        for name, values in {**found, "episodes": episode, "held_out": validation[chosen]}.items():
             self._windows[name].append(values)
         self._episodes += len(mask)
         self._store(
@@ -247,13 +332,8 @@ class _Finder:
             raise UserError(f"dataset {self._where} has no usable shard: collect it again, with the same options")
         stored = {name: torch.from_numpy(array[: self._filled]) for name, array in self._stored.items()}
         states = State(stored["centers"], stored["features"], stored["mask"])
-        table = WindowTable(states, stored["actions"], stored["counts"], self._length)
-        found = {name: np.concatenate(parts) for name, parts in self._windows.items()}
-        table.starts = torch.from_numpy(found["start"])
-        table.sequence_mask = torch.from_numpy(found["counts"])
-        table.episodes = torch.from_numpy(found["episode"])
-        table.training = torch.from_numpy(np.flatnonzero(~found["validation"]))
-        table.validation = torch.from_numpy(np.flatnonzero(found["validation"]))
+        windows = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in self._windows.items()}
+        table = WindowTable(states, stored["actions"], stored["counts"], **windows, segment_length=self._length)
         for name in ("training", "validation"):
             if not table.sequence_mask[getattr(table, name)].any():
                 raise UserError(

@@ -35,9 +35,7 @@ from cavin_pyro.planning.optimizers import Shooting
 from cavin_pyro.planning.protocol import RewardFunction
 from cavin_pyro.planning.returns import AUTO, END
 from cavin_pyro.planning.searching import SearchingPlanner
-from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
-from cavin_pyro.storage.geometry import geometry_of
-from cavin_pyro.storage.models import model_of
+from cavin_pyro.storage.checkpoint import load
 
 CPU = torch.device("cpu")
 
@@ -118,8 +116,8 @@ def announce_objects(config: DictConfig) -> None:
     """
     if config.planner.model_free:
         return
-    path = find_checkpoint(config.checkpoint)
-    model = load_checkpoint(path, trust=list(config.trust)).config["model"]
+    trained_before = load(config.checkpoint, trust=list(config.trust))
+    path, model = trained_before.path, trained_before.config["model"]
     trained, near = model.get("maximum_objects", OBJECT_SLOTS), model.get("neighbours")
     if config.objects > trained:
         print(
@@ -165,17 +163,16 @@ def make_planner(config: DictConfig, reward: RewardFunction, device: torch.devic
     Raises:
         UserError: a checkpoint that cannot be used, or a planner that refuses its options.
     """
-    path = find_checkpoint(config.checkpoint)
-    checkpoint = load_checkpoint(path, trust=list(config.trust))
-    geometry = geometry_of(checkpoint, path)
+    checkpoint = load(config.checkpoint, trust=list(config.trust))
+    geometry = checkpoint.geometry
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
         with naming("planner", options):
             return construct(options), geometry
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
-    model = model_of(checkpoint, path).to(device)
-    _check_planner(options, model, path)
+    model = checkpoint.model.to(device)
+    _check_planner(options, model, checkpoint.path)
     if options.get("compile") is True and device.type == "cuda":
         options["compile"] = GRAPHS
     if options.get("tracking_at") == AUTO and config.pushes_per_plan != 1:

@@ -11,44 +11,112 @@ import json
 import sysconfig
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from cavin_pyro.config.commands import CHECKPOINTS, DEFAULT_CHECKPOINT
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.parts import amortized_guides, build_guide, build_model, construct, describe
+from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.storage.digests import check_manifest, tensors_digest
 from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.provenance import provenance as of_this_process
 from cavin_pyro.storage.trust import check_numbers, check_targets
 
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
+POINTNET = "cavin_pyro.models.networks.pointnet.PointNet"
 BUILT_SECTIONS = ("model", "geometry", "dynamics", "prior", "scales", "guide")  # from which parts are built
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Weights, configuration and provenance.
+    """What a file of `save` or of the command `train` holds.
 
     Attributes:
-        config: of the parts. provenance: of the weights. tensors: by `part.parameter`.
+        path: of the file. config: of the parts. provenance: of the weights. tensors: by `part.parameter`.
     """
 
+    path: Path
     config: dict[str, Any]
     provenance: dict[str, Any]
     tensors: dict[str, Tensor]
 
-    def load_into(self, part: str, module: nn.Module, where: str | Path) -> None:
-        """Copy one part's weights into a module.
+    @cached_property
+    def model(self) -> Model:
+        """The model program with its trained parameters, in evaluation mode and without gradients.
+
+        Raises:
+            UserError: there is no model in the file, or one of another architecture.
+        """
+        if "model" not in self.config:
+            raise UserError(f"checkpoint {self.path} holds no model: give one that train has written")
+        return self._filled("model", build_model(self.config))
+
+    @cached_property
+    def guide(self) -> Guide:
+        """The guide of `model`, likewise.
+
+        Raises:
+            UserError: there is no guide in the file, or one that infers no other windows than those of its training.
+        """
+        guide = build_guide(self.config, self.model) if "guide" in self.config else None
+        if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in self.tensors)):
+            raise UserError(f"checkpoint {self.path} holds no guide: give one that train has written")
+        if not guide.amortized:
+            others = ", ".join(amortized_guides(self.model.name))
+            raise UserError(
+                f"checkpoint {self.path} has guide {type(guide).__name__}, with parameters for windows of its training "
+                f"alone: train with guide= one of {others}, which infer any window"
+            )
+        return self._filled("guide", guide)
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """What turns an object's point cloud into its geometric feature, frozen: `pointnet`, or another class.
+
+        Raises:
+            UserError: there is none in the file.
+        """
+        section = self.config.get("geometry") or {}
+        if section.get("_target_", POINTNET) == POINTNET:
+            return self.pointnet
+        return self._filled("geometry", checked_geometry(construct(section)))
+
+    @cached_property
+    def pointnet(self) -> PointNet:
+        """The frozen PointNet of a pretraining run or of a whole checkpoint.
+
+        Raises:
+            UserError: there is none in the file.
+        """
+        weight = self.tensors.get("pointnet.feature.weight")
+        if weight is None:
+            raise UserError(f"checkpoint {self.path} holds no PointNet: give one that pretrain or train has written")
+        return self._filled("pointnet", PointNet(feature_dimension=len(weight)))
+
+    def _filled(self, part: str, module: Module) -> Module:
+        self.load_into(part, module)
+        return module.requires_grad_(False).eval()
+
+    def load_into(self, part: str, module: nn.Module) -> None:
+        """Copy the weights of `part`, as `save` names it, into a module.
 
         Raises:
             UserError: the weights are of another architecture or type.
         """
-        prefix = f"{part}."
+        prefix = f"{_stored_name(part, module)}."
         weights = {name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)}
         wanted = module.state_dict()
         for name in sorted(set(wanted) | set(weights)):
@@ -56,40 +124,80 @@ class Checkpoint:
             if have is None or want is None or have.shape != want.shape:
                 shapes = [None if value is None else list(value.shape) for value in (have, want)]
                 raise UserError(
-                    f"checkpoint {where} is of another architecture: {part}.{name} has shape {shapes[0]} in the file "
-                    f"and {shapes[1]} in {type(module).__name__}: use the configuration that it was trained with"
+                    f"checkpoint {self.path} is of another architecture: {part}.{name} has shape {shapes[0]} in the "
+                    f"file and {shapes[1]} in {type(module).__name__}: use the configuration that it was trained with"
                 )
             if have.dtype != want.dtype:
                 raise UserError(
-                    f"checkpoint {where} is damaged: {part}.{name} holds {_plain(have.dtype)}, not {_plain(want.dtype)}"
+                    f"checkpoint {self.path} is damaged: {part}.{name} holds {_plain(have.dtype)}, not "
+                    f"{_plain(want.dtype)}"
                 )
         module.load_state_dict(weights)
 
 
-def save_checkpoint(
-    path: Path, *, parts: Mapping[str, nn.Module], config: Mapping[str, Any], provenance: Mapping[str, Any]
+def checked_geometry(geometry: Any) -> Geometry:
+    """What a section `geometry` has built; a `UserError` if it is something else."""
+    if not isinstance(geometry, Geometry):
+        raise UserError(
+            f"geometry {type(geometry).__name__} is no Geometry: derive it from cavin_pyro.models.networks.geometry"
+        )
+    return geometry
+
+
+def save(
+    path: str | Path,
+    *,
+    model: Model | None = None,
+    guide: Guide | None = None,
+    geometry: Geometry | None = None,
+    config: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    **others: nn.Module,
 ) -> None:
-    """Write the parts' weights, from any device, atomically, with configuration and provenance in the header."""
+    """Write a checkpoint, which `load` and the option `checkpoint` of all commands read, atomically.
+
+    cavin_pyro.save("mine.safetensors", model=model, guide=guide, geometry=geometry)
+
+    Args:
+        path: of the file, FILE.safetensors.
+        model, guide, geometry: whose weights, on any device, are kept, as are those of the `others`.
+        config: how the parts are built, and options to keep with them. Without a section `model`, the parts are
+            described by the arguments that they were built with.
+        provenance: where the weights come from; by default this process.
+
+    Raises:
+        UserError: a part is no `cavin_pyro.models.part.Part`, or was built with something that no file can describe.
+    """
+    stored = dict(config or {})
+    if model is not None and "model" not in stored:
+        stored |= describe(model=model, guide=guide, geometry=geometry)
+    parts = {"model": model, "guide": guide, "geometry": geometry, **others}
     tensors = {
-        f"{part}.{name}": value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        f"{_stored_name(part, module)}.{name}": value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for part, module in parts.items()
+        if module is not None
         for name, value in module.state_dict().items()
     }
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(checkpoint_bytes(tensors, config, provenance))
+    with atomic_write(Path(path)) as temporary:
+        content = checkpoint_bytes(tensors, stored, of_this_process() if provenance is None else provenance)
+        temporary.write_bytes(content)
 
 
 def checkpoint_bytes(tensors: Mapping[str, Tensor], config: Mapping[str, Any], provenance: Mapping[str, Any]) -> bytes:
     """A checkpoint's file; the header has a digest of the weights as well."""
     header = {"format": FORMAT, "version": str(FORMAT_VERSION), "sha256": tensors_digest(tensors)}
     header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
-    return save(dict(tensors), metadata=header)  # `save_file` would hide the error of a full disk
+    return safetensors.torch.save(dict(tensors), metadata=header)  # `save_file` would hide the error of a full disk
 
 
-def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
-    """Read and check a checkpoint.
+def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
+    """Read and check a checkpoint; no code of the file is run. Its parts are built when they are asked for.
+
+    trained = cavin_pyro.load("contact")
+    trained.model, trained.guide, trained.geometry, trained.config, trained.provenance
 
     Args:
+        name_or_path: a shipped one by its name, such as `cavin`, or the path of another.
         trust: a list of further modules whose classes the checkpoint may name.
 
     Raises:
@@ -97,7 +205,7 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
     """
     if isinstance(trust, str):  # a sequence too, of letters
         raise UserError(f'trust must be a list of modules, ["{trust}"] in Python, not "{trust}"')
-    path = Path(path)
+    path = find_checkpoint(name_or_path)
     header, tensors = _read(path)
     try:
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
@@ -110,10 +218,10 @@ def load_checkpoint(path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoin
     built = {section: config[section] for section in BUILT_SECTIONS if section in config}
     check_targets(built, path, trust)
     check_numbers(built, path, max((size for value in tensors.values() for size in value.shape), default=0))
-    return Checkpoint(config, provenance, tensors)
+    return Checkpoint(path, config, provenance, tensors)
 
 
-def find_checkpoint(name: str) -> Path:
+def find_checkpoint(name: str | Path) -> Path:
     """The file of a shipped checkpoint by its name, such as `cavin`, or of another by its path.
 
     Raises:
@@ -204,6 +312,10 @@ def _check_weights(tensors: Mapping[str, Tensor], digest: str | None, path: Path
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise UserError(f"checkpoint {path} is damaged: {name} holds values that are not finite")
+
+
+def _stored_name(part: str, module: nn.Module) -> str:
+    return "pointnet" if part == "geometry" and isinstance(module, PointNet) else part
 
 
 def _plain(dtype: torch.dtype) -> str:

@@ -21,7 +21,7 @@ def provenance() -> dict[str, Any]:
     return {
         "program": f"cavin_pyro {__version__}",
         "revision": _revision(),
-        "command": " ".join(["python -m", _module(), *(shlex.quote(argument) for argument in sys.argv[1:])]),
+        "command": shlex.join(["python", *_program(), *sys.argv[1:]]),
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
@@ -37,8 +37,11 @@ def program_fingerprint() -> str:
     return digest.hexdigest()[:12]
 
 
-def _module() -> str:
-    return f"cavin_pyro.{Path(sys.argv[0]).stem.removeprefix('cavin-')}"
+def _program() -> list[str]:
+    """A command, or the user's own script."""
+    script = Path(sys.argv[0])
+    ours = script.parent.name == "cavin_pyro" or script.stem.startswith("cavin-")
+    return ["-m", f"cavin_pyro.{script.stem.removeprefix('cavin-')}"] if ours else [script.name]
 
 
 def _version(name: str) -> str:

@@ -22,9 +22,9 @@ from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint, verify_checkpoint
+from cavin_pyro.storage.checkpoint import load, save, verify_checkpoint
 from cavin_pyro.storage.files import file_digest, output_folder, write_json
-from cavin_pyro.storage.geometry import check_fit, chosen_geometry, geometry_of, part_name
+from cavin_pyro.storage.geometry import check_fit, chosen_geometry
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
 from cavin_pyro.training.compatibility import check_compatibility
@@ -91,16 +91,16 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     record = {**training_provenance(data, origin, windows), **started}
     check_same_data(folder, record["data"])
     stored_config = write_config(folder, config)
-    parts = {"model": model, "guide": guide, part_name(geometry): geometry}
     path = folder / "checkpoint.safetensors"
 
-    def save(step: int, row: dict[str, float]) -> None:
-        save_checkpoint(path, parts=parts, config=stored_config, provenance={**record, "step": step, "metrics": row})
+    def keep(step: int, row: dict[str, float]) -> None:
+        about = {**record, "step": step, "metrics": row}
+        save(path, model=model, guide=guide, geometry=geometry, config=stored_config, provenance=about)
 
     trainer = configured(TrainerConfig, config.trainer, "trainer")
-    run = Trainer(model, guide, objective, windows, folder, save, trainer, seed=config.seed, mirror_signs=signs)
+    run = Trainer(model, guide, objective, windows, folder, keep, trainer, seed=config.seed, mirror_signs=signs)
     run.resume()
-    _keep_best(run, path, save)
+    _keep_best(run, path, keep)
     run.run()
     best = next(row for row in run.rows if row["step"] == run.best_step)
     write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
@@ -146,15 +146,16 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
     Raises:
         UserError: there is no such file, it holds other parts, or features of another geometry.
     """
-    path = find_checkpoint(config.initial)
-    checkpoint = load_checkpoint(path)
-    checkpoint.load_into("model", model, path)
-    checkpoint.load_into("guide", guide, path)
-    if geometry_fingerprint(geometry_of(checkpoint, path)) != geometry_fingerprint(geometry):
-        raise UserError(f"checkpoint {path} was trained with other geometric features: give its geometry= or pointnet=")
+    checkpoint = load(config.initial)
+    checkpoint.load_into("model", model)
+    checkpoint.load_into("guide", guide)
+    if geometry_fingerprint(checkpoint.geometry) != geometry_fingerprint(geometry):
+        raise UserError(
+            f"checkpoint {checkpoint.path} was trained with other geometric features: give its geometry= or pointnet="
+        )
     about = checkpoint.provenance
     kept = {name: about[name] for name in ("calibrated",) if name in about and list(config.trained) == ["dynamics"]}
-    return {**kept, "initial": {"sha256": file_digest(path), "provenance": about}}
+    return {**kept, "initial": {"sha256": file_digest(checkpoint.path), "provenance": about}}
 
 
 def train_only(names: Sequence[str], model: Model, guide: Guide) -> None:

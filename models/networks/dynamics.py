@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.networks.layers import ObjectPool, fully_connected, unit
+from cavin_pyro.models.part import Part
 from cavin_pyro.models.state import State
 
 PUSH_RANGE = 0.15  # metres, maximum displacement by one push along an axis
@@ -68,7 +69,7 @@ class StateChange(nn.Module):
         return State(centers, features, state.mask.expand(centers.shape[:-1]))
 
 
-class PushOutcome(nn.Module, ABC):
+class PushOutcome(Part, ABC):
     """Base class of f, the state after one push.
 
     Attributes:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from torch import Tensor, nn
+from torch import Tensor
+
+from cavin_pyro.models.part import Part
 
 
-class Geometry(nn.Module):
+class Geometry(Part):
     """`forward(clouds)`: `[..., P, 3]` metres from the object's centre, in any order -> unit vectors `[..., F]`.
 
     Attributes:

@@ -9,6 +9,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from cavin_pyro.models.networks.layers import fully_connected, relative_positions
+from cavin_pyro.models.part import Part
 from cavin_pyro.models.state import State
 
 
@@ -63,7 +64,7 @@ class SceneContext(nn.Module):
         return objects, self.scene(objects.sum(-2))
 
 
-class LearnedPrior(nn.Module):
+class LearnedPrior(Part):
     """Base class of learned priors.
 
     Args:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from pyro import distributions
 from pyro.distributions import TorchDistribution
-from torch import Tensor, nn
+from torch import Tensor
 
+from cavin_pyro.models.part import Part
 from cavin_pyro.models.state import State
 
 
-class StandardPrior(nn.Module):
+class StandardPrior(Part):
     """N(0, I) for every state (the paper's prior).
 
     Every prior is built with these three dimensions and called with these two arguments; learned priors use them.

@@ -26,7 +26,7 @@ from cavin_pyro.data.collection import CollectionConfig, collect
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.networks.pointnet import PointNet
-from cavin_pyro.storage.checkpoint import save_checkpoint
+from cavin_pyro.storage.checkpoint import save
 from tests.cavin_pyro.shell import ENVIRONMENT, ROOT, Answer, complaints
 
 SMALL_CHECK = [  # options that make a check of all sections a matter of seconds
@@ -132,7 +132,7 @@ def small_parts(seed: int = 0) -> dict[str, torch.nn.Module]:
     """An untrained cascade of width 8."""
     torch.manual_seed(seed)
     model = CascadedModel(effect_dimension=4, motion_dimension=4, width=8)
-    return {"model": model, "guide": CascadedGuide(model, width=8), "pointnet": PointNet()}
+    return {"model": model, "guide": CascadedGuide(model, width=8), "geometry": PointNet()}
 
 
 def small_config() -> dict[str, Any]:
@@ -165,8 +165,8 @@ def save_baseline(path: Path, name: str, **more: Any) -> None:
     config = {**small_config(), **more, "guide": {"_target_": guide, **({} if name == "dynamics" else {"width": 8})}}
     config["model"] = {**model, "segment_length": 3, "feature_dimension": 64, "width": 8, "maximum_objects": 5}
     built = build_model(config)
-    parts = {"model": built, "guide": build_guide(config, built), "pointnet": PointNet()}
-    save_checkpoint(path, parts=parts, config=config, provenance={"step": 0})
+    parts = {"model": built, "guide": build_guide(config, built), "geometry": PointNet()}
+    save(path, **parts, config=config, provenance={"step": 0})
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -222,7 +222,7 @@ def checkpoint_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint as train writes it, of an untrained and very small cascade; to be read only."""
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
-        save_checkpoint(path, parts=small_parts(), config=small_config(), provenance={"step": 0})
+        save(path, **small_parts(), config=small_config(), provenance={"step": 0})
     return path
 
 

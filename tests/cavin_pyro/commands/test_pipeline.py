@@ -15,7 +15,7 @@ import yaml
 from cavin_pyro.config.options import flat_options
 from cavin_pyro.data.dataset import read_metadata
 from cavin_pyro.evaluation.statistics import wilson
-from cavin_pyro.storage.checkpoint import load_checkpoint
+from cavin_pyro.storage.checkpoint import load
 
 # A task that nobody has seen: an L-shaped bridge.
 LAYOUT = """
@@ -76,9 +76,9 @@ def test_every_command_leaves_its_files_with_pictures_that_show_something(chain:
 
 
 def test_checkpoints_tell_their_parts_their_configuration_and_their_command(chain: SimpleNamespace) -> None:
-    features = load_checkpoint(chain.folder / "features" / "pointnet.safetensors")
+    features = load(chain.folder / "features" / "pointnet.safetensors")
     assert {name.partition(".")[0] for name in features.tensors} == {"pointnet", "decoder"}
-    trained = load_checkpoint(chain.folder / "run" / "checkpoint.safetensors")
+    trained = load(chain.folder / "run" / "checkpoint.safetensors")
     assert {name.partition(".")[0] for name in trained.tensors} == {"model", "guide", "pointnet"}
     assert trained.config == yaml.safe_load((chain.folder / "run" / "config.yaml").read_text())
     assert trained.provenance["command"] == f"python -m cavin_pyro.train {LINES['train']}"

@@ -15,7 +15,7 @@ from cavin_pyro.models.likelihoods import PredictedScales
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.outline import Outline
 from cavin_pyro.models.networks.pointnet import PointNet
-from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.checkpoint import load, save
 from cavin_pyro.storage.geometry import check_fit
 from cavin_pyro.training.run import build_objective
 
@@ -44,11 +44,11 @@ def test_presets_of_priors_and_guides_build_what_a_checkpoint_builds_again(
     config = OmegaConf.to_container(compose("train", *overrides))
     model = build_model(config)
     parts = {"model": model, "guide": build_guide(config, model)}
-    save_checkpoint(tmp_path / "a.safetensors", parts=parts, config=config, provenance={})
-    checkpoint = load_checkpoint(tmp_path / "a.safetensors")
+    save(tmp_path / "a.safetensors", **parts, config=config, provenance={})
+    checkpoint = load(tmp_path / "a.safetensors")
     again = build_model(checkpoint.config)
     for part, module in {"model": again, "guide": build_guide(checkpoint.config, again)}.items():
-        checkpoint.load_into(part, module, "a.safetensors")
+        checkpoint.load_into(part, module)
         weights = parts[part].state_dict()
         assert all(torch.equal(value, weights[name]) for name, value in module.state_dict().items())
 

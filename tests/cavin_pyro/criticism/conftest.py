@@ -169,4 +169,4 @@ def cascade(small: SimpleNamespace) -> CheckContext:
         seen = torch.ones(batch, 3, dtype=torch.bool)
         return Window(State(centers, features, mask), actions, seen, seen[:, 0].clone())
 
-    return CheckContext(model, guide, parts["pointnet"], windows(12), windows(14))
+    return CheckContext(model, guide, parts["geometry"], windows(12), windows(14))

@@ -23,13 +23,12 @@ from cavin_pyro.criticism.loading import (
     CheckContext,
     compare_data,
     load_context,
-    load_programs,
     trained_windows,
 )
 from cavin_pyro.criticism.section import Section, Verdict
 from cavin_pyro.data.dataset import content_records
 from cavin_pyro.data.windows import load_windows
-from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.checkpoint import load, save
 from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
 
 SMALL = [*SMALL_CHECK, "sizes.subgoals.scenes=2"]
@@ -40,7 +39,7 @@ def trained(small: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) ->
     """A checkpoint that tells which windows it was trained on."""
     path = tmp_path_factory.mktemp("trained") / "checkpoint.safetensors"
     config = {**small.config(), "windows": WINDOWS, "seed": 1}
-    save_checkpoint(path, parts=small.parts(), config=config, provenance={"step": 0, "command": "train <here>"})
+    save(path, **small.parts(), config=config, provenance={"step": 0, "command": "train <here>"})
     return path
 
 
@@ -92,8 +91,8 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
 ) -> None:
     context, about = load_context(check_config("windows=1000"))
     assert context.seed == 0
-    checkpoint = load_checkpoint(trained)
-    windows, segment_length, seed = trained_windows(checkpoint, trained)
+    checkpoint = load(trained)
+    windows, segment_length, seed = trained_windows(checkpoint)
     table = load_windows([pushes], context.geometry, windows, segment_length=segment_length, seed=seed)
     for name in ("training", "validation"):
         window = getattr(context, name)
@@ -124,19 +123,19 @@ def test_checkpoints_that_cannot_be_checked_are_refused_with_the_reason(small: S
     path, parts, config = tmp_path / "checkpoint", small.parts(), small.config()
 
     def saved(parts: dict[str, torch.nn.Module], config: dict[str, Any]) -> Any:
-        save_checkpoint(path, parts=parts, config=config, provenance={})
-        return load_checkpoint(path)
+        save(path, **parts, config=config, provenance={})
+        return load(path)
 
-    load_programs(saved(parts, config), path)
+    assert saved(parts, config).guide
     without_guide = {name: part for name, part in parts.items() if name != "guide"}
     unnamed = {name: part for name, part in config.items() if name != "guide"}
     for what, kept in ((without_guide, config), (parts, unnamed)):
         with pytest.raises(UserError, match="holds no guide: give one that train has written"):
-            load_programs(saved(what, kept), path)
+            assert saved(what, kept).guide
     for wrong in ({}, {"windows": WINDOWS}, {"windows": {}, "seed": 0}, {"windows": 3, "seed": 0}):
         with pytest.raises(UserError, match="does not tell which windows its training held out"):
-            trained_windows(saved(parts, {**config, **wrong}), path)
-    told = trained_windows(saved(parts, {**config, "windows": WINDOWS, "seed": 7}), path)
+            trained_windows(saved(parts, {**config, **wrong}))
+    told = trained_windows(saved(parts, {**config, "windows": WINDOWS, "seed": 7}))
     assert told == (WindowConfig(**WINDOWS, held_out_objects=[]), 3, 7)
 
 
@@ -187,15 +186,15 @@ def test_finished_sections_are_kept_and_others_run_again(counted: list[str], tmp
 def test_two_checkpoints_are_compared_on_the_windows_that_both_held_out(
     small: SimpleNamespace, pushes: Path, tmp_path: Path
 ) -> None:
-    def save(name: str, seed: int) -> None:
+    def trained(name: str, seed: int) -> None:
         config = {**small.config(), "windows": WINDOWS, "seed": seed}
-        save_checkpoint(tmp_path / name, parts=small.parts(), config=config, provenance={})
+        save(tmp_path / name, **small.parts(), config=config, provenance={})
 
     def check() -> dict[str, Any]:
         write_pair(config, ["elbo"], folder)
         return {name: json.loads((folder / name / "report.json").read_text()) for name in ("a", "b", ".")}
 
-    save("a", seed=1), save("b", seed=2)
+    trained("a", seed=1), trained("b", seed=2)
     options = [f"a={tmp_path / 'a'}", f"b={tmp_path / 'b'}", f"data={pushes}", "windows=1000", *SMALL_CHECK[1:]]
     config, folder = compose("check", *options), tmp_path / "out"
     folder.mkdir()
@@ -205,7 +204,7 @@ def test_two_checkpoints_are_compared_on_the_windows_that_both_held_out(
     assert 0 < first["a"]["about"]["windows"]["validation"] < alone["windows"]["validation"]
     assert set(first["."]["sections"]) == {"verdicts", "comparison"}
     assert first["."]["about"]["checkpoint"] == f"a: {tmp_path / 'a'}; b: {tmp_path / 'b'}"
-    save("b", seed=1)  # another training under the same path, which held out all windows of a
+    trained("b", seed=1)  # another training under the same path, which held out all windows of a
     assert check()["a"]["about"]["windows"] == alone["windows"]
     assert check_pair(config) and not check_pair(compose("check"))
     with pytest.raises(UserError, match="give both"):

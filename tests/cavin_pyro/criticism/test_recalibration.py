@@ -18,7 +18,7 @@ from torch import nn
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.guide import assess_guide
-from cavin_pyro.criticism.loading import CheckContext, load_programs
+from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.recalibration import (
     calibrate_f,
     calibrate_scales,
@@ -34,7 +34,7 @@ from cavin_pyro.models.likelihoods import PredictedScales
 from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
 from cavin_pyro.models.networks.outline import Outline
 from cavin_pyro.models.state import State, Window, stack_steps
-from cavin_pyro.storage.checkpoint import load_checkpoint
+from cavin_pyro.storage.checkpoint import load
 from cavin_pyro.storage.files import file_digest
 from cavin_pyro.training.run import train
 from tests.cavin_pyro.conftest import WINDOWS
@@ -201,7 +201,7 @@ def test_the_command_changes_the_guide_and_one_number_of_f_and_says_what_it_brou
     assert "f's scales of centres are" in done.output and "90 % regions of all codes cover" in done.output
     path = tmp_path / "out" / "checkpoint.safetensors"
     assert {one.name for one in path.parent.iterdir()} == {"calibration.json", path.name, "config.yaml"}
-    before, after = load_checkpoint(trained), load_checkpoint(path)
+    before, after = load(trained), load(path)
     changed = {name for name, value in before.tensors.items() if not value.equal(after.tensors[name])}
     assert {name for name in changed if not name.startswith("guide.")} == {"model.dynamics.head.bias"} < changed
     assert before.tensors["model.dynamics.head.bias"][:3].equal(after.tensors["model.dynamics.head.bias"][:3])
@@ -211,10 +211,10 @@ def test_the_command_changes_the_guide_and_one_number_of_f_and_says_what_it_brou
     assert record["scales"]["factor"] > 0 and record["before"]["joint"] and record["after"]["joint"]
     losses = json.loads((path.parent / "calibration.json").read_text())["losses"]
     assert [row["step"] for row in losses] == [1, 2, 3]
-    load_programs(after, path)
+    assert after.guide
     again = shell.run_command("calibrate", *line, folder=tmp_path)
     assert again.status == 0, again.errors
-    assert all(torch.equal(value, after.tensors[name]) for name, value in load_checkpoint(path).tensors.items())
+    assert all(torch.equal(value, after.tensors[name]) for name, value in load(path).tensors.items())
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,3 +195,39 @@ def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
     said = "^unknown object 'fork' in windows.held_out_objects: choose from can, mug, which are in "
     with pytest.raises(UserError, match=said):
         load_windows([tmp_path / "data"], PointNet(), WindowConfig(held_out_objects=["fork"]))
+
+
+def arrays_of_windows(W: int = 6, T: int = 2, M: int = 3) -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(0)
+    centers, features = generator.random((W, T + 1, M, 3)), generator.random((W, T + 1, M, 64))
+    return {"centers": centers, "features": features, "actions": generator.random((W, T, 4))}
+
+
+def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
+    arrays, mask = arrays_of_windows(), np.ones((6, 3, 3), dtype=bool)
+    mask[:3, :, 2] = False
+    table = WindowTable.from_arrays(**arrays, mask=mask, episodes=[7, 7, 8, 8, 9, 9], validation_fraction=0.3)
+    batch = table.batch(torch.tensor([4, 1]))
+    for name, found in (("centers", batch.states.centers), ("features", batch.states.features)):
+        np.testing.assert_allclose(found, arrays[name][[4, 1]], rtol=1e-6)
+    np.testing.assert_allclose(batch.actions, arrays["actions"][[4, 1]], rtol=1e-6)
+    assert batch.states.mask.tolist() == mask[[4, 1]].tolist()
+    assert batch.transition_mask.all() and batch.sequence_mask.all()
+    assert table.batch(torch.tensor([1])).states.objects == 2
+    held_out = set(table.episodes[table.validation].tolist())
+    assert len(held_out) == 1 and not held_out & set(table.episodes[table.training].tolist())
+    assert sorted([*table.training.tolist(), *table.validation.tolist()]) == list(range(6))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"actions": np.zeros((6, 3, 4))}, r"^centers has shape \[6, 3, 3, 3\], and must have \[6, 4, any, 3\]$"),
+        ({"mask": np.ones((6, 3))}, r"^mask has shape \[6, 3\], and must have \[6, 3, 3\]$"),
+        ({"features": np.full((6, 3, 3, 64), np.nan)}, "^features has numbers that are not finite"),
+        ({"episodes": [1] * 6}, "^windows of 1 episodes"),
+    ],
+)
+def test_arrays_that_are_no_windows_are_refused_in_one_line(wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        WindowTable.from_arrays(**{**arrays_of_windows(), **wrong})

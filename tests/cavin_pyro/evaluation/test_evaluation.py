@@ -26,7 +26,7 @@ from cavin_pyro.evaluation.rollout import (
 )
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import CavinPlanner, Plan, RandomPlanner
-from cavin_pyro.storage.checkpoint import save_checkpoint
+from cavin_pyro.storage.checkpoint import save
 
 
 @pytest.fixture
@@ -241,7 +241,7 @@ def test_a_checkpoint_runs_with_more_objects_than_it_was_trained_with_and_says_s
     config = small.config()
     config["model"]["maximum_objects"] = 3
     path = tmp_path / "three.safetensors"
-    save_checkpoint(path, parts=small.parts(), config=config, provenance={})
+    save(path, **small.parts(), config=config, provenance={})
     for objects, lines in ((3, 0), (8, 1)):
         options = configure(*fast(f"checkpoint={path}", f"objects={objects}", "maximum_steps=1"))
         announce_objects(options)

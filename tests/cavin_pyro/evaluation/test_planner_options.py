@@ -18,7 +18,7 @@ from cavin_pyro.evaluation.rollout import OUTCOMES, rollout
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.optimizers import OPTIMIZERS
-from cavin_pyro.storage.checkpoint import save_checkpoint
+from cavin_pyro.storage.checkpoint import save
 from cavin_pyro.visualization.plan import draw_plan
 
 FITTING = {
@@ -47,8 +47,8 @@ def save_untrained(path: Path, *further: str) -> Path:
     composed = compose("train", "guide=none", "model.width=8", *further)
     config = {part: OmegaConf.to_container(composed[part], resolve=True) for part in ("model", "prior", "scales")}
     with torch.random.fork_rng(), pyro.settings.context(module_local_params=True):
-        parts = {"model": building.build_model(config), "pointnet": PointNet()}
-        save_checkpoint(path, parts=parts, config=config, provenance={"step": 0})
+        parts = {"model": building.build_model(config), "geometry": PointNet()}
+        save(path, **parts, config=config, provenance={"step": 0})
     return path
 
 

@@ -5,18 +5,25 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch import nn
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.parts import build_guide, build_model
+from cavin_pyro.config.parts import build_model
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.likelihoods import PredictedScales
+from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
+from cavin_pyro.models.networks.outline import Outline
 from cavin_pyro.models.networks.pointnet import PointNet
-from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
-from cavin_pyro.storage.geometry import load_pointnet
+from cavin_pyro.models.priors.conditional import ConditionalPrior
+from cavin_pyro.models.priors.mixture import ObjectMixturePrior
+from cavin_pyro.storage.checkpoint import load, save
 
 
 def test_weights_configuration_and_provenance_survive_a_round_trip(small: SimpleNamespace, tmp_path: Path) -> None:
     parts, path = small.parts(), tmp_path / "a.safetensors"
-    save_checkpoint(path, parts=parts, config=small.config(), provenance={"step": 7, "date": "today"})
-    checkpoint = load_checkpoint(path)
+    save(path, **parts, config=small.config(), provenance={"step": 7, "date": "today"})
+    checkpoint = load(path)
     assert checkpoint.config == small.config()
     assert checkpoint.provenance == {"step": 7, "date": "today"}
     assert list(tmp_path.iterdir()) == [path]
@@ -24,37 +31,67 @@ def test_weights_configuration_and_provenance_survive_a_round_trip(small: Simple
     for name, part in others.items():
         before = part.state_dict()
         assert any(not torch.equal(before[key], value) for key, value in parts[name].state_dict().items())
-        checkpoint.load_into(name, part, path)
+        checkpoint.load_into(name, part)
         for key, value in parts[name].state_dict().items():
             assert torch.equal(part.state_dict()[key], value)
 
 
 def test_a_checkpoint_alone_is_enough_to_build_its_parts(small: SimpleNamespace, checkpoint_file: Path) -> None:
-    checkpoint = load_checkpoint(checkpoint_file)
-    model = build_model(checkpoint.config)
-    checkpoint.load_into("model", model, checkpoint_file)
-    checkpoint.load_into("guide", build_guide(checkpoint.config, model), checkpoint_file)
-    expected = small.parts()["model"].state_dict()
-    assert model.state_dict().keys() == expected.keys()
-    assert all(torch.equal(value, expected[name]) for name, value in model.state_dict().items())
-    pointnet = load_pointnet(checkpoint_file)
-    assert not pointnet.training
-    assert not any(parameter.requires_grad for parameter in pointnet.parameters())
+    checkpoint = load(checkpoint_file)
+    assert checkpoint.guide.model is checkpoint.model
+    for name, part in small.parts().items():
+        found, expected = getattr(checkpoint, name), part.state_dict()
+        assert found.state_dict().keys() == expected.keys()
+        assert all(torch.equal(value, expected[key]) for key, value in found.state_dict().items())
+        assert not found.training and not any(parameter.requires_grad for parameter in found.parameters())
+
+
+def test_a_model_built_in_python_needs_no_configuration(tmp_path: Path) -> None:
+    path, sizes = tmp_path / "mine.safetensors", {"dimension": 4, "width": 8}
+    model = CascadedModel(
+        effect_dimension=4,
+        motion_dimension=4,
+        width=8,
+        effect_prior=ObjectMixturePrior(**sizes, components=2),
+        motion_prior=ConditionalPrior(**sizes, effect_dimension=4),
+        scales=PredictedScales(height_ratio=0.4),
+        dynamics=ContactDynamics(object_width=8, pair_width=8, shape_width=8),
+    )
+    guide = CascadedGuide(model, width=8, motion_reads_effect=False)
+    save(path, model=model, guide=guide, geometry=Outline())
+    again = load(path)
+    assert type(again.model.prior_of_effects) is ObjectMixturePrior and again.model.scales == model.scales
+    for part, found in ((model, again.model), (guide, again.guide)):
+        assert all(torch.equal(value, found.state_dict()[name]) for name, value in part.state_dict().items())
+    assert type(again.geometry) is Outline and again.provenance["program"].startswith("cavin_pyro")
+
+
+def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: Path) -> None:
+    class Own(CascadedModel):
+        """No other program can import it."""
+
+    for model, said in (
+        (CascadedModel(effect_prior=nn.Identity()), r"^model\.effect_prior is a Identity, .*Part"),
+        (Own(), "^model is of class .*Own, which no other program can import: move it into a module"),
+    ):
+        with pytest.raises(UserError, match=said):
+            save(tmp_path / "a.safetensors", model=model)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_write_that_fails_leaves_the_earlier_checkpoint(
     small: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.safetensors"
-    save_checkpoint(path, parts=small.parts(), config={}, provenance={"step": 1})
+    save(path, **small.parts(), config={}, provenance={"step": 1})
 
     def refuse(path: Path, content: bytes) -> int:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", refuse)
     with pytest.raises(OSError, match="No space left"):
-        save_checkpoint(path, parts=small.parts(), config={}, provenance={"step": 2})
-    assert load_checkpoint(path).provenance == {"step": 1}
+        save(path, **small.parts(), config={}, provenance={"step": 2})
+    assert load(path).provenance == {"step": 1}
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -63,15 +100,15 @@ def test_a_checkpoint_cut_short_is_refused(length: int, checkpoint_file: Path, t
     path = tmp_path / "cut.safetensors"
     path.write_bytes(checkpoint_file.read_bytes()[:length])
     with pytest.raises(UserError, match=r"cut\.safetensors is truncated or no safetensors file"):
-        load_checkpoint(path)
+        load(path)
 
 
 def test_weights_of_another_architecture_are_named(small: SimpleNamespace, checkpoint_file: Path) -> None:
-    checkpoint, config = load_checkpoint(checkpoint_file), small.config()
+    checkpoint, config = load(checkpoint_file), small.config()
     config["model"]["width"] = 16
     with pytest.raises(UserError, match=r"model\.\S+ has shape \[.*\] in the file and \[.*\] in CascadedModel"):
-        checkpoint.load_into("model", build_model(config), checkpoint_file)
+        checkpoint.load_into("model", build_model(config))
     with pytest.raises(UserError, match="in the file and None in PointNet"):
-        checkpoint.load_into("model", PointNet(), checkpoint_file)
+        checkpoint.load_into("model", PointNet())
     with pytest.raises(UserError, match="has shape None in the file"):
-        checkpoint.load_into("decoder", PointNet(), checkpoint_file)
+        checkpoint.load_into("decoder", PointNet())

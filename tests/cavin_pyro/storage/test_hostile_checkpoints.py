@@ -21,10 +21,9 @@ from torch import Tensor
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.storage import checkpoint as storage
-from cavin_pyro.storage.checkpoint import load_checkpoint
+from cavin_pyro.storage.checkpoint import load
 from cavin_pyro.storage.digests import MANIFEST
 from cavin_pyro.storage.files import file_digest
-from cavin_pyro.storage.geometry import load_pointnet
 
 Rewrite = Callable[[dict[str, Any]], Path]
 MODULE = """
@@ -62,7 +61,7 @@ def test_classes_by_the_names_that_they_had_before_are_found(small: SimpleNamesp
     config = small.config()
     before = json.dumps(config).replace("cavin_pyro.models.", "models.").replace("cavin_pyro.guides.", "guides.")
     assert '"models.' in before
-    assert load_checkpoint(rewritten(json.loads(before))).config == config
+    assert load(rewritten(json.loads(before))).config == config
 
 
 @pytest.mark.parametrize(
@@ -82,13 +81,13 @@ def test_a_checkpoint_may_name_classes_of_this_program_only(
     target: str, small: SimpleNamespace, rewritten: Rewrite
 ) -> None:
     never_built = {**small.config(), "objective": {"_target_": target}}
-    assert load_checkpoint(rewritten(never_built)).config == never_built
+    assert load(rewritten(never_built)).config == never_built
     for section in ("model", "prior", "guide"):
         for where in ({"_target_": target}, {"scales": {"_target_": target}}, {"list": [{"_target_": target}]}):
             config = small.config()
             config[section] |= where
             with pytest.raises(UserError, match=r"asks to run .*, which is not part of this program"):
-                load_checkpoint(rewritten(config))
+                load(rewritten(config))
 
 
 def test_a_trusted_package_is_trusted_for_its_own_classes_and_not_for_what_it_imports(
@@ -102,16 +101,16 @@ def test_a_trusted_package_is_trusted_for_its_own_classes_and_not_for_what_it_im
     )
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(UserError, match=r"pass 'trust=\[my_parts\]'"):
-        load_checkpoint(naming("my_parts.Own"))
+        load(naming("my_parts.Own"))
     assert "my_parts" not in sys.modules  # not even imported
     with pytest.raises(UserError, match=r'^trust must be a list of modules, \["my_parts"\] in Python, not'):
-        load_checkpoint(naming("my_parts.Own"), trust="my_parts")
+        load(naming("my_parts.Own"), trust="my_parts")
     for name in ("Own", "Inner", "inner.Inner"):
-        model = build_model(load_checkpoint(naming(f"my_parts.{name}"), trust=["my_parts"]).config)
+        model = build_model(load(naming(f"my_parts.{name}"), trust=["my_parts"]).config)
         assert type(model.prior_of_effects).__name__ == name.rpartition(".")[2]
     for name in ("torch.load", "torch.nn.Linear", "function", "Gone"):
         with pytest.raises(UserError, match=r"trust=\[my_parts\] allows the classes that are defined there") as refused:
-            load_checkpoint(naming(f"my_parts.{name}"), trust=["my_parts"])
+            load(naming(f"my_parts.{name}"), trust=["my_parts"])
         assert f"my_parts.{name} is none of them" in str(refused.value)
 
 
@@ -137,7 +136,7 @@ def test_a_stored_configuration_that_could_do_harm_is_refused_before_anything_is
     config = small.config()
     config[section][name] = value
     with pytest.raises(UserError, match=said):
-        load_checkpoint(rewritten(config))
+        load(rewritten(config))
 
 
 def with_nan(tensors: dict[str, Tensor]) -> None:
@@ -165,12 +164,12 @@ def test_changed_weights_are_refused(small: SimpleNamespace, checkpoint_file: Pa
     (tmp_path / "flipped.safetensors").write_bytes(content)
     for path in (tmp_path / "flipped.safetensors", spoilt(checkpoint_file, tmp_path, integers, keep_digest=True)):
         with pytest.raises(UserError, match="its weights are not those that were saved"):
-            load_checkpoint(path)
+            load(path)
     with pytest.raises(UserError, match="holds values that are not finite"):
-        load_checkpoint(spoilt(checkpoint_file, tmp_path, with_nan, keep_digest=False))
+        load(spoilt(checkpoint_file, tmp_path, with_nan, keep_digest=False))
     path = spoilt(checkpoint_file, tmp_path, integers, keep_digest=False)
     with pytest.raises(UserError, match=r"model\.\S+ holds int32, not float32"):
-        load_checkpoint(path).load_into("model", small.parts()["model"], path)
+        load(path).load_into("model", small.parts()["model"])
 
 
 def test_a_shipped_checkpoint_that_was_replaced_is_refused(
@@ -180,11 +179,11 @@ def test_a_shipped_checkpoint_that_was_replaced_is_refused(
     path = tmp_path / "cavin.safetensors"
     path.write_bytes(checkpoint_file.read_bytes())
     (tmp_path / MANIFEST).write_text(f"{file_digest(path)}  cavin.safetensors\n")
-    replaced = rewritten(load_checkpoint(path).config)  # a good checkpoint, of another name
-    load_checkpoint(replaced)
+    replaced = rewritten(load(path).config)  # a good checkpoint, of another name
+    load(replaced)
     replaced.rename(path)
     with pytest.raises(UserError, match=f"is not the one that was shipped: its SHA-256 .*{MANIFEST}"):
-        load_checkpoint(path)
+        load(path)
 
 
 SPITEFUL = [None, -1, 0, 1e30, 10**9, 10**30, "", "x", "${a}", [], {}, [[]], {"_target_": "os.system"}, True]
@@ -200,10 +199,10 @@ def test_a_spiteful_value_in_the_configuration_gives_one_line_or_a_model(
         section = sampled.choice(["model", "guide", "prior", "scales"])
         config[section][sampled.choice([*config[section], "more"])] = sampled.choice(SPITEFUL)
         try:
-            checkpoint = load_checkpoint(rewritten(config))
+            checkpoint = load(rewritten(config))
             model = build_model(checkpoint.config)
-            checkpoint.load_into("model", model, "it")
-            checkpoint.load_into("guide", build_guide(checkpoint.config, model), "it")
+            checkpoint.load_into("model", model)
+            checkpoint.load_into("guide", build_guide(checkpoint.config, model))
         except UserError as error:
             assert "\n" not in str(error)
 
@@ -211,15 +210,15 @@ def test_a_spiteful_value_in_the_configuration_gives_one_line_or_a_model(
 def test_a_fuzzed_header_gives_one_line_or_the_same_weights(checkpoint_file: Path, tmp_path: Path) -> None:
     sampled, content, path = random.Random(0), checkpoint_file.read_bytes(), tmp_path / "fuzzed.safetensors"
     size = 8 + int.from_bytes(content[:8], "little")
-    good = load_checkpoint(checkpoint_file).tensors
+    good = load(checkpoint_file).tensors
     for _ in range(80):
         fuzzed = bytearray(content)
         for _ in range(sampled.randint(1, 4)):
             fuzzed[sampled.randrange(size)] = sampled.choice(b'0123456789{}[]",:\x00\xffabc')
         path.write_bytes(fuzzed)
         try:
-            tensors = load_checkpoint(path).tensors
-            load_pointnet(path)
+            tensors = load(path).tensors
+            assert load(path).pointnet
         except UserError as error:
             assert "\n" not in str(error)
         else:

@@ -6,7 +6,6 @@ import datetime
 import json
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,9 +15,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cavin_pyro import __version__
+from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.storage.checkpoint import save_checkpoint
-from cavin_pyro.storage.geometry import pointnet_provenance
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.storage.checkpoint import save
+from cavin_pyro.storage.geometry import chosen_geometry
 from cavin_pyro.storage.progress import ScalarLog
 from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
@@ -108,13 +109,15 @@ def test_provenance_names_command_versions_and_time(monkeypatch: pytest.MonkeyPa
     assert datetime.timedelta(seconds=-2) < age < datetime.timedelta(minutes=1)
     monkeypatch.setattr(sys, "argv", ["/usr/bin/cavin-plan"])
     assert provenance()["command"] == "python -m cavin_pyro.plan"
+    monkeypatch.setattr(sys, "argv", ["/somewhere/study.py", "3"])
+    assert provenance()["command"] == "python study.py 3"
 
 
-def test_a_pointnet_out_of_a_whole_checkpoint_keeps_its_own_record(small: SimpleNamespace, tmp_path: Path) -> None:
-    parts, path = {"pointnet": small.parts()["pointnet"]}, tmp_path / "pointnet.safetensors"
+def test_a_pointnet_out_of_a_whole_checkpoint_keeps_its_own_record(tmp_path: Path) -> None:
+    path = tmp_path / "pointnet.safetensors"
     for record in ({"command": "pretrain"}, {"command": "train", "pointnet": {"command": "pretrain"}}):
-        save_checkpoint(path, parts=parts, config={}, provenance=record)
-        assert pointnet_provenance(path) == {"pointnet": {"command": "pretrain"}}
+        save(path, geometry=PointNet(), config={}, provenance=record)
+        assert chosen_geometry(compose("train", f"pointnet={path}"))[1] == {"pointnet": {"command": "pretrain"}}
 
 
 def test_scalars_are_on_disk_at_once_and_a_resumed_run_replaces_those_that_were_lost(tmp_path: Path) -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from cavin_pyro.config.parts import build_guide, build_model
-from cavin_pyro.storage.checkpoint import default_checkpoint, load_checkpoint, shipped_folder
+from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.storage.checkpoint import default_checkpoint, load, shipped_folder
 from cavin_pyro.storage.digests import read_manifest, tensors_digest
 from cavin_pyro.storage.files import file_digest
-from cavin_pyro.storage.geometry import geometry_of, part_name
 
 SHIPPED = sorted(default_checkpoint().parent.glob("*.safetensors"))
 WEIGHTS = "8c3a642176f2c88dad9c37537a502455bfcc995c25ab1d64a3668d25c1d314e4"  # of all their digests and names
@@ -21,19 +20,17 @@ def test_every_shipped_checkpoint_is_in_the_manifest_and_keeps_its_weights() -> 
     files = {path.relative_to(shipped_folder()).as_posix(): path for path in shipped_folder().rglob("*.safetensors")}
     assert len(files) == 22
     assert read_manifest(shipped_folder()) == {name: file_digest(path) for name, path in files.items()}
-    digests = [f"{tensors_digest(load_checkpoint(path).tensors)}  {name}\n" for name, path in sorted(files.items())]
+    digests = [f"{tensors_digest(load(path).tensors)}  {name}\n" for name, path in sorted(files.items())]
     assert hashlib.sha256("".join(digests).encode()).hexdigest() == WEIGHTS
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_a_shipped_checkpoint_builds_with_its_own_configuration_and_holds_its_provenance(path: Path) -> None:
     assert path.stat().st_size <= 3_000_000
-    checkpoint = load_checkpoint(path)
-    model = build_model(checkpoint.config)
-    checkpoint.load_into("model", model, path)
-    checkpoint.load_into("guide", build_guide(checkpoint.config, model), path)
-    geometry, provenance = geometry_of(checkpoint, path), checkpoint.provenance
-    assert not any(parameter.requires_grad for parameter in geometry.parameters())
+    checkpoint = load(path)
+    provenance = checkpoint.provenance
+    for part in (checkpoint.model, checkpoint.guide, checkpoint.geometry):
+        assert not any(parameter.requires_grad for parameter in part.parameters())
     assert sum(data["transitions"] for data in provenance["data"]) >= 100_000
     assert {"command", "date", "packages", "revision", "step", "metrics"} <= set(provenance)
-    assert ("pointnet" in provenance) == (part_name(geometry) == "pointnet")  # which alone is trained before
+    assert ("pointnet" in provenance) == isinstance(checkpoint.geometry, PointNet)  # which alone is trained before

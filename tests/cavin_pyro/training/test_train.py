@@ -10,7 +10,6 @@ import torch
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.loading import load_programs
 from cavin_pyro.envs.sensors.camera import Camera
 from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.factory import make_runner
@@ -19,9 +18,8 @@ from cavin_pyro.models.networks.contact.geometry import REACH, endpoints
 from cavin_pyro.models.networks.outline import Outline
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.models.state import State, Window
-from cavin_pyro.storage.checkpoint import checkpoint_bytes, load_checkpoint
+from cavin_pyro.storage.checkpoint import checkpoint_bytes, load
 from cavin_pyro.storage.files import file_digest
-from cavin_pyro.storage.geometry import geometry_of
 from cavin_pyro.training.run import train
 from cavin_pyro.training.trainer import Trainer, reflect
 
@@ -46,27 +44,25 @@ def run(home: Path, name: str, *options: str) -> Trainer:
 
 def test_what_is_trained_is_what_plans(folder: Path) -> None:
     path = folder / "first" / "checkpoint.safetensors"
-    assert isinstance(geometry_of(load_checkpoint(path), path), Outline)
+    assert isinstance(load(path).geometry, Outline)
     small = ("planner=paper", "planner.samples=8", "planner.horizon=6", "maximum_steps=1", "objects=2")
     runner = make_runner(compose("evaluate", f"checkpoint={path}", *small))
     model = runner.planner.model
     assert isinstance(model.dynamics, ContactDynamics)
-    assert torch.equal(model.dynamics.head.weight, load_checkpoint(path).tensors["model.dynamics.head.weight"])
+    assert torch.equal(model.dynamics.head.weight, load(path).tensors["model.dynamics.head.weight"])
     assert runner.rollout(0).outcome in ("timeout", "success", "violation", "fall")
     runner.env.close()
 
 
 def test_parts_that_are_not_trained_stay_bit_for_bit(folder: Path) -> None:
     """What a calibration has found stays true where f alone is trained."""
-    first = load_checkpoint(folder / "first" / "checkpoint.safetensors")
+    first = load(folder / "first" / "checkpoint.safetensors")
     calibrated = folder / "calibrated.safetensors"
     records = {**first.provenance, "calibrated": [{"steps": 3}]}
     calibrated.write_bytes(checkpoint_bytes(first.tensors, first.config, records))
     more = (*CONTACT, "guide.width=8", f"initial={calibrated}", "objective=rollout", "trainer.reflect=true")
     for trained, part in (("[dynamics]", "dynamics"), ("[]", None)):
-        after = load_checkpoint(
-            run(folder, f"of-{part}", f"trained={trained}", *more).folder / "checkpoint.safetensors"
-        )
+        after = load(run(folder, f"of-{part}", f"trained={trained}", *more).folder / "checkpoint.safetensors")
         changed = {name.split(".")[1] for name, value in first.tensors.items() if not value.equal(after.tensors[name])}
         assert changed == {"dynamics"} if part else len(changed) > 3
         assert after.provenance.get("calibrated") == ([{"steps": 3}] if part else None)
@@ -114,7 +110,7 @@ def test_an_automatic_guide_learns_its_windows_resumes_and_says_what_it_is(
     # The classes that the checkpoint names are known, and check says why it cannot use them.
     path = whole.folder / "checkpoint.safetensors"
     with pytest.raises(UserError, match="parameters for windows of its training alone: .* cascaded, flow, joint"):
-        load_programs(load_checkpoint(path), path)
+        assert load(path).guide
 
 
 MIRROR = torch.tensor([1.0, -1.0, 1.0])

@@ -21,7 +21,7 @@ from cavin_pyro.config.commands import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.models.state import State
-from cavin_pyro.storage.checkpoint import load_checkpoint, save_checkpoint
+from cavin_pyro.storage.checkpoint import load, save
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.training import trainer as trainer_module
 from cavin_pyro.training.elbo import elbo_terms
@@ -49,12 +49,10 @@ def windows(episodes: int = 10, positions: int = 6) -> WindowTable:
     features = functional.normalize(torch.randn(count, 5, 64, generator=generator), dim=-1)
     states = State(start, features, torch.ones(count, 5, dtype=torch.bool))
     actions = 2 * torch.rand(count, 4, generator=generator) - 1
-    table = WindowTable(states, actions, torch.ones(count, dtype=torch.bool))
     starts = [episode * positions + step for episode in range(episodes) for step in range(positions - 3)]
-    table.starts = torch.tensor(starts)
-    table.sequence_mask = torch.ones(len(starts), dtype=torch.bool)
-    table.training, table.validation = torch.arange(len(starts)).split([len(starts) - 9, 9])
-    return table
+    index = torch.arange(len(starts))
+    windows = {"starts": torch.tensor(starts), "sequence_mask": index >= 0, "held_out": index >= len(starts) - 9}
+    return WindowTable(states, actions, torch.ones(count, dtype=torch.bool), **windows, episodes=index)
 
 
 def trainer(
@@ -68,14 +66,14 @@ def trainer(
     """A trainer of a small cascade; the hook is called after each checkpoint."""
     parts = small.parts()
 
-    def save(step: int, row: Row) -> None:
-        save_checkpoint(folder / "checkpoint.safetensors", parts=parts, config={}, provenance={"step": step})
+    def keep(step: int, row: Row) -> None:
+        save(folder / "checkpoint.safetensors", **parts, config={}, provenance={"step": step})
         if hook is not None:
             hook(run, step)
 
     folder.mkdir(exist_ok=True)
     programs = (parts["model"], parts["guide"], objective or Objective(Trace_ELBO()))
-    run = Trainer(*programs, windows(), folder, save, config, seed=seed)
+    run = Trainer(*programs, windows(), folder, keep, config, seed=seed)
     return run
 
 
@@ -116,7 +114,7 @@ def test_training_lowers_the_loss_and_reports_every_term(small: SimpleNamespace,
     assert {"step", "training_loss", "validation_loss", "learning_rate", "windows_per_second", *terms} == set(names)
     assert read_rows(tmp_path / "run" / "metrics.csv") == run.rows
     assert list((tmp_path / "run" / "tensorboard").iterdir())
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").provenance == {"step": run.best_step}
+    assert load(tmp_path / "run" / "checkpoint.safetensors").provenance == {"step": run.best_step}
     assert not pyro.get_param_store().keys()
 
 
@@ -264,7 +262,7 @@ def test_a_nan_stops_training_with_its_term_and_the_last_good_checkpoint_stays(
         run.run()
     assert f"the term {term} is not finite; the best checkpoint, of step 4, stays" in str(caught.value)
     assert "\n" not in str(caught.value)
-    checkpoint = load_checkpoint(tmp_path / "run" / "checkpoint.safetensors")
+    checkpoint = load(tmp_path / "run" / "checkpoint.safetensors")
     assert checkpoint.provenance == {"step": 4}
     assert all(bool(value.isfinite().all()) for value in checkpoint.tensors.values())
 

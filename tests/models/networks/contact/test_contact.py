@@ -31,7 +31,7 @@ from cavin_pyro.models.networks.contact.rows import Rows
 from cavin_pyro.models.networks.layers import fixed_shapes
 from cavin_pyro.models.networks.outline import DIRECTIONS, PER_OUTLINE, Outline, mean_extent
 from cavin_pyro.models.state import State
-from cavin_pyro.storage.checkpoint import find_checkpoint, load_checkpoint
+from cavin_pyro.storage.checkpoint import load
 from tests.models.networks.contact import by_hand
 
 MARGIN = 0.01
@@ -69,7 +69,7 @@ def untrained(size: float = 0.5, **options: Any) -> ContactDynamics:
 def shipped(margin: float | None = None) -> ContactDynamics:
     """f of `checkpoint=contact`, by default with all objects within reach."""
     part, f = "model.dynamics.", ContactDynamics(reach_margin=margin)
-    tensors = load_checkpoint(find_checkpoint("contact")).tensors
+    tensors = load("contact").tensors
     weights = {name[len(part) :]: value for name, value in tensors.items() if name.startswith(part)}
     still = weights.pop("still_scale")
     f.load_state_dict(weights if margin is None else {**weights, "still_scale": still})

@@ -1,0 +1,21 @@
+"""What models, guides and their parts have in common: a checkpoint can tell how to build them again."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from torch import nn
+
+Self = TypeVar("Self", bound="Part")
+
+
+class Part(nn.Module):
+    """A module that keeps the arguments it was built with, `by_position` and `by_keyword`."""
+
+    by_position: tuple[Any, ...]
+    by_keyword: dict[str, Any]
+
+    def __new__(cls: type[Self], *by_position: Any, **by_keyword: Any) -> Self:
+        made = super().__new__(cls)
+        vars(made).update(by_position=by_position, by_keyword=by_keyword)  # modules among them are not registered
+        return made
