@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from pyro import poutine
-from torch import Tensor, nn
+from torch import nn
 
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
@@ -52,7 +52,7 @@ class AutomaticGuide(Guide):
             self.automatic(window)
         self.fixed_actions = window.actions.clone()
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> Any:
+    def forward(self, window: Window) -> Any:
         """`window: [B]`, those of the first call. Raises `ValueError` for others."""
         if self.fixed_actions is None:
             self.fix(window)

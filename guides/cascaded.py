@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pyro
-from torch import Tensor
 
 from cavin_pyro.guides.guide import EffectInference, Guide, MotionInference
 from cavin_pyro.models.cascaded import CascadedModel
@@ -40,10 +39,10 @@ class CascadedGuide(Guide):
         self.effect_inference = EffectInference(model, width=width, reads_actions=effect_reads_actions)
         self.motion_inference = MotionInference(model, width=width, reads_effect=motion_reads_effect)
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. The codes are inferred from the window, also if the model then generates."""
+    def forward(self, window: Window) -> None:
+        """`window: [B]`."""
         first, last = window.first, window.last
-        encoded = self.model.encode(window, generate) if encoded is None else encoded
+        encoded = self.model.encode(window)
 
         with windows_plate(window), sequence_mask(window):
             effect_code = pyro.sample("effect_code", self.effect_inference(first, last, window.actions))

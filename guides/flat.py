@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pyro
-from torch import Tensor
 
 from cavin_pyro.guides.guide import Guide, MotionInference
 from cavin_pyro.models.flat import FlatModel
@@ -24,8 +23,8 @@ class FlatGuide(Guide):
         super().__init__(model)
         self.motion_inference = MotionInference(model, width=width, reads_effect=False)
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. The code is inferred from the window, also if the model then generates."""
-        encoded = self.model.encode(window, generate) if encoded is None else encoded
+    def forward(self, window: Window) -> None:
+        """`window: [B]`."""
+        encoded = self.model.encode(window)
         with windows_plate(window), sequence_mask(window):
             pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first.mask, window.actions))

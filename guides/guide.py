@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pyro.distributions import TorchDistribution
@@ -17,14 +17,14 @@ from cavin_pyro.models.networks.layers import (
     fully_connected,
     relative_positions,
 )
-from cavin_pyro.models.state import State
+from cavin_pyro.models.state import State, Window
 
 
 class Guide(Program):
     """A guide for the models in `fits`, by their `name`.
 
-    A guide's `forward(window, generate=False, encoded=None)` has a `pyro.sample` for every code of the model and no
-    others. `encoded` is the result of `model.encode(window, generate)`, which `forward` computes if it is None.
+    A guide's `forward(window)` has a `pyro.sample` for every code of the model and no others. It reads the same state
+    features as the model, `model.encode(window)`, which training computes once for both.
 
     Args:
         model: whose codes the guide infers, and whose other dimensions it has.
@@ -43,6 +43,12 @@ class Guide(Program):
             )
         # In a tuple, so that the model's parameters are not registered (and saved) in the guide as well.
         self._model = (model,)
+
+    def __call__(self, window: Window) -> Any:
+        """Infer the codes of whole windows. Raises `ValueError` for initial ones."""
+        if not window.whole:
+            raise ValueError("a guide infers from whole windows: Predictive(model.generate, guide=guide)(window)")
+        return super().__call__(window)
 
     @property
     def model(self) -> Model:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from torch import Tensor
-
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.state import Window
 
@@ -13,5 +11,5 @@ class NoGuide(Guide):
 
     fits = ("dynamics",)
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
+    def forward(self, window: Window) -> None:
         """No site."""

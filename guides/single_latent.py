@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pyro
-from torch import Tensor
 
 from cavin_pyro.guides.guide import EffectInference, Guide
 from cavin_pyro.models.model import sequence_mask, windows_plate
@@ -31,7 +30,7 @@ class SingleLatentGuide(Guide):
         super().__init__(model)
         self.effect_inference = EffectInference(model, width=width, reads_actions=reads_actions)
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """`window: [B]`. The code is inferred from the window, also if the model then generates."""
+    def forward(self, window: Window) -> None:
+        """`window: [B]`."""
         with windows_plate(window), sequence_mask(window):
             pyro.sample("effect_code", self.effect_inference(window.first, window.last, window.actions))

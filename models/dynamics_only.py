@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import pyro
 
 from cavin_pyro.models.model import Model, windows_plate
 from cavin_pyro.models.state import Window
@@ -19,13 +19,11 @@ class DynamicsModel(Model):
     name = "dynamics"
     codes = ()
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """Run the process for `window: [B]`, a batch of training examples.
-
-        With `generate=True` it reads only the first states and the actions, and samples the next states. `encoded` is
-        the result of `encode`.
-        Raises `ValueError` for windows of another shape or features of another length.
-        """
-        encoded = self.encode(window, generate) if encoded is None else encoded
+    def forward(self, window: Window) -> None:
+        """Run the process for `window: [B]`, see `Model`."""
+        encoded = self.encode(window)
         with windows_plate(window):
-            self.sample_transitions(window, encoded, window.actions, generate)
+            for step in self.transitions(window, encoded, window.actions):
+                centers = pyro.sample(f"next_centers{step.suffix}", step.centers, obs=step.observed_centers)
+                features = pyro.sample(f"next_features{step.suffix}", step.features, obs=step.observed_features)
+                step.sampled = (centers, features)

@@ -50,24 +50,21 @@ class FlatModel(Model):
         )
         self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """Run the process for `window: [B]`, a batch of training examples.
-
-        With `generate=True` it reads only the first states and samples everything else. `encoded` is the result of
-        `encode`. Raises `ValueError` for windows of another shape or features of another length.
-        """
-        encoded = self.encode(window, generate) if encoded is None else encoded
-        first = window.first
+    def forward(self, window: Window) -> None:
+        """Run the process for `window: [B]`, see `Model`."""
+        encoded, first = self.encode(window), window.first
 
         with windows_plate(window):
             with sequence_mask(window):
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first))
 
                 mean = self.action_generator(self.trunk(encoded[:, 0]), first.mask, motion_code)
-                observed = None if generate else window.actions
-                actions = pyro.sample("actions", self.scales.actions(mean), obs=observed)
+                actions = pyro.sample("actions", self.scales.actions(mean), obs=window.observed(window.actions))
 
-            self.sample_transitions(window, encoded, actions, generate)
+            for step in self.transitions(window, encoded, actions):
+                centers = pyro.sample(f"next_centers{step.suffix}", step.centers, obs=step.observed_centers)
+                features = pyro.sample(f"next_features{step.suffix}", step.features, obs=step.observed_features)
+                step.sampled = (centers, features)
 
     def motion_prior(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
         """p(z | s): `state: [...]` -> batch `[...]`, event `[Z]`; the effect code is ignored."""

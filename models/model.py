@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pyro
-import torch
 from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor
@@ -16,7 +16,7 @@ from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Sca
 from cavin_pyro.models.networks.dynamics import Dynamics, PushOutcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes, unit
 from cavin_pyro.models.part import Part
-from cavin_pyro.models.state import State, Window, stack_steps
+from cavin_pyro.models.state import State, Window
 
 
 class Program(Part):
@@ -36,9 +36,9 @@ class Program(Part):
 class Model(Program):
     """A process that generates windows of experience, with the dynamics f as its last line.
 
-    A model's `forward(window, generate=False, encoded=None)` runs its process for `window: [B]`. With `generate=True`
-    it reads only the first states (and the actions, if it generates none) and samples everything else. `encoded` is the
-    result of `encode(window, generate)`: a caller that runs guide and model encodes once and passes it to both.
+    A model's `forward(window)` runs its process for `window: [B]`, a batch of training examples. Of `window.initial` it
+    reads only the first states (and the actions, if it generates none) and samples everything else. It raises
+    `ValueError` for windows of another shape or features of another length.
 
     `codes` declares a model's latent sites, and so the methods that a planner can call, with these keywords:
 
@@ -90,6 +90,7 @@ class Model(Program):
             ValueError: scales that f must predict if it does not.
         """
         super().__init__()
+        self._encoding: tuple[Window, Tensor] | None = None
         self.segment_length = segment_length
         self.feature_dimension = feature_dimension
         self.width = width
@@ -111,78 +112,87 @@ class Model(Program):
         """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
-    def encode(self, window: Window, generate: bool = False) -> Tensor:
+    def encode(self, window: Window) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 
         The others are needed by f alone, if it reads them and the next states are observed.
 
         Raises `ValueError` for windows of another shape or features of another length.
         """
+        if self._encoding is not None and self._encoding[0] is window:
+            return self._encoding[1]
         if len(window.batch_shape) != 1:
             raise ValueError(f"windows come as one batch [B]; got leading dimensions {[*window.batch_shape]}")
         if window.segment_length != self.segment_length:
             raise ValueError(
                 f"window has {window.segment_length} pushes; this model was made for {self.segment_length}"
             )
-        first_only = generate or not self.dynamics.reads_encoding
-        return self.encoder(window.states.step(slice(0, 1) if first_only else slice(0, -1)))
+        all_steps = window.whole and self.dynamics.reads_encoding
+        return self.encoder(window.states.step(slice(0, -1) if all_steps else slice(0, 1)))
 
-    def sample_subgoal(self, mean: State, window: Window, generate: bool) -> None:
-        """s' ~ h(. | s, c) for `window: [B]` around `mean: [..., B]`, observed unless `generate` (paper, equation 2).
+    @contextmanager
+    def encoding(self, window: Window) -> Iterator[None]:
+        """Within, model and guide share one encoding of this window object, a third of the time of a step."""
+        self._encoding = (window, self.encode(window))
+        try:
+            yield
+        finally:
+            self._encoding = None
 
-        Sites subgoal_centers, event `[M, 3]`, and subgoal_features, event `[M, F]`. They count the objects that are
-        real in s and s', or in s alone if s' is sampled.
+    def generate(self, window: Window) -> None:
+        """Run the process for the first states of `window: [B]`: it samples all that it would observe.
+
+        A program as any other, so `Predictive(model.generate, guide=guide, num_samples=20)(window)` infers the codes
+        from whole windows and generates from these.
         """
-        first, last = window.first, window.last
-        counted = first.mask if generate else first.mask & last.mask
-        pyro.sample("subgoal_centers", self.scales.centers(mean, counted), obs=None if generate else last.centers)
-        pyro.sample("subgoal_features", self.scales.features(mean, counted), obs=None if generate else last.features)
+        self(window.initial)
 
-    def sample_transitions(self, window: Window, encoded: Tensor, actions: Tensor, generate: bool) -> None:
-        """s_t+1 ~ f(. | s_t, a_t), observed, or sampled from the first states (paper, equation 1).
+    def transitions(self, window: Window, encoded: Tensor, actions: Tensor) -> Iterator[Transition]:
+        """f's likelihoods for `window: [B]`, encoded by `encode`, and `actions: [..., B, T, 4]` (paper, equation 1).
 
-        `encoded` is the result of `encode`, `actions: [..., B, T, 4]` the input of f for sampling. Sites next_centers,
-        event `[T, M, 3]`, and next_features, event `[T, M, F]`. Observed, they count the transitions in
-        `transition_mask`, with the objects that are real before and after the push.
+        Of a whole window one, for all T pushes at once: events `[T, M, 3]` and `[T, M, F]`. It counts the transitions
+        in `transition_mask`, with the objects that are real before and after the push. Of an initial window T, push by
+        push: events `[M, 3]` and `[M, F]`. f reads the `sampled` state of each before the next, its features scaled to
+        unit length, like observed ones.
         """
-        if generate:
-            self._generate_transitions(window.first, actions)
+        if window.whole:
+            before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
+            counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
+            mean, scales = self.dynamics.outcome(before, encoded, actions)
+            yield Transition("", *self._likelihoods(mean, counted, scales, 2), after.centers, after.features)
             return
-        if actions is not window.actions and not torch.equal(actions, window.actions):
-            raise ValueError(
-                "f reads the window's actions unless it generates, so the site actions cannot be conditioned or "
-                "intervened on: put them into the window, or pass generate=True"
-            )
-        before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
-        mean, predicted = self.dynamics.outcome(before, encoded, window.actions)
-        counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
-        centers = self.scales.centers(mean, counted, event_dims=2, predicted=predicted)
-        features = self.scales.features(mean, counted, event_dims=2, predicted=predicted)
-        pyro.sample("next_centers", centers, obs=after.centers)
-        pyro.sample("next_features", features, obs=after.features)
-
-    def _generate_transitions(self, state: State, actions: Tensor) -> None:
-        """Sample push by push from `state: [B]`, at sites next_centers_t and next_features_t for t = 1, ..., T.
-
-        next_centers and next_features record all of them. Sampled features are scaled to unit length before f reads
-        them, like observed ones.
-        """
-        samples = []
-        for step, action in enumerate(actions.unbind(-2), start=1):
+        state = window.first
+        for push, action in enumerate(actions.unbind(-2), start=1):
             encoded = self.encoder(state) if self.dynamics.reads_encoding else None
-            mean, predicted = self.dynamics.outcome(state, encoded, action)
-            centers = pyro.sample(f"next_centers_{step}", self.scales.centers(mean, state.mask, predicted=predicted))
-            features = pyro.sample(f"next_features_{step}", self.scales.features(mean, state.mask, predicted=predicted))
-            samples.append(State(centers, features, state.mask.expand(centers.shape[:-1])))
-            state = samples[-1]._replace(features=unit(features))
-        steps = stack_steps(samples)
-        for name, sampled in (("next_centers", steps.centers), ("next_features", steps.features)):
-            recorded = pyro.deterministic(name, sampled, event_dim=3)
-            if recorded is not sampled and not torch.equal(recorded, sampled):
-                raise ValueError(
-                    f"{name} only records what generation has sampled, so it cannot be conditioned or intervened on: "
-                    f"use {name}_1, ..., {name}_{len(samples)}"
-                )
+            mean, scales = self.dynamics.outcome(state, encoded, action)
+            step = Transition(f"_{push}", *self._likelihoods(mean, state.mask, scales, 1))
+            yield step
+            centers, features = step.sampled
+            state = State(centers, unit(features), state.mask.expand(centers.shape[:-1]))
+
+    def _likelihoods(
+        self, mean: State, counted: Tensor, scales: Tensor | None, event_dims: int
+    ) -> tuple[TorchDistribution, TorchDistribution]:
+        return (
+            self.scales.centers(mean, counted, event_dims=event_dims, predicted=scales),
+            self.scales.features(mean, counted, event_dims=event_dims, predicted=scales),
+        )
+
+
+@dataclass
+class Transition:
+    """f's likelihoods of all pushes of a window, or of one: for the sites next_centers and next_features.
+
+    suffix: of the sites' names: none, or _1, ..., _T. observed_centers, observed_features: None if they are sampled.
+    sampled: centres and features, for the program to set before it asks for the next transition.
+    """
+
+    suffix: str
+    centers: TorchDistribution
+    features: TorchDistribution
+    observed_centers: Tensor | None = None
+    observed_features: Tensor | None = None
+    sampled: tuple[Tensor, Tensor] = ()  # type: ignore[assignment]
 
 
 def windows_plate(window: Window) -> AbstractContextManager:

@@ -65,28 +65,28 @@ class SingleLatentModel(Model):
         )
         self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        """Run the process for `window: [B]`, a batch of training examples.
-
-        With `generate=True` it reads only the first states and samples everything else. `encoded` is the result of
-        `encode`. Raises `ValueError` for windows of another shape or features of another length.
-        """
-        encoded = self.encode(window, generate) if encoded is None else encoded
-        first = window.first
+    def forward(self, window: Window) -> None:
+        """Run the process for `window: [B]`, see `Model`."""
+        encoded, first, last = self.encode(window), window.first, window.last
+        real = first.mask & last.mask
 
         with windows_plate(window):
             with sequence_mask(window):
                 effect_code = pyro.sample("effect_code", self.prior_of_effects(first))
 
                 effect = self.meta_dynamics.effect(encoded[:, 0], effect_code)
-                self.sample_subgoal(self.meta_dynamics(first, effect), window, generate)
+                goal = self.meta_dynamics(first, effect)
+                pyro.sample("subgoal_centers", self.scales.centers(goal, real), obs=window.observed(last.centers))
+                pyro.sample("subgoal_features", self.scales.features(goal, real), obs=window.observed(last.features))
 
                 mean = self.action_generator(effect, first.mask)
-                observed = None if generate else window.actions
                 with poutine.scale(scale=self.action_weight):
-                    actions = pyro.sample("actions", self.scales.actions(mean), obs=observed)
+                    actions = pyro.sample("actions", self.scales.actions(mean), obs=window.observed(window.actions))
 
-            self.sample_transitions(window, encoded, actions, generate)
+            for step in self.transitions(window, encoded, actions):
+                centers = pyro.sample(f"next_centers{step.suffix}", step.centers, obs=step.observed_centers)
+                features = pyro.sample(f"next_features{step.suffix}", step.features, obs=step.observed_features)
+                step.sampled = (centers, features)
 
     def effect_prior(self, state: State) -> TorchDistribution:
         """p(c | s): `state: [...]` -> batch `[...]`, event `[C]`."""

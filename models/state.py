@@ -56,9 +56,12 @@ class State(NamedTuple):
 
 
 class Window(NamedTuple):
-    """One training example: `T + 1` states and the `T` pushes between them, in any batch `[...]`."""
+    """One training example: `T + 1` states and the `T` pushes between them, in any batch `[...]`.
 
-    states: State  # fields with leading [..., T + 1]
+    `window.initial` has the first state alone, and programs sample what they observe of a whole window.
+    """
+
+    states: State  # fields with leading [..., T + 1]; [..., 1] of an initial window
     actions: Tensor  # [..., T, 4] normalised pushes (x, y, dx, dy): start and motion
     transition_mask: Tensor  # [..., T] bool: transitions that count for the dynamics f
     sequence_mask: Tensor  # [...] bool: windows that count for the terms with latent variables (h and g)
@@ -82,6 +85,20 @@ class Window(NamedTuple):
     def last(self) -> State:
         """The state s' after the last push, the subgoal reached: `[...]`."""
         return self.states.step(-1)
+
+    @property
+    def initial(self) -> Window:
+        """The window without its states after the first; the actions stay, for programs that do not generate any."""
+        return self._replace(states=self.states.step(slice(0, 1)))
+
+    @property
+    def whole(self) -> bool:
+        """Whether states after the first are known."""
+        return self.states.mask.shape[-2] > 1
+
+    def observed(self, value: Tensor) -> Tensor | None:
+        """For `obs=` of a `pyro.sample`: the value if the window is whole; None, to sample it, if it is initial."""
+        return value if self.whole else None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Window:
         """Apply one function to every tensor, for example `window.map(lambda tensor: tensor[:8])`."""

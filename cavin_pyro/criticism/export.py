@@ -26,7 +26,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.codes import log_weights
 from cavin_pyro.criticism.estimates import arviz
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.criticism.windows import all_pushes, seeded
 from cavin_pyro.storage.files import atomic_write
 
 DIMENSIONS = {  # of each variable, after chain and draw
@@ -104,12 +104,12 @@ def sample_groups(context: CheckContext, *, windows: int, samples: int) -> dict[
     options = {"num_samples": samples, "parallel": True}
     groups: dict[str, dict[str, Tensor]] = {}
     with seeded(context.seed):
-        generated = Predictive(model, **options)(window, generate=True)
+        generated = Predictive(model.generate, **options)(window)
         groups["prior"] = {name: generated[name] for name in context.codes}
         groups["prior_predictive"] = predictions(generated, window.first.mask)
         if context.codes:
             codes = Predictive(guide, return_sites=context.codes, **options)(window)
-            generated = Predictive(model, posterior_samples=codes, parallel=True)(window, generate=True)
+            generated = Predictive(model.generate, posterior_samples=codes, parallel=True)(window)
             groups["posterior"] = codes
             groups["posterior_predictive"] = predictions(generated, window.first.mask)
             groups["sample_stats"] = {"log_weight": log_weights(model, guide, window, samples, fixed=codes)}
@@ -124,6 +124,8 @@ def sample_groups(context: CheckContext, *, windows: int, samples: int) -> dict[
 
 def predictions(values: Mapping[str, Tensor], mask: Tensor, steps: Tensor | None = None) -> dict[str, Tensor]:
     """The predicted variables among `values`; `mask: [B, M]`, `steps: [B, T, M]` for each push where that varies."""
+    if "next_centers" not in values:
+        values = {**values, "next_centers": all_pushes(values, "next_centers")}
     masks = {"subgoal_centers": mask, "next_centers": mask.unsqueeze(-2) if steps is None else steps}
     found = {name: values[name] for name in PREDICTED if name in values}
     return {name: without_padding(value, masks[name]) if name in masks else value for name, value in found.items()}

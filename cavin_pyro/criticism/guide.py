@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import torch
 from matplotlib.figure import Figure
-from pyro import poutine
 from torch import Tensor
 
 from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS, Codes, guide_density, log_weights, sample_guide
 from cavin_pyro.criticism.estimates import Interval, arviz, covered, draw_ranks, mean_interval, rank
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
-from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
+from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.layers import unit
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program
@@ -102,24 +102,23 @@ def assess_guide(
 
 
 @torch.no_grad()
-def simulate(model: Program, window: Window) -> tuple[Codes, Window]:
+def simulate(model: Model, window: Window) -> tuple[Codes, Window]:
     """Codes `[B, D]` from the prior and windows from the program, from the first states of windows `[B]`.
 
     The last state is h's, which the guide reads, where the model has one; those between are f's.
     """
-    nodes: Any = poutine.trace(model).get_trace(window, generate=True).nodes
-    names = [name for name in ("effect_code", "motion_code") if name in nodes]
-    centers, features = nodes["next_centers"]["value"].clone(), unit(nodes["next_features"]["value"])
-    if "subgoal_centers" in nodes:
-        centers[:, -1], features[:, -1] = nodes["subgoal_centers"]["value"], nodes["subgoal_features"]["value"]
+    values = sampled_values(model.generate, window)
+    centers, features = all_pushes(values, "next_centers"), unit(all_pushes(values, "next_features"))
+    if "subgoal_centers" in values:
+        centers[:, -1], features[:, -1] = values["subgoal_centers"], values["subgoal_features"]
     first = window.first
     mask = first.mask.unsqueeze(1).expand(-1, centers.shape[1] + 1, -1)
     states = State(
         torch.cat((first.centers.unsqueeze(1), centers), 1), torch.cat((first.features.unsqueeze(1), features), 1), mask
     )
-    actions = nodes["actions"]["value"] if "actions" in nodes else window.actions
     seen = torch.ones_like(window.transition_mask)
-    return {name: nodes[name]["value"] for name in names}, Window(states, actions, seen, seen[:, 0].clone())
+    simulated = Window(states, values.get("actions", window.actions), seen, seen[:, 0].clone())
+    return {name: values[name] for name in ("effect_code", "motion_code") if name in values}, simulated
 
 
 class Calibration(NamedTuple):
@@ -136,9 +135,7 @@ class Calibration(NamedTuple):
 
 
 @torch.no_grad()
-def calibration(
-    model: Program, guide: Program, window: Window, *, samples: int, prior_samples: int = 32
-) -> Calibration:
+def calibration(model: Model, guide: Program, window: Window, *, samples: int, prior_samples: int = 32) -> Calibration:
     """Where the true codes of windows simulated from those of `window: [B]` lie among `samples` of the guide."""
     codes, simulated = simulate(model, window)
     inferred = sample_guide(guide, simulated, samples)

@@ -18,7 +18,7 @@ from cavin_pyro.criticism.estimates import Interval, covered, draw_ranks, rank, 
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import MOVED
 from cavin_pyro.criticism.section import Section, conclude, within, worst
-from cavin_pyro.criticism.windows import repeated, seeded
+from cavin_pyro.criticism.windows import repeated, sampled_values, seeded
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State, Window
@@ -164,12 +164,12 @@ def sample_sites(
     """What the program generates at some sites for windows `[B]`, with codes from the guide or prior: `[S, B, ...]`."""
     parts: dict[str, list[Tensor]] = {site: [] for site in sites}
     for count, copies in repeated(window, samples):
-        program: Any = model
+        program: Any = model.generate
         if guide is not None:
-            program = poutine.replay(model, trace=poutine.trace(guide).get_trace(copies))
-        nodes: Any = poutine.trace(program).get_trace(copies, generate=True).nodes
+            program = poutine.replay(model.generate, trace=poutine.trace(guide).get_trace(copies))
+        values = sampled_values(program, copies)
         for site in sites:
-            parts[site].append(nodes[site]["value"].unflatten(0, (count, -1)))
+            parts[site].append(values[site].unflatten(0, (count, -1)))
     return {site: torch.cat(values) for site, values in parts.items()}
 
 

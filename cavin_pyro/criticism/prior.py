@@ -18,7 +18,7 @@ from cavin_pyro.criticism.estimates import Interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
 from cavin_pyro.criticism.section import INSPECT, Section, conclude, grade, not_applicable
-from cavin_pyro.criticism.windows import Outcome, generated, seeded
+from cavin_pyro.criticism.windows import GeneratedWindow, generated, seeded
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program, substitute
@@ -143,7 +143,7 @@ def prior_residuals(model: Program, window: Window, codes: Codes) -> Tensor:
     return torch.cat(columns, -1)
 
 
-def decoded_summary(outcome: Outcome) -> Tensor:
+def decoded_summary(outcome: GeneratedWindow) -> Tensor:
     """Pushes, how near they come to objects, and how the subgoal moves what: `[B, R]`."""
     centers, mask = outcome.first.centers, outcome.first.mask
     columns = []

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from cavin_pyro.criticism.windows import Outcome
+from cavin_pyro.criticism.windows import GeneratedWindow
 from cavin_pyro.envs.workspace import push_endpoints
 
 MOVED = 0.01  # metres; an object that moves farther counts as moved
@@ -27,7 +27,7 @@ class Nearness:
     tool: float
 
     @classmethod
-    def of(cls, real: Outcome) -> Nearness:
+    def of(cls, real: GeneratedWindow) -> Nearness:
         """From real windows `[B]`.
 
         `pair`: so that 1 % of the last states have a nearer pair; 0 without two objects anywhere. `tool`: so that
@@ -45,12 +45,12 @@ class Statistic:
     """One number per window, or per push of a window.
 
     Attributes:
-        function: of an `Outcome` `[B]` -> `[B]` or `[B, T]`. part: of the model, that makes it: h, f or g.
+        function: of an `GeneratedWindow` `[B]` -> `[B]` or `[B, T]`. part: of the model, that makes it: h, f or g.
     """
 
     name: str
     label: str
-    function: Callable[[Outcome], Tensor]
+    function: Callable[[GeneratedWindow], Tensor]
     part: str
     unit: str = ""
 
@@ -78,41 +78,41 @@ def statistics_of(nearness: Nearness) -> list[Statistic]:
     ]
 
 
-def _end(part: str, outcome: Outcome) -> Tensor:
+def _end(part: str, outcome: GeneratedWindow) -> Tensor:
     """Centres `[B, M, 3]` after the segment, as h or f has them."""
     end = outcome.steps[:, -1] if part == "f" else outcome.subgoal
     assert end is not None
     return end
 
 
-def _moves(part: str, outcome: Outcome) -> Tensor:
+def _moves(part: str, outcome: GeneratedWindow) -> Tensor:
     """How far each object goes over the segment: `[B, M]` metres, 0 for padding."""
     return (_end(part, outcome) - outcome.first.centers).norm(dim=-1) * outcome.first.mask
 
 
-def _farthest_move(part: str, outcome: Outcome) -> Tensor:
+def _farthest_move(part: str, outcome: GeneratedWindow) -> Tensor:
     return _moves(part, outcome).amax(-1)
 
 
-def _moved_objects(part: str, outcome: Outcome) -> Tensor:
+def _moved_objects(part: str, outcome: GeneratedWindow) -> Tensor:
     return (_moves(part, outcome) > MOVED).sum(-1).float()
 
 
-def _close_pairs(part: str, near: float, outcome: Outcome) -> Tensor:
+def _close_pairs(part: str, near: float, outcome: GeneratedWindow) -> Tensor:
     # Every pair stands in the matrix twice.
     return (pair_distances(_end(part, outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
 
 
-def _touching(near: float, outcome: Outcome) -> Tensor:
+def _touching(near: float, outcome: GeneratedWindow) -> Tensor:
     return (path_distances(outcome).amin(-1) < near).float().mean(-1)
 
 
-def _before(outcome: Outcome) -> Tensor:
+def _before(outcome: GeneratedWindow) -> Tensor:
     """Centres before each push: `[B, T, M, 3]`."""
     return torch.cat((outcome.first.centers.unsqueeze(1), outcome.steps[:, :-1]), 1)
 
 
-def _moves_of_pushes(outcome: Outcome) -> Tensor:
+def _moves_of_pushes(outcome: GeneratedWindow) -> Tensor:
     """How far each push moves each object: `[B, T, M]` metres, 0 for padding."""
     return (outcome.steps - _before(outcome)).norm(dim=-1) * outcome.first.mask.unsqueeze(1)
 
@@ -130,7 +130,7 @@ def _endpoints(actions: Tensor) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(start).to(actions), torch.from_numpy(end).to(actions)
 
 
-def path_distances(outcome: Outcome) -> Tensor:
+def path_distances(outcome: GeneratedWindow) -> Tensor:
     """From each push's path to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
     start, end = (point.unsqueeze(-2) for point in _endpoints(outcome.actions))
     line, offset = end - start, _before(outcome)[..., :2] - start
@@ -139,7 +139,7 @@ def path_distances(outcome: Outcome) -> Tensor:
     return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
 
 
-def start_distances(outcome: Outcome) -> Tensor:
+def start_distances(outcome: GeneratedWindow) -> Tensor:
     """From each push's start to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
     start, _ = _endpoints(outcome.actions)
     distances = (_before(outcome)[..., :2] - start.unsqueeze(-2)).norm(dim=-1)

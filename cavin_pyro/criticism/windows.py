@@ -21,7 +21,7 @@ from cavin_pyro.training.elbo import substitute
 WINDOWS_AT_ONCE = 4096  # a few megabytes per layer, so that a pass stays in the processor's cache
 
 
-class Outcome(NamedTuple):
+class GeneratedWindow(NamedTuple):
     """Actions and states of windows `[B]`, observed or generated. Lengths are metres."""
 
     first: State  # [B], the state s
@@ -39,9 +39,9 @@ def seeded(seed: int) -> Iterator[None]:
         yield
 
 
-def observed(window: Window) -> Outcome:
+def observed(window: Window) -> GeneratedWindow:
     """The windows `[B]` themselves."""
-    return Outcome(window.first, window.actions, window.states.centers[:, 1:], window.last.centers)
+    return GeneratedWindow(window.first, window.actions, window.states.centers[:, 1:], window.last.centers)
 
 
 def generated(
@@ -51,8 +51,8 @@ def generated(
     guide: Guide | None = None,
     means: Sequence[str] | None = None,
     codes: Mapping[str, Tensor] | None = None,
-) -> Outcome:
-    """Run the program once for each window `[B]` with `generate=True`.
+) -> GeneratedWindow:
+    """Generate once from the first state of each window `[B]`.
 
     Args:
         guide: where the codes come from; by default the model's own prior given s.
@@ -60,19 +60,31 @@ def generated(
             by default everything is sampled.
         codes: `[B, D]` by name, in place of samples.
     """
-    program: Any = substitute(model, codes or {})
+    program: Any = substitute(model.generate, codes or {})
     if guide is not None:
-        program = poutine.replay(model, trace=poutine.trace(guide).get_trace(window))
+        program = poutine.replay(model.generate, trace=poutine.trace(guide).get_trace(window))
     if means is not None:
         program = _Means(means)(program)
-    nodes = poutine.trace(program).get_trace(window, generate=True).nodes
-    return Outcome(
+    values = sampled_values(program, window)
+    return GeneratedWindow(
         first=window.first,
-        actions=nodes["actions"]["value"] if "actions" in nodes else window.actions,
-        steps=nodes["next_centers"]["value"],
-        subgoal=nodes["subgoal_centers"]["value"] if "subgoal_centers" in nodes else None,
-        chosen="actions" in nodes,
+        actions=values.get("actions", window.actions),
+        steps=all_pushes(values, "next_centers"),
+        subgoal=values.get("subgoal_centers"),
+        chosen="actions" in values,
     )
+
+
+def sampled_values(program: Any, window: Window) -> dict[str, Tensor]:
+    """The value of every site that one run of a program has sampled or observed."""
+    nodes = poutine.trace(program).get_trace(window).nodes
+    return {name: site["value"] for name, site in nodes.items() if site["type"] == "sample"}
+
+
+def all_pushes(values: Mapping[str, Tensor], site: str) -> Tensor:
+    """A site that generation samples push by push, of all T pushes: `[..., T, M, D]`."""
+    steps = [values[f"{site}_{push}"] for push in range(1, len(values) + 1) if f"{site}_{push}" in values]
+    return torch.stack(steps, -3)
 
 
 def repeated(window: Window, copies: int) -> Iterator[tuple[int, Window]]:

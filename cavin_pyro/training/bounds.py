@@ -33,17 +33,15 @@ class DifferentiableRenyiELBO(RenyiELBO):
     store; this is the same value as a tensor. Codes must be reparameterized.
     """
 
-    def differentiable_loss(
-        self, model: nn.Module, guide: nn.Module, window: Window, *, encoded: Tensor | None = None
-    ) -> Tensor:
-        """The negative bound, a scalar summed over the windows `[B]`; `encoded` as in `window_terms`.
+    def differentiable_loss(self, model: nn.Module, guide: nn.Module, window: Window) -> Tensor:
+        """The negative bound, a scalar summed over the windows `[B]`.
 
         Raises `ValueError` unless the particles are vectorized.
         """
         particles = self.num_particles
         if particles > 1 and not self.vectorize_particles:
             raise ValueError("the Renyi bound is computed for all particles at once: set vectorize_particles=true")
-        terms = window_terms(model, guide, window, particles=particles, encoded=encoded)
+        terms = window_terms(model, guide, window, particles=particles)
         log_weight = -sum(terms.values())  # [K, B]
         order = 1.0 - self.alpha
         bound = ((order * log_weight).logsumexp(0) - math.log(particles)) / order

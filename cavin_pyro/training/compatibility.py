@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from inspect import signature
 from typing import Any
 
 import torch
@@ -27,15 +26,9 @@ def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> N
     restored afterwards.
 
     Raises:
-        UserError: a program that takes no `encoded`, a code that the guide lacks or the model does not have, one
-            outside of the model's plates, of another shape, or counted where the model does not count it.
+        UserError: a code that the guide lacks or the model does not have, one outside of the model's plates, of another
+            shape, or counted where the model does not count it.
     """
-    for kind, program in (("model", model), ("guide", guide)):
-        if "encoded" not in signature(program.forward).parameters:
-            raise UserError(
-                f"{kind} {type(program).__name__} takes no state features: write "
-                "forward(self, window, generate=False, encoded=None)"
-            )
     device = window.actions.device
     window = window._replace(sequence_mask=torch.arange(len(window.actions), device=device) == 0)
     with forked(device):

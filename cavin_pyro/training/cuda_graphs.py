@@ -44,7 +44,8 @@ def capturable(loss: BoundObjective, window: Window) -> bool:
 
 def capturable_loss(loss: BoundObjective, window: Window) -> Tensor:
     """The loss of a batch `[B]` that is `capturable`, summed over its windows: a scalar."""
-    terms = elbo_terms(loss.model, loss.guide, window, encoded=loss.model.encode(window))
+    with loss.model.encoding(window):
+        terms = elbo_terms(loss.model, loss.guide, window)
     return sum((terms | loss.terms_of_model(window)).values(), window.actions.new_zeros(()))
 
 

@@ -24,7 +24,6 @@ def window_terms(
     window: Window,
     *,
     particles: int | None = None,
-    encoded: Tensor | None = None,
     fixed: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """Each term of -ELBO for each window of a batch [B], from one sample of the codes, or from K.
@@ -35,17 +34,15 @@ def window_terms(
         particles: K, an outermost plate of independent samples; the programs must broadcast over it.
         fixed: values of codes, `[B, D]` or `[K, B, D]`, that replace samples from the guide. Their terms
             are still the guide's and the model's densities at these values.
-        encoded: what the model's `encode` returns for this window; by default each program computes it.
 
     Returns:
         `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`. An
         automatic guide of Pyro's has its density at auxiliary sites, each a term `kl_<site>` more: `[]` if one density
         is that of all windows.
     """
-    given = {} if encoded is None else {"encoded": encoded}
     with pyro.plate("particles", particles, dim=-2) if particles else nullcontext():
-        guided = poutine.trace(substitute(guide, fixed or {})).get_trace(window, **given)
-        joint = poutine.trace(poutine.replay(model, trace=guided)).get_trace(window, **given)
+        guided = poutine.trace(substitute(guide, fixed or {})).get_trace(window)
+        joint = poutine.trace(poutine.replay(model, trace=guided)).get_trace(window)
     guided.compute_log_prob()
     joint.compute_log_prob()
     terms = {}
@@ -70,13 +67,13 @@ def substitute(program: Program, values: Mapping[str, Tensor]) -> Program:
     return poutine.replay(program, trace=trace) if values else program
 
 
-def elbo_terms(model: Program, guide: Program, window: Window, *, encoded: Tensor | None = None) -> dict[str, Tensor]:
+def elbo_terms(model: Program, guide: Program, window: Window) -> dict[str, Tensor]:
     """Each term of the loss -ELBO for a batch [B], from one sample of the codes; their sum is Trace_ELBO's loss.
 
     Returns:
         The terms of `window_terms`: scalars, summed over windows.
     """
-    return {name: term.sum() for name, term in window_terms(model, guide, window, encoded=encoded).items()}
+    return {name: term.sum() for name, term in window_terms(model, guide, window).items()}
 
 
 def term_counts(names: Iterable[str], window: Window) -> dict[str, int]:

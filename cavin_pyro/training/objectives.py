@@ -160,11 +160,11 @@ class BoundObjective(nn.Module):
         elbo = objective.elbo
         if not isinstance(elbo, DifferentiableBound):
             return loss_with_gradients(elbo, model, guide, window, list(self.parameters()))
-        encoded = self.model.encode(window)  # once for both programs
-        if not objective.counterfactual_weight:
-            return elbo.differentiable_loss(model, guide, window, encoded=encoded)
-        guided = poutine.trace(self.guide).get_trace(window, encoded=encoded)
-        loss = elbo.differentiable_loss(model, poutine.replay(guide, trace=guided), window, encoded=encoded)
+        with self.model.encoding(window):
+            if not objective.counterfactual_weight:
+                return elbo.differentiable_loss(model, guide, window)
+            guided = poutine.trace(self.guide).get_trace(window)
+            loss = elbo.differentiable_loss(model, poutine.replay(guide, trace=guided), window)
         codes = {name: guided.nodes[name]["value"] for name in CODES if name in guided.nodes}
         return loss + objective.counterfactual_weight * counterfactual_loss(self.model, window, codes)
 

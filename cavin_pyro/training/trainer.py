@@ -208,8 +208,8 @@ class Trainer:
             torch.manual_seed(0)
             for part in parts:
                 window = self.windows.batch(part)
-                encoded = self.model.encode(window)
-                bound = elbo_terms(self.model, self.guide, window, encoded=encoded)
+                with self.model.encoding(window):
+                    bound = elbo_terms(self.model, self.guide, window)
                 others = self._loss.terms_of_model(window)
                 terms = {name: term.item() for name, term in {**bound, **others}.items()}
                 loss += sum(terms[name] for name in bound)

@@ -25,8 +25,8 @@ every_program = pytest.mark.parametrize("pair", PROGRAMS, ids="-".join)
 def test_codes_of_a_window_regenerate_it(pair: tuple[str, str], random_window: Callable[..., Window]) -> None:
     model, guide = make(*pair)
     for options in ({}, {"guide": guide, "parallel": True}):
-        sampled = Predictive(model, num_samples=6, **options)(random_window(), generate=True)
-        assert sampled["next_centers"].shape == (6, 4, 3, 4, 3) and sampled["next_centers"].isfinite().all()
+        sampled = Predictive(model.generate, num_samples=6, **options)(random_window())
+        assert sampled["next_centers_3"].shape == (6, 4, 4, 3) and sampled["next_centers_3"].isfinite().all()
         assert ("actions" in sampled) == bool(model.codes)
         assert ("subgoal_centers" in sampled) == ("effect_code" in model.codes)
 
@@ -37,16 +37,24 @@ def test_generation_follows_conditions_and_interventions(
 ) -> None:
     model, window = make(*pair)[0], random_window()
     site = (*model.codes, "next_centers_1")[0]
-    shape = poutine.trace(model).get_trace(window, generate=True).nodes[site]["value"].shape
+    shape = poutine.trace(model.generate).get_trace(window).nodes[site]["value"].shape
     for handler in (poutine.condition, poutine.do):
         results = []
         for value in (0.0, 0.0, 3.0):
             torch.manual_seed(0)
-            program = handler(model, data={site: torch.full(shape, value)})
-            results.append(poutine.trace(program).get_trace(window, generate=True).nodes["next_centers_2"]["value"])
+            program = handler(model.generate, data={site: torch.full(shape, value)})
+            results.append(poutine.trace(program).get_trace(window).nodes["next_centers_2"]["value"])
         assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
-    with pytest.raises(ValueError, match="next_centers only records what generation has sampled"):
-        poutine.condition(model, data={"next_centers": torch.zeros(4, 3, 4, 3)})(window, generate=True)
+
+
+def test_f_follows_actions_that_are_set_and_a_guide_needs_whole_windows(random_window: Callable[..., Window]) -> None:
+    (model, guide), window = make("cascaded", "cascaded"), random_window()
+    backwards = poutine.do(model, data={"actions": -window.actions})
+    means = [poutine.trace(one).get_trace(window).nodes["next_centers"]["fn"].mean for one in (model, backwards)]
+    assert torch.equal(means[0], poutine.trace(model).get_trace(window).nodes["next_centers"]["fn"].mean)
+    assert not torch.equal(*means)
+    with pytest.raises(ValueError, match="infers from whole windows"):
+        guide(window.initial)
 
 
 @torch.no_grad()

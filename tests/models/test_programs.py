@@ -37,10 +37,16 @@ SITES: dict[type[Model], dict[str, tuple[int, ...]]] = {
 every_model = pytest.mark.parametrize("kind", SITES, ids=lambda kind: kind.__name__)
 
 
-def trace(model: Any, window: Window, generate: bool = False) -> poutine.Trace:
-    traced = poutine.trace(model).get_trace(window, generate=generate)
+def trace(model: Any, window: Window) -> poutine.Trace:
+    traced = poutine.trace(model).get_trace(window)
     traced.compute_log_prob()
     return traced
+
+
+def values_of(generated: poutine.Trace) -> dict[str, Tensor]:
+    """Of every sampled site, and those of f for all pushes at once."""
+    values = {name: generated.nodes[name]["value"] for name in generated.stochastic_nodes}
+    return values | {name: torch.stack([values[f"{name}_{push}"] for push in (1, 2, 3)], 1) for name in TRANSITIONS}
 
 
 @every_model
@@ -71,19 +77,18 @@ def test_generation_reads_only_first_states_and_given_actions(
     hidden = window._replace(states=states._replace(centers=torch.cat([states.centers[:, :1], unread], 1)))
     if kind is not DynamicsModel:
         hidden = hidden._replace(actions=torch.full_like(window.actions, math.nan))
-    traced = trace(kind(**SIZES), hidden, generate=True)
-    for name, shape in SITES[kind].items():
-        assert tuple(traced.nodes[name]["value"].shape) == shape
-        assert traced.nodes[name]["value"].isfinite().all()
-    assert set(traced.observation_nodes) == set(TRANSITIONS)  # records of what was sampled push by push
+    traced = trace(kind(**SIZES).generate, hidden)
+    values = values_of(traced)
+    assert {name: tuple(values[name].shape) for name in SITES[kind]} == SITES[kind]
+    assert all(value.isfinite().all() for value in values.values()) and not traced.observation_nodes
 
 
 def test_generated_windows_score_the_same_when_observed(random_window: Callable[..., Window]) -> None:
     window = random_window().map(lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)
     window = window._replace(transition_mask=torch.ones(4, 3, dtype=torch.bool))
     model = CascadedModel(**SIZES).double()
-    generated = trace(model, window, generate=True)
-    value = {name: generated.nodes[name]["value"] for name in SITES[CascadedModel]}
+    generated = trace(model.generate, window)
+    value = values_of(generated)
     # The dynamics read features of unit length, so observed ones are set to that before the next push.
     first = window.states.step(slice(0, 1))
     centers = torch.cat([first.centers, value["next_centers"]], 1)
@@ -225,6 +230,6 @@ def test_f_is_scored_by_students_t_with_its_own_scales_or_by_fixed_ones(scales: 
         expected = distributions.MultivariateStudentT(torch.tensor(3.0), mean.centers, matrices)
     scored = expected.log_prob(seen.states.centers[:, 1:]).sum((-1, -2))
     assert torch.allclose(site["fn"].log_prob(site["value"]), scored, rtol=1e-4, atol=1e-3)
-    trace(model, seen, generate=True)
+    trace(model.generate, seen)
     with pytest.raises(ValueError, match="scales=predicted needs an f that predicts them"):
         CascadedModel(scales=PredictedScales(), **SIZES)

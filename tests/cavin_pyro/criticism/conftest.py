@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import pyro
 import pytest
 import torch
-from pyro import distributions, poutine
+from pyro import distributions
 from pyro.nn import PyroModule
 from torch import Tensor
 
 from cavin_pyro.criticism.guide import simulate
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.dynamics_only import DynamicsModel
@@ -47,21 +47,24 @@ class SceneModel(PyroModule):
         super().__init__()
         self.shuffled = shuffled
 
-    def forward(self, window: Window, generate: bool = False) -> None:
+    def generate(self, window: Window) -> None:
+        self(window.initial)
+
+    def forward(self, window: Window) -> None:
         mean = scene_mean(window).roll(int(self.shuffled), 0)
         with pyro.plate("windows", len(mean)):
             c = pyro.sample("effect_code", normal(mean, 1.0))
             last = window.last
-            after, kind = (None, None) if generate else (last.centers, last.features)
-            pyro.sample("subgoal_centers", distributions.Normal(c.unsqueeze(-2), NOISE).to_event(2), obs=after)
-            still = torch.zeros_like(last.features)
-            pyro.sample("subgoal_features", distributions.Normal(still, 0.1).to_event(2), obs=kind)
+            goal = distributions.Normal(c.unsqueeze(-2), NOISE).to_event(2)
+            pyro.sample("subgoal_centers", goal, obs=window.observed(last.centers))
+            still = distributions.Normal(torch.zeros_like(last.features), 0.1).to_event(2)
+            pyro.sample("subgoal_features", still, obs=window.observed(last.features))
             z = pyro.sample("motion_code", normal(torch.zeros_like(window.actions[:, 0]), 1.0))
             pushes = distributions.Normal(z.unsqueeze(-2).expand(*z.shape[:-1], 3, 4), NOISE).to_event(2)
-            pyro.sample("actions", pushes, obs=None if generate else window.actions)
-        if generate:
-            pyro.deterministic("next_centers", torch.zeros(len(mean), 3, 1, 3), event_dim=3)
-            pyro.deterministic("next_features", torch.ones(len(mean), 3, 1, 2), event_dim=3)
+            pyro.sample("actions", pushes, obs=window.observed(window.actions))
+        for push in (1, 2, 3):
+            pyro.deterministic(f"next_centers_{push}", torch.zeros(len(mean), 1, 3), event_dim=2)
+            pyro.deterministic(f"next_features_{push}", torch.ones(len(mean), 1, 2), event_dim=2)
 
 
 class SceneGuide(PyroModule):
@@ -123,13 +126,13 @@ def generated_by(model: CascadedModel, part: str) -> Window:
     features = torch.nn.functional.normalize(torch.randn(COUNT, 1, 3, 4), dim=-1).expand(-1, 4, -1, -1)
     counts = torch.ones(COUNT, 3, dtype=torch.bool)
     blank = Window(State(centers, features, mask), torch.zeros(COUNT, 3, 4), counts, counts[:, 0])
-    nodes = poutine.trace(model).get_trace(blank, generate=True).nodes
-    after, kinds = nodes["next_centers"]["value"].clone(), nodes["next_features"]["value"].clone()
+    values = sampled_values(model.generate, blank)
+    after, kinds = (all_pushes(values, site) for site in ("next_centers", "next_features"))
     if part == "h":
-        after[:, -1], kinds[:, -1] = nodes["subgoal_centers"]["value"], nodes["subgoal_features"]["value"]
+        after[:, -1], kinds[:, -1] = values["subgoal_centers"], values["subgoal_features"]
     kinds[:, :-1] = torch.nn.functional.normalize(kinds[:, :-1], dim=-1)  # as f reads them
     states = State(torch.cat((centers[:, :1], after), 1), torch.cat((features[:, :1], kinds), 1), mask)
-    return blank._replace(states=states, actions=nodes["actions"]["value"])
+    return blank._replace(states=states, actions=values["actions"])
 
 
 def cascade_context(model: CascadedModel, window: Window) -> CheckContext:

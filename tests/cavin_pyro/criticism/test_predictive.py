@@ -15,7 +15,7 @@ from torch import Tensor
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.criticism.predictive import assess_predictive, compare, effect_size, replicate
 from cavin_pyro.criticism.pushing import Nearness, statistics_of
-from cavin_pyro.criticism.windows import Outcome, generated, observed, seeded
+from cavin_pyro.criticism.windows import GeneratedWindow, generated, observed, seeded
 from cavin_pyro.envs.workspace import normalised_push
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.state import State, Window
@@ -23,7 +23,7 @@ from cavin_pyro.models.state import State, Window
 NEAR = Nearness(pair=0.05, tool=0.04)
 
 
-def outcome(centers: list[list[list[float]]], pushes: list[list[float]], subgoal: list[list[float]]) -> Outcome:
+def outcome(centers: list[list[list[float]]], pushes: list[list[float]], subgoal: list[list[float]]) -> GeneratedWindow:
     """One window: planar centres before and after each push, pushes (x, y, dx, dy) in metres; and padding."""
 
     def padded(points: Tensor) -> Tensor:
@@ -34,15 +34,15 @@ def outcome(centers: list[list[list[float]]], pushes: list[list[float]], subgoal
     wanted = np.array(pushes)
     actions = torch.from_numpy(normalised_push(wanted[:, :2], wanted[:, 2:])).float()[None]
     first = State(states[:, 0], torch.zeros(*real.shape, 4), real)
-    return Outcome(first, actions, states[:, 1:], padded(torch.tensor([subgoal])))
+    return GeneratedWindow(first, actions, states[:, 1:], padded(torch.tensor([subgoal])))
 
 
-def values(made: Outcome, near: Nearness = NEAR) -> dict[str, Tensor]:
+def values(made: GeneratedWindow, near: Nearness = NEAR) -> dict[str, Tensor]:
     return {statistic.name: statistic.function(made)[0] for statistic in statistics_of(near)}
 
 
 @pytest.fixture
-def pushed() -> Outcome:
+def pushed() -> GeneratedWindow:
     """Two objects 0.2 m apart; the first push moves one by 0.06 m, the second misses both by far.
 
     f lets the second object slip by 0.012 m in the second push; h wants the first 0.16 m further, at the second.
@@ -54,20 +54,20 @@ def pushed() -> Outcome:
     )
 
 
-def test_moves_are_of_the_farthest_object_and_of_those_beyond_a_centimetre(pushed: Outcome) -> None:
+def test_moves_are_of_the_farthest_object_and_of_those_beyond_a_centimetre(pushed: GeneratedWindow) -> None:
     found = values(pushed)
     assert found["farthest_move_h"].item() == pytest.approx(0.16, abs=1e-6)
     assert found["farthest_move_f"].item() == pytest.approx(0.06, abs=1e-6)
     assert (found["moved_objects_h"].item(), found["moved_objects_f"].item()) == (1.0, 2.0)
 
 
-def test_objects_inside_each_other_are_counted_as_pairs(pushed: Outcome) -> None:
+def test_objects_inside_each_other_are_counted_as_pairs(pushed: GeneratedWindow) -> None:
     found = values(pushed)
     assert (found["close_pairs_h"].item(), found["close_pairs_f"].item()) == (1.0, 0.0)
     assert values(pushed, Nearness(pair=0.15, tool=0.04))["close_pairs_f"].item() == 1.0
 
 
-def test_pushes_start_where_they_start(pushed: Outcome) -> None:
+def test_pushes_start_where_they_start(pushed: GeneratedWindow) -> None:
     found = values(pushed)
     aside = math.hypot(0.06, 0.4)  # from (0.5, 0.4) to the first object, which lies at (0.56, 0) by then
     assert found["start_to_nearest"].tolist() == pytest.approx([0.08, aside], abs=1e-6)
@@ -95,7 +95,7 @@ def test_nearness_is_what_real_windows_show() -> None:
     start = np.stack([np.full(count, 0.45), offset.numpy()], -1)
     actions = torch.from_numpy(normalised_push(start, np.tile([0.1, 0.0], (count, 1)))).float()[:, None]
     state = State(first, torch.zeros(count, 2, 4), torch.ones(count, 2, dtype=torch.bool))
-    near = Nearness.of(Outcome(state, actions, after[:, None], after))
+    near = Nearness.of(GeneratedWindow(state, actions, after[:, None], after))
     assert near.pair == pytest.approx(0.101, abs=1e-6)
     assert near.tool == pytest.approx(0.1 * 51 / 101, abs=1e-3)
 

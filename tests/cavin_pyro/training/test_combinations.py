@@ -14,7 +14,6 @@ import pyro
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from cavin_pyro.config import parts as building
 from cavin_pyro.config.commands import TrainerConfig, WindowConfig
@@ -181,14 +180,9 @@ def test_the_balance_of_states_and_actions_is_a_positive_number() -> None:
 class WithMore(CascadedGuide):
     """Samples something that the model does not know."""
 
-    def forward(self, window: Window, generate: bool = False, encoded: Tensor | None = None) -> None:
-        super().forward(window, generate, encoded)
+    def forward(self, window: Window) -> None:
+        super().forward(window)
         pyro.sample("more", pyro.distributions.Normal(0.0, 1.0))
-
-
-class WithoutFeatures(CascadedGuide):
-    def forward(self, window: Window, generate: bool = False) -> None:  # type: ignore[override]
-        super().forward(window, generate)
 
 
 def test_model_and_guide_are_checked_by_their_sites(few: Window) -> None:
@@ -204,5 +198,3 @@ def test_model_and_guide_are_checked_by_their_sites(few: Window) -> None:
     model = building.build_model(composed("cascaded", "cascaded"))
     with pytest.raises(UserError, match="samples effect_code, more, motion_code, but the codes of model Cascaded"):
         check_compatibility(model, WithMore(model, width=8), few)
-    with pytest.raises(UserError, match="takes no state features: write forward"):
-        check_compatibility(model, WithoutFeatures(model, width=8), few)
