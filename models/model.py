@@ -132,7 +132,7 @@ class Model(Program):
 
     @contextmanager
     def encoding(self, window: Window) -> Iterator[None]:
-        """Within, model and guide share one encoding of this window object, a third of the time of a step."""
+        """Within, model and guide share one encoding of this window object, which training needs only once."""
         self._encoding = (window, self.encode(window))
         try:
             yield
@@ -163,12 +163,12 @@ class Model(Program):
             return
         state = window.first
         for push, action in enumerate(actions.unbind(-2), start=1):
-            encoded = self.encoder(state) if self.dynamics.reads_encoding else None
-            mean, scales = self.dynamics.outcome(state, encoded, action)
+            features = self.encoder(state) if self.dynamics.reads_encoding else None
+            mean, scales = self.dynamics.outcome(state, features, action)
             step = Transition(f"_{push}", *self._likelihoods(mean, state.mask, scales, 1))
             yield step
-            centers, features = step.sampled
-            state = State(centers, unit(features), state.mask.expand(centers.shape[:-1]))
+            centers, sampled = step.sampled
+            state = State(centers, unit(sampled), state.mask.expand(centers.shape[:-1]))
 
     def _likelihoods(
         self, mean: State, counted: Tensor, scales: Tensor | None, event_dims: int

@@ -126,7 +126,7 @@ def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = C
     return losses
 
 
-def sleep_loss(model: Program, guide: Program, window: Window) -> Tensor:
+def sleep_loss(model: Model, guide: Program, window: Window) -> Tensor:
     """-log q(codes | simulated window), in nats, mean over windows simulated from the first states of windows `[B]`."""
     codes, simulated = simulate(model, window)
     trace: poutine.Trace = poutine.trace(substitute(guide, codes)).get_trace(simulated)
@@ -134,7 +134,7 @@ def sleep_loss(model: Program, guide: Program, window: Window) -> Tensor:
 
 
 def sleep(
-    model: nn.Module,
+    model: Model,
     guide: nn.Module,
     batch: Callable[[], Window],
     *,
