@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
-from cavin_pyro.config.application import command
+from cavin_pyro.config.application import DictConfig, command
 
 
 @command("check")
@@ -14,6 +12,7 @@ def main(config: DictConfig) -> None:
 
     import pyro
 
+    from cavin_pyro.config.errors import user_input
     from cavin_pyro.config.parts import check_sizes
     from cavin_pyro.criticism.comparison import check_pair, write_pair
     from cavin_pyro.criticism.export import check_export, write_samples
@@ -26,10 +25,11 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
-    names = choose_sections(config.sections, config.sizes)
-    pair, export = check_pair(config), check_export(config.export)
-    check_sizes("sizes.export", config.sizes.export)
-    accept = partial(check_objects, objects=config.sizes.subgoals.objects) if "subgoals" in names else None
+    with user_input("sections", "sizes"):
+        names = choose_sections(config.sections, config.sizes)
+        pair, export = check_pair(config), check_export(config.export)
+        check_sizes("sizes.export", config.sizes.export)
+        accept = partial(check_objects, objects=config.sizes.subgoals.objects) if "subgoals" in names else None
     with output_folder(config.output) as folder:
         if pair:
             parts = write_pair(config, names, folder, accept)

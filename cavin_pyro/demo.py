@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
-from cavin_pyro.config.application import command
+from cavin_pyro.config.application import DictConfig, command
 
 
 @command("demo")
@@ -14,6 +12,7 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.factory import make_runner
+    from cavin_pyro.evaluation.statistics import counted
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import write_config
     from cavin_pyro.visualization.rendering import render_episode
@@ -28,7 +27,7 @@ def main(config: DictConfig) -> None:
                 write_config(folder, options)
                 row = render_episode(runner, folder, seed=config.seed, video=True)
             runner.env.close()
-            print(f"{task}: {row['outcome']} after {row['steps']} pushes")
+            print(f"{task}: {row['outcome']} after {counted(row['steps'], 'push', 'pushes')}")
             for what, name in (("picture", "plan.png"), ("from above", "plan-above.png"), ("video", "episode.mp4")):
                 print(f"  {what:<11}{folder / name}", flush=True)
 

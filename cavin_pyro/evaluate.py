@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
-from cavin_pyro.config.application import command
+from cavin_pyro.config.application import DictConfig, Figures, command
 
 
 @command("evaluate")
-def main(config: DictConfig) -> None:
+def main(config: DictConfig) -> Figures:
     """Run seeded episodes and report rates with their intervals; resumes an interrupted run."""
     import copy
     from dataclasses import asdict
@@ -46,6 +44,7 @@ def main(config: DictConfig) -> None:
         with atomic_write(folder / "results.txt") as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
         print(f"{text}\nwritten: {folder / 'results.json'}")
+        return {"success": f"{100 * results['success']['rate']:.1f} %", "episodes": results["episodes"]}
 
 
 if __name__ == "__main__":

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
-from cavin_pyro.config.application import command
+from cavin_pyro.config.application import DictConfig, Figures, command
 
 
 @command("plan")
-def main(config: DictConfig) -> None:
+def main(config: DictConfig) -> Figures:
     """Run one closed-loop episode from segmented depth images, and write its table, pictures and video."""
     import copy
 
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.evaluation.factory import announce_objects, make_runner
-    from cavin_pyro.evaluation.statistics import plan_summary
+    from cavin_pyro.evaluation.statistics import counted, plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
@@ -33,11 +31,13 @@ def main(config: DictConfig) -> None:
             write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
-        print(f"{runner.task.name}: {row['outcome']} after {row['steps']} pushes, return {row['return']:.1f}")
+        pushes = counted(row["steps"], "push", "pushes")
+        print(f"{runner.task.name}: {row['outcome']} after {pushes}, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)
         for name in episode_files(video=config.video, viewer=config.viewer):
             print(f"  {folder / name}")
+        return {name: row[name] for name in ("outcome", "steps", "return")}
 
 
 if __name__ == "__main__":

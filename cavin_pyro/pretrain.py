@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
-from cavin_pyro.config.application import command
+from cavin_pyro.config.application import DictConfig, command
 
 
 @command("pretrain")

@@ -35,7 +35,7 @@ def _commands() -> str:
     lines = [
         "# Commands",
         "",
-        "Options are given as `name=value`. `--help` lists those of a command with its presets, too.",
+        "Options are given as `name=value`. `--help=all` lists those of a command with its presets, too.",
     ]
     for name, schema in COMMANDS.items():
         lines += ["", f"## {name}", "", f"`python -m cavin_pyro.{name} ...`", ""]

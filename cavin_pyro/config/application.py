@@ -2,36 +2,45 @@
 
 @command("plan")
 def main(config: DictConfig) -> None: ...
+
+It imports little, so that hardly an interruption comes before `guarded`.
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
+import io
 import logging
 import os
+import re
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn, TypeVar
-
-from omegaconf import DictConfig, OmegaConf
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from cavin_pyro import __version__
-from cavin_pyro.config.errors import Parser, UserError
+from cavin_pyro.config.errors import Parser, UserError, lacks_memory, one_line
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig as DictConfig
+else:
+    DictConfig = Any
 
 RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "assets")  # docs/reliability.md
 _REFUSALS = ("ENOSPC", "EDQUOT", "EACCES", "EPERM", "EROFS", "EFBIG", "EIO", "ENAMETOOLONG")
-_DISK_ERRORS = {getattr(errno, name) for name in _REFUSALS}
-_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "calculation overflowed")  # torch's words
+_TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST}
+_DISK_ERRORS = {getattr(errno, name) for name in _REFUSALS} | _TAKEN
 
 T = TypeVar("T")
-Body = Callable[[DictConfig], None]
+Figures = Mapping[str, Any]
+"""What a command found, by name, for the table of a sweep."""
+Body = Callable[[DictConfig], Figures | None]
 
 
 def command(name: str) -> Callable[[Body], Callable[[], None]]:
@@ -45,18 +54,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             # Torch, not imported yet, reads it. Several threads wait for one another after each of many small products:
             # where another program uses a core, plans would take fifty times as long, and training would stand still.
             os.environ.setdefault("OMP_NUM_THREADS", "1")
-            line = guarded(lambda: read_command_line(sys.argv[1:]))
-            config, choices = guarded(lambda: _compose(name, line))
-            if line.help:
-                from cavin_pyro.config.help import help_page
-
-                guarded(lambda: print(help_page(name, body.__doc__ or "", config, choices)))
-            elif line.cfg:
-                guarded(lambda: print(OmegaConf.to_yaml(config), end=""))
-            elif line.multirun:
-                _sweep(name, body, line)
-            else:
-                guarded(lambda: body(config), name)
+            guarded(lambda: _run(name, body))
 
         main.__doc__ = body.__doc__
         return main
@@ -64,38 +62,62 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
     return decorate
 
 
-def guarded(action: Callable[[], T], name: str | None = None) -> T:
+def _run(name: str, body: Body) -> None:
+    if sys.flags.optimize > 1:
+        raise UserError("PYTHONOPTIMIZE=2, or python -OO, strips docstrings, which Pyro needs: unset it")
+    line = read_command_line(sys.argv[1:])
+    from omegaconf import OmegaConf
+
+    config, choices = _compose(name, line)
+    if line.help or line.help_all:
+        from cavin_pyro.config.help import help_page
+
+        print(help_page(name, body.__doc__ or "", config, choices, everything=line.help_all))
+    elif line.cfg:
+        print(OmegaConf.to_yaml(config), end="")
+    elif line.multirun:
+        _sweep(name, body, line)
+    else:
+        guarded(lambda: body(config), name, line.overrides)
+
+
+def guarded(action: Callable[[], T], name: str | None = None, words: Sequence[str] = ()) -> T:
     """Run; bad input, a disk that refuses and an interruption end in one line instead of a traceback (`--traceback`).
 
     SIGTERM and SIGHUP interrupt as Ctrl-C does; the exit status is 128 and the signal's number. A reader of what is
     printed that stops early, such as `head`, ends the command silently, with the status of SIGPIPE. `name`: of the
-    command, if it has begun its work: an interruption says whether it resumes.
+    command, if it has begun its work: an interruption says whether it resumes. `words`: its options as typed.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # its encoding may lack letters of a path
     try:
         with _interruptions():
             result = action()
             print(end="", flush=True)  # here, since as it exits Python complains of a reader that has gone
             return result
-    except UserError as error:
-        if "--traceback" in sys.argv:
-            raise
-        _stop(str(error), error.status)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(128 + signal.SIGPIPE) from None
-    except OSError as error:
-        if error.errno not in _DISK_ERRORS:
-            raise
-        _stop(_refusal(error), 2)
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not any(said in str(error) for said in _NO_MEMORY):
-            raise
-        _stop(f"these options need more memory than there is: choose smaller ones ({str(error)[:160]})", 2)
     except KeyboardInterrupt as error:
         number = error.args[0] if isinstance(error, Interruption) else signal.SIGINT
-        by = "" if number == signal.SIGINT else f" by {number.name}"
         then = "to resume" if name in RESUMING else "to start again: nothing is kept of this one"
-        _stop(f"interrupted{by}{f'; rerun the same command {then}' if name else ''}", 128 + number)
+        _stop(f"{_interrupted(number)}{f'; rerun the same command {then}' if name else ''}", 128 + number)
+    except Exception as error:
+        line = _line(error, words)
+        if line is None or "--traceback" in sys.argv:
+            raise
+        _stop(line, getattr(error, "status", 2))
+
+
+def _line(error: Exception, words: Sequence[str]) -> str | None:
+    """What to say of an error instead of a traceback; None for a bug."""
+    if isinstance(error, UserError):
+        given = [word for word in words if re.split(r"[./=]", word.lstrip("+"))[0] in error.sections]
+        named = any(word.partition("=")[0].rpartition(".")[2] in str(error) for word in given)
+        return f"{', '.join(given)}: {error}" if given and not named else str(error)
+    if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
+        return _refusal(error)
+    return one_line(error) if lacks_memory(error) else None
 
 
 def _refusal(error: OSError) -> str:
@@ -106,6 +128,8 @@ def _refusal(error: OSError) -> str:
     if name and error.errno in (errno.EACCES, errno.EPERM) and os.path.exists(name) and not os.access(name, os.R_OK):
         return f"{name} cannot be read: {error.strerror}; change its permissions, or give another"
     where = f" at {name}" if name else ""
+    if error.errno in (errno.EISDIR, errno.ENOTDIR, errno.EEXIST):
+        return f"something else is{where or ' where results go'} ({error.strerror}): move it away, or choose output=DIR"
     return f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR"
 
 
@@ -115,27 +139,42 @@ class Interruption(KeyboardInterrupt):
 
 @contextmanager
 def _interruptions() -> Iterator[None]:
-    """Raise `Interruption` for SIGTERM and SIGHUP, unless they are ignored (nohup) or handled by somebody else."""
+    """Raise `Interruption` for Ctrl-C, SIGTERM and SIGHUP, unless ignored (nohup) or handled by somebody else.
+
+    While a module is being imported, which may lose an exception or report it as its own, they end the process at once.
+    """
     if threading.current_thread() is not threading.main_thread():  # Python handles signals in the main thread alone
         yield
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_IGN)  # schedulers send a signal to a process and to its group
-        raise Interruption(signal.Signals(number))
+        if number != signal.SIGINT:  # schedulers send a signal to a process and to its group
+            signal.signal(number, signal.SIG_IGN)
+        while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+            frame = frame.f_back
+        if frame is None:
+            raise Interruption(signal.Signals(number))
+        os.write(2, f"error: {_interrupted(signal.Signals(number))}\n".encode())
+        os._exit(128 + number)
 
-    ours = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) == signal.SIG_DFL]
-    for one in ours:
-        signal.signal(one, interrupt)
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    ours = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}
+    for number in ours:
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for one in ours:
-            signal.signal(one, signal.SIG_DFL)
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+
+
+def _interrupted(number: signal.Signals) -> str:
+    return f"interrupted{'' if number == signal.SIGINT else f' by {number.name}'}"
 
 
 def _stop(line: str, status: int) -> NoReturn:
-    print(f"error: {' '.join(line.split())}", file=sys.stderr, flush=True)
+    line = re.sub(r"(\S{400})\S+", r"\1...", " ".join(line.split()))  # a number of 5,000 digits
+    print(f"error: {line}", file=sys.stderr, flush=True)
     raise SystemExit(status)
 
 
@@ -153,6 +192,7 @@ def read_command_line(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("overrides", nargs="*")
     for flags in (("--help", "-h"), ("--multirun", "-m"), ("--traceback",)):
         parser.add_argument(*flags, action="store_true")
+    parser.add_argument("--help=all", action="store_true", dest="help_all")
     parser.add_argument("--version", action="version", version=f"cavin_pyro {__version__}")
     parser.add_argument("--cfg", choices=["job"])
     parser.add_argument("--config-dir")
@@ -163,16 +203,32 @@ def read_command_line(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _sweep(name: str, body: Body, line: argparse.Namespace) -> None:
-    """Let Hydra's application run a sweep, by its launchers and in its folders."""
+    """Let Hydra's application run a sweep, by its launchers: each run in a folder named by what differs."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
     from cavin_pyro.config.composition import finished, of_sweep, rewritten
 
-    def job(config: DictConfig) -> None:
-        guarded(lambda: body(finished(name, config, HydraConfig.get())), name)
+    words, found = rewritten(line.overrides), dict[str, Figures]()
+    varied, folder = of_sweep(words)
 
-    words = rewritten(line.overrides)
+    def job(config: DictConfig) -> None:
+        given = HydraConfig.get()
+        differing = [word for word in given.overrides.task if word.partition("=")[0] in varied]
+        print(f"{chr(10) if found else ''}{name} {' '.join(differing)}")
+        figures = guarded(lambda: body(finished(name, config, given, differing)), name, words)
+        found[" ".join(differing)] = figures or {}
+
     presets = [] if line.config_dir is None else ["--config-dir", str(Path(line.config_dir).resolve())]
-    sys.argv[1:] = ["--multirun", *presets, *words, *of_sweep(words)]
+    sys.argv[1:] = ["--multirun", *presets, *words, *folder]
     hydra.main(version_base="1.3", config_path=None, config_name=name)(job)()
+    print(sweep_table(found), end="")
+
+
+def sweep_table(found: Mapping[str, Figures]) -> str:
+    """A line for each run of a sweep, with its figures; empty where other processes ran them."""
+    columns = list(dict.fromkeys(column for figures in found.values() for column in figures))
+    rows = [["", *columns], *([run, *(str(of.get(one, "")) for one in columns)] for run, of in found.items())]
+    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(["", *lines, ""]) if columns else ""

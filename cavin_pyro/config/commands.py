@@ -76,7 +76,7 @@ class WorldConfig:
     )
     camera: Any = option(ENV["camera"], "depth camera", choices="cavin_pyro.envs.sensors.CAMERAS")
     segmentation: Any = option(
-        ENV["segmentation"], "of depth images", choices="cavin_pyro.envs.segmentation.SEGMENTERS"
+        ENV["segmentation"], "segmentation of depth images", choices="cavin_pyro.envs.segmentation.SEGMENTERS"
     )
     assets: str | None = option(None, "folder of meshes, for object sets and robots that need one")
     ranges: RangesConfig = field(default_factory=RangesConfig)
@@ -121,7 +121,9 @@ class TrainerConfig:
     steps: int = option(1_000_000, "gradient steps, at most", minimum=1)
     batch_size: int = option(64, "windows per step", minimum=1)
     learning_rate: float = option(1e-4, "learning rate of Adam", positive=True)
-    schedule: str = option("constant", "of the learning rate; cosine ends at 1 %", choices=("constant", "cosine"))
+    schedule: str = option(
+        "constant", "schedule of the learning rate; cosine ends at 1 %", choices=("constant", "cosine")
+    )
     batches: str = option("mixed", "bucketed: one number of objects in each", choices=("mixed", "bucketed"))
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
     cuda_graphs: bool = option(True, "on a GPU, replay each step's loss and gradients as one CUDA graph")
@@ -224,7 +226,7 @@ class CalibrateConfig(DeviceOptions):
     seed: int = seed_option()
     steps: int = option(1500, "gradient steps", minimum=1)
     batch_size: int = option(256, "windows per step", minimum=1)
-    learning_rate: float = option(3e-3, "of Adam at the start; it falls to a hundredth of that", positive=True)
+    learning_rate: float = option(3e-3, "learning rate of Adam at the start, which falls to a hundredth", positive=True)
     wake_weight: float = option(0.03, "weight of -ELBO on real windows beside the loss on generated ones", minimum=0)
     windows: int = option(2000, "held-out windows for measurements", minimum=1)
     samples: int = option(50, "samples of the guide for each window, in measurements", minimum=2)
@@ -258,7 +260,9 @@ class SceneConfig(DeviceOptions):
     layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
     reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
     criterion: str = option(
-        ENV["criterion"], "violations: the text's, or the code's", choices="cavin_pyro.envs.tasks.CRITERIA"
+        ENV["criterion"],
+        "which violations end an episode: those of the paper's text, or of its code",
+        choices="cavin_pyro.envs.tasks.CRITERIA",
     )
     objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)

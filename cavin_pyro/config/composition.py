@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import functools
 import itertools
@@ -19,11 +20,10 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, one_line
 from cavin_pyro.config.options import check_options, options, with_defaults
 
 PRESETS = Path(__file__).parent / "presets"
@@ -61,7 +61,7 @@ def composed(name: str, overrides: Sequence[str], config_dir: str | None = None)
         except UserError:
             raise
         except Exception as error:
-            raise UserError(_explained(name, words)) from error
+            raise UserError(_explained(name, words, error)) from error
 
 
 @functools.cache
@@ -87,24 +87,33 @@ def register(name: str) -> None:
             )
 
 
-def finished(name: str, config: DictConfig, hydra_config: Any) -> DictConfig:
+def finished(name: str, config: DictConfig, hydra_config: Any, differing: Sequence[str] | None = None) -> DictConfig:
     """What Hydra has composed, resolved, checked and with a folder for results, without Hydra's own section.
 
-    An option without a value, or with one out of its range, is a `UserError`.
+    An option without a value, or with one out of its range, is a `UserError`. `differing`: the overrides by which a run
+    of a sweep differs from the others, and which name its folder.
     """
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    own = copy.deepcopy(config)
+    OmegaConf.set_readonly(own, False)
+    OmegaConf.set_struct(own, False)
+    own.pop("hydra", None)
     OmegaConf.resolve(own)  # checks the types of what interpolations stand for
     # Plain, because Hydra's own interpolations mean nothing in a worker process.
     plain: Any = OmegaConf.to_container(own, throw_on_missing=True)
     check_options(COMMANDS[name], plain)
     for group in (next(iter(entry)) for entry in COMMANDS[name]().defaults if isinstance(entry, dict)):
         if not OmegaConf.select(own, group.replace("/", ".")):
-            raise UserError(f"{group} must be one of its presets, which --help lists")
-    if hydra_config.mode == RunMode.MULTIRUN:
-        plain["output"] = os.path.relpath(hydra_config.runtime.output_dir)
+            raise UserError(f"{group} must be one of {', '.join(presets(group))}")
+    if differing is not None:
+        plain["output"] = os.path.join(hydra_config.sweep.dir, _file_name(differing))
     elif not plain["output"]:
         plain["output"] = _default_output(name, plain, hydra_config)
     return OmegaConf.create(plain)
+
+
+def presets(group: str) -> list[str]:
+    """The choices in a group of presets, such as `planner`; none for a group that is not ours."""
+    return sorted(file.stem for file in (PRESETS / group).glob("*.yaml"))
 
 
 def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
@@ -118,12 +127,11 @@ def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
     yield from map(list, itertools.product(*choices))
 
 
-def of_sweep(overrides: Sequence[str]) -> list[str]:
-    """What Hydra is told about the folders of a sweep's runs: each is named by the options that differ."""
+def of_sweep(overrides: Sequence[str]) -> tuple[set[str], list[str]]:
+    """The options that vary in a sweep, and what Hydra is told about the folder of its runs."""
     parsed = [_parsed(word) for word in overrides]
-    fixed = ",".join(f"'{one.key_or_group}'" for one in parsed if not one.is_sweep_override())
     folder = [f"hydra.sweep.dir={one.value()}" for one in parsed if one.key_or_group == "output"]
-    return [f"hydra.job.config.override_dirname.exclude_keys=[{fixed}]", *folder]
+    return {one.get_key_element() for one in parsed if one.is_sweep_override()}, folder
 
 
 def rewritten(overrides: Sequence[str]) -> list[str]:
@@ -177,11 +185,15 @@ def _default_output(name: str, config: dict[str, Any], hydra_config: Any) -> str
     pattern = OUTPUT.get(name, f"runs/{name}")
     told = {*SAME_RUN, *re.findall(r"{(\w+)}", pattern)}
     overrides = [word.lstrip("+") for word in hydra_config.overrides.task if not word.endswith("={}")]
-    others = ",".join(sorted(word.replace("/", "-") for word in overrides if word.partition("=")[0] not in told))
+    others = _file_name([word for word in overrides if word.partition("=")[0] not in told])
     return pattern.format(**{**config, **hydra_config.runtime.choices}) + ("-" if others else "") + others
 
 
-def _explained(name: str, words: Sequence[str]) -> str:
+def _file_name(overrides: Sequence[str]) -> str:
+    return ",".join(sorted(word.lstrip("+").replace("/", "-") for word in overrides))
+
+
+def _explained(name: str, words: Sequence[str], raised: Exception) -> str:
     """One line about the first override with which the composition fails; those that choose presets come first."""
     words = sorted(words, key=lambda word: not ((PRESETS / word.partition("=")[0]).is_dir() or "searchpath" in word))
     known: Any = _composed(name, [])[0]
@@ -192,7 +204,7 @@ def _explained(name: str, words: Sequence[str]) -> str:
             return str(error)
         except Exception as error:
             return _reason(name, word, error, known)
-    raise AssertionError(words)
+    return one_line(raised)
 
 
 def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
@@ -204,6 +216,8 @@ def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
     if "/" not in key and not key.startswith("hydra") and OmegaConf.select(known, key, default=error) is error:
         return _unknown(name, key, known)
     first = str(error.__cause__ or error).splitlines()[0]
+    if choices := presets(key.replace(".", "/")):
+        first += f"; choose from {', '.join(choices)}"
     if first.startswith("Ambiguous value"):
         first += f"; several values need -m: python -m cavin_pyro.{name} -m {word}"
     return f"{word}: {first}"

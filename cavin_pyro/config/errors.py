@@ -7,11 +7,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "calculation overflowed")  # torch's words
+
 
 class UserError(Exception):
-    """Bad input, with its place and the valid choices: one line, shown without a traceback."""
+    """Bad input, with its place and the valid choices: one line, shown without a traceback.
+
+    `sections`: beginnings of options' names, of which the command line's head the line where it names none itself.
+    """
 
     status = 2  # of the command
+    sections: tuple[str, ...] = ()
 
 
 class WorkerError(UserError):
@@ -21,20 +27,33 @@ class WorkerError(UserError):
 
 
 @contextmanager
-def user_input() -> Iterator[None]:
-    """Turn a ValueError from reading the user's choices into a `UserError`.
+def user_input(*sections: str) -> Iterator[None]:
+    """Turn whatever is raised while the user's choices are read, or parts built from them, into a `UserError`.
 
-    Wrap only the building of parts from configuration, so that a ValueError anywhere else stays a bug with a traceback.
+    Wrap only that, so that an error anywhere else stays a bug with a traceback. For `sections` see `UserError`.
     """
     try:
         yield
-    except ValueError as error:
-        raise UserError(one_line(error)) from error
+    except (UserError, OSError):  # `guarded` says what a disk refuses
+        raise
+    except Exception as error:
+        kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "
+        refused = UserError(f"{kind}{one_line(error)}{kind and '; --traceback shows where'}")
+        refused.sections = sections
+        raise refused from error
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether an error is that of more memory than there is."""
+    torch_says = isinstance(error, RuntimeError) and any(said in str(error) for said in _NO_MEMORY)
+    return isinstance(error, MemoryError) or torch_says
 
 
 def one_line(error: BaseException) -> str:
     """What an exception says, in one line; its class if it says nothing."""
-    return " ".join(str(error).split()) or type(error).__name__
+    said = " ".join(str(error).split()) or type(error).__name__
+    more = f"these options need more memory than there is: choose smaller ones ({said[:160]})"
+    return more if lacks_memory(error) else said
 
 
 class Parser(argparse.ArgumentParser):

@@ -6,6 +6,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 from hydra.utils import get_object
@@ -13,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro import __version__
 from cavin_pyro.config.commands import COMMANDS
-from cavin_pyro.config.composition import PRESETS
-from cavin_pyro.config.options import Option, options, shown
+from cavin_pyro.config.composition import presets
+from cavin_pyro.config.options import options, shown
 
 WIDTH, INDENT = 100, 34  # columns
 EXAMPLES = {
@@ -28,10 +29,29 @@ EXAMPLES = {
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
     "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }
+EPISODES = (
+    "planner planner/optimizer layout reward objects maximum_steps seed checkpoint device output pushes_per_plan "
+    "margin planner.samples planner.horizon planner.compile env.objects env.camera env.segmentation env.assets"
+)
+USUAL = {  # options that a user of the field changes, which --help lists; --help=all lists every one
+    "collect": "env/ranges transitions output seed steps policy checkpoint minimum_objects maximum_objects repair "
+    "workers launcher env.objects env.camera env.segmentation env.assets "
+    "env.ranges.names env.ranges.mass env.ranges.friction",
+    "pretrain": "data output device seed clouds held_out_objects steps batch_size learning_rate autoencoder.width "
+    "autoencoder.feature_dimension",
+    "train": "model guide prior geometry dynamics scales objective data output device seed pointnet initial trained "
+    "trainer.steps trainer.batch_size trainer.learning_rate trainer.schedule trainer.validate_every trainer.patience "
+    "windows.held_out_objects objective.elbo.num_particles model.width model.effect_dimension model.motion_dimension",
+    "check": "sizes checkpoint a b data output seed windows sections export trust env.objects env.camera "
+    "env.segmentation env.assets sizes.guide.samples sizes.predictive.replicates sizes.subgoals.scenes",
+    "calibrate": "checkpoint data output device seed parts steps batch_size learning_rate windows samples",
+    "plan": f"{EPISODES} task tiles.goal video viewer save_goal",
+    "evaluate": f"{EPISODES} task episodes compare shard merge workers",
+    "demo": f"{EPISODES} tasks",
+    "reproduce": "scale methods planners tasks objects rewards episodes bottom_episodes models output device workers "
+    "shard table",
+}
 FACTS_OF_PRESETS = ("model_free", "default_checkpoint")  # which a preset tells the program, and users need not set
-# "name: what it means" or "one, other: what both mean", up to the next of its kind; names may be in backticks.
-NAMES = r"`?[a-z_]+`?(?:, `?[a-z_]+`?)*"
-MEANING = rf"(?:(?<=\s)|^)({NAMES}): (.+?)(?=\s{NAMES}: |\n\n|$)"
 FLAGS = {
     "-m": "one run for each value: -m seed=0,1,2 (Hydra's launchers: hydra/launcher=...)",
     "--cfg job": "print the configuration, run nothing",
@@ -41,41 +61,45 @@ FLAGS = {
 }
 
 
-def help_page(name: str, purpose: str, config: DictConfig, choices: Mapping[str, str]) -> str:
-    """The page of a command: its docstring, and its options as composed, with those of the preset of each group."""
+def help_page(
+    name: str, purpose: str, config: DictConfig, choices: Mapping[str, str], *, everything: bool = True
+) -> str:
+    """The page of a command: its docstring, and its options as composed, with those of the preset of each group.
+
+    `everything`: all options, by the part that reads them, instead of the `USUAL` ones.
+    """
     lines = [f"python -m cavin_pyro.{name} [option=value ...]     (cavin_pyro {__version__})", ""]
     lines += textwrap.wrap(" ".join(inspect.cleandoc(purpose).split()), WIDTH)
     lines += ["", "Examples"]
     lines += [f"  python -m cavin_pyro.{name} {overrides}".rstrip() for overrides in EXAMPLES[name]]
+    hidden = 0
+    for section, entries in option_entries(name, config, choices).items():
+        listed = [one for one in entries if everything or one[0].partition("=")[0] in USUAL[name].split()]
+        lines += ["", section] * bool(listed) + [line for one in listed for line in _entry(*one)]
+        hidden += len(entries) - len(listed)
+    lines += ["", "Flags"]
+    flags = {f"--help{'=all' if hidden else ''}": f"list {hidden or 'all'} {'more ' * bool(hidden)}options"} | FLAGS
+    return "\n".join([*lines, *(line for one in flags.items() for line in _entry(*one))])
+
+
+def option_entries(name: str, config: DictConfig, choices: Mapping[str, str]) -> dict[str, list[tuple[str, str]]]:
+    """Every option of a command as `name=value`, with its meaning, by the heading of the part that reads it."""
     own = {group: choice for group, choice in choices.items() if presets(group)}
-    if own:
-        lines += ["", "Presets: each sets several options, which are listed below"]
-    for group, choice in own.items():
-        lines += _entry(f"{group}={choice}", f"one of {', '.join(presets(group))}")
-    sections: dict[str, list[Option]] = {}
+    groups = [(f"{group}={choice}", f"one of {', '.join(presets(group))}") for group, choice in own.items()]
+    entries = {"Presets: each sets several options": groups}
     for one in options(COMMANDS[name]):
-        sections.setdefault(one.name.rpartition(".")[0], []).append(one)
-    for section, declared in sections.items():
-        lines += ["", f"Options of {section}" if section else "Options"]
-        for one in declared:
-            unit = f", in {one.about.unit}" if one.about.unit else ""
-            names = f"; one of {', '.join(one.about.names)}" if one.about.names else ""
-            lines += _entry(f"{one.name}={_text(OmegaConf.select(config, one.name))}", f"{one.about.help}{unit}{names}")
+        section = one.name.rpartition(".")[0]
+        unit = f", in {one.about.unit}" if one.about.unit else ""
+        names = f"; one of {', '.join(one.about.names)}" if one.about.names else ""
+        option = f"{one.name}={_text(OmegaConf.select(config, one.name))}"
+        heading = f"Options of {section}" if section else "Options"
+        entries.setdefault(heading, []).append((option, f"{one.about.help}{unit}{names}"))
     for group in own:
         part: Any = OmegaConf.select(config, group)
         if OmegaConf.is_dict(part):
-            lines += ["", f"{group.capitalize()}, for {group}={choices[group]}"]
-            for entry in _part_entries(group, OmegaConf.to_container(part)):
-                lines += _entry(*entry)
-    lines += ["", "Flags"]
-    for flag, meaning in FLAGS.items():
-        lines += _entry(flag, meaning)
-    return "\n".join(lines)
-
-
-def presets(group: str) -> list[str]:
-    """The choices in a group of presets, such as `planner`; none for a group that is not ours."""
-    return sorted(file.stem for file in (PRESETS / group).glob("*.yaml"))
+            heading = f"{group.capitalize()}, for {group}={choices[group]}"
+            entries[heading] = [*_part_entries(group, OmegaConf.to_container(part))]
+    return entries
 
 
 def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tuple[str, str]]:
@@ -84,7 +108,7 @@ def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tupl
         found = section.get("_target_") and get_object(section["_target_"])
     except Exception:  # a user's module may raise anything; building the part says it in one line
         found = None
-    meanings, kind = _meanings(found), "function" if inspect.isfunction(found) else "class"
+    meanings, kind = _meanings(found, section), "function" if inspect.isfunction(found) else "class"
     for name, value in section.items():
         said = meanings.get(name, meaning)
         if isinstance(value, dict):
@@ -96,15 +120,25 @@ def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tupl
             yield f"{prefix}.{name}={_text(value)}", said
 
 
-def _meanings(found: Any) -> Mapping[str, str]:
-    """The sentences on each argument in the docstrings of a class, its parents, their constructors, or a function."""
-    described = [found]
+def _meanings(found: Any, section: Mapping[str, Any]) -> Mapping[str, str]:
+    """The sentences on each argument in the docstrings of a class, its parents, their constructors, or a function.
+
+    "name: what it means" or "one, other: what both mean", up to the next; names may be in backticks.
+    """
+    described, known = [found], {*section}
     if inspect.isclass(found):
         described = [part for one in found.__mro__ for part in (one, vars(one).get("__init__"))]
+    for one in described:
+        with suppress(TypeError, ValueError):  # None, or a class written in C
+            known.update(inspect.signature(one).parameters)
+    name = rf"`?(?:{'|'.join(sorted(known))})`?"
+    names_of = rf"{name}(?:, {name})*"
+    entry = rf"(?:(?<=\s)|^)({names_of}): (.+?)(?=\s{names_of}: |\n\n|$)"
     meanings: dict[str, str] = {}
     for text in (inspect.cleandoc(one.__doc__) for one in described if one is not None and one.__doc__):
-        for names, said in re.findall(MEANING, text, re.S):
+        for names, said in re.findall(entry, text, re.S):
             sentence = re.split(r"(?<=[^.])\.(?:\s|$)", " ".join(said.split()))[0]
+            sentence = re.sub(r"(:\w+:)?`~?([^`]*)`", r"\2", sentence)
             sentence = re.sub(r"\bNone\b", "null", sentence)  # as the command line writes it
             for name in names.replace("`", "").split(", "):
                 meanings.setdefault(name, sentence)

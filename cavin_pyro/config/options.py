@@ -93,6 +93,7 @@ class Option(NamedTuple):
     name: str
     default: Any
     about: About
+    kind: Any
 
 
 def options(schema: Any, prefix: str = "") -> Iterator[Option]:
@@ -104,7 +105,7 @@ def options(schema: Any, prefix: str = "") -> Iterator[Option]:
         if is_dataclass(hints[one.name]):
             yield from options(default, f"{prefix}{one.name}.")
         elif "about" in one.metadata:
-            yield Option(f"{prefix}{one.name}", default, one.metadata["about"])
+            yield Option(f"{prefix}{one.name}", default, one.metadata["about"], hints[one.name])
 
 
 def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> None:
@@ -113,6 +114,8 @@ def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> 
         value: Any = config
         for part in one.name.split("."):
             value = value[part]
+        if isinstance(value, list) and one.kind is not Any and any(isinstance(entry, list | dict) for entry in value):
+            raise UserError(f"{prefix}{one.name} must be a plain list such as [a,b], not {value}")
         if value is not None:
             check_value(f"{prefix}{one.name}", value, one.about)
 
@@ -175,12 +178,12 @@ def with_defaults(value: Any, group: str = "") -> Any:
         return value
     own = {name: with_defaults(entry) for name, entry in value.items()}
     declared = constructor_options(own["_target_"]) if own.get("_target_") else {}
-    options = {"_target_": own.pop("_target_")} if "_target_" in own else {}
+    options = {"_target_": _node_of(own.pop("_target_"), str)} if "_target_" in own else {}
     for name, one in declared.items():
         if name in own or (is_shown(one) and name not in GIVEN.get(group, ())):
             option = own.pop(name) if name in own else _part_of(one.default)
             options[name] = _node_of(option, one.annotation)
-    return options | own
+    return options | {name: _node_of(option, type(option)) for name, option in own.items()}
 
 
 def constructor_options(target: str) -> dict[str, inspect.Parameter]:

@@ -16,13 +16,14 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.composition import PRESETS
-from cavin_pyro.config.errors import UserError, one_line
+from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import constructor_options
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.part import Part
 
+PARTS = ("model", "guide", "prior", "geometry", "dynamics", "scales", "objective")  # sections of a training
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "cavin_pyro.models.priors.standard.StandardPrior"
 LARGEST_SIZE = 10**6  # more would fill the memory until the system kills the process, or take minutes to begin
@@ -93,6 +94,7 @@ def build_part(section: str, config: Config, *arguments: Any, **keywords: Any) -
         return construct(config, *arguments, **keywords)
 
 
+@user_input("model", "prior", "scales", "dynamics")
 def build_model(config: Config) -> Model:
     """The model program with its parts, from the sections `model`, `prior`, `scales` and `dynamics`.
 
@@ -140,6 +142,7 @@ def _checked_model(model: Any) -> Model:
     return model
 
 
+@user_input("guide")
 def build_guide(config: Config, model: Model) -> Guide:
     """The guide program of a model, from the section `guide`.
 

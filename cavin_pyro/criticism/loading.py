@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from cavin_pyro.config.commands import WindowConfig
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.dataset import content_records, read_metadata
@@ -92,6 +92,7 @@ class Loaded(NamedTuple):
     folders: list[Path]
 
 
+@user_input("checkpoint", "data", "a", "b")
 def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 

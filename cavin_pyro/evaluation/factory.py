@@ -183,6 +183,7 @@ def make_planner(config: DictConfig, reward: RewardFunction, device: torch.devic
         return construct(options, model=model, reward=reward, **optimizers), geometry
 
 
+@user_input("planner", "checkpoint", "task", "tiles", "env", "layout", "generated", "pushes_per_plan")
 def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     """Build an environment and a planner, and run episodes with them.
 

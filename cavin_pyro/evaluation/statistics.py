@@ -12,6 +12,11 @@ from scipy.stats import binomtest
 Rate = dict[str, float]
 
 
+def counted(count: int, one: str, many: str) -> str:
+    """A number of things: "1 push", "2 pushes"."""
+    return f"{count} {one if count == 1 else many}"
+
+
 def wilson(successes: int, trials: int) -> Rate:
     """A rate with its Wilson score interval at 95 %, as fractions: rate, low, high."""
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
@@ -54,7 +59,7 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def table(results: dict[str, Any], title: str) -> str:
     """The results as a table for people; rates in per cent with their intervals."""
-    lines = [f"{title}, {results['episodes']} episodes", f"{'':16}{'rate':>8}   95 % interval"]
+    lines = [f"{title}, {counted(results['episodes'], 'episode', 'episodes')}", f"{'':16}{'rate':>8}   95 % interval"]
     for name in ("success", "violation", "fall", "timeout"):
         rate = results[name]
         lines.append(f"{name:16}{100 * rate['rate']:7.1f} %  {100 * rate['low']:5.1f} to {100 * rate['high']:5.1f} %")

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from cavin_pyro.config.commands import DEFAULT_CHECKPOINT
-from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.parts import Config, construct
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.parts import PARTS, Config, construct
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.checkpoint import POINTNET, checked_geometry, load
 
 
+@user_input(*PARTS)
 def check_fit(model: Model, geometry: Geometry, objects: int | None = None) -> None:
     """Check that a model takes these features, and says that it is trained on scenes of up to `objects`.
 

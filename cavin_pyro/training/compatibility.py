@@ -9,7 +9,8 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import nn
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.parts import PARTS
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.resume import forked
 
@@ -17,6 +18,7 @@ Site = Any  # of a trace: a dictionary of Pyro's
 Sites = dict[str, Site]
 
 
+@user_input(*PARTS)
 @torch.no_grad()
 def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> None:
     """Run both programs once and check that the guide has the sites of the model's codes, and no others.

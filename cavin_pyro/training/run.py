@@ -130,7 +130,7 @@ def build_objective(config: Config, model: Model) -> Objective:
     check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
     if "elbo" in section and section["elbo"] is None:
         raise UserError("objective.elbo must be a section, not null")
-    with user_input(), naming("objective", section):
+    with user_input("objective"), naming("objective", section):
         objective = as_objective(construct(section))
         objective.check(model)
     return objective

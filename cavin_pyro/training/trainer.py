@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from cavin_pyro.config.commands import TrainerConfig
 from cavin_pyro.config.device import send, set_matmul_precision
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.parts import PARTS
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
@@ -123,6 +124,7 @@ class Trainer:
                     bar.set_postfix(validation=f"{row['validation_loss']:.1f}", best=f"{self.best:.1f}")
                     running, since = 0.0, time.perf_counter()
 
+    @user_input(*PARTS)
     def _check_programs(self) -> None:
         """Let Pyro validate model and guide once, instead of in every step."""
         window = self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed)

@@ -22,6 +22,7 @@ from cavin_pyro.envs.scene import COLORS
 from cavin_pyro.envs.tasks import Task
 from cavin_pyro.envs.workspace import TILE_SIDE, tile_center
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
+from cavin_pyro.evaluation.statistics import counted
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.overlay import (
     OBSTACLE_COLOR,
@@ -104,8 +105,9 @@ class EpisodeRecording(EpisodeCallback):
     def on_end(self, episode: Episode) -> None:
         self._stream.set_time(TIMELINE, duration=self._seconds)
         self._log_photograph(episode.photograph)
+        made = counted(len(episode.transitions), "push", "pushes")
         level = rr.TextLogLevel.INFO if episode.outcome == "success" else rr.TextLogLevel.ERROR
-        self._stream.log("log", rr.TextLog(f"{episode.outcome} after {len(episode.transitions)} pushes", level=level))
+        self._stream.log("log", rr.TextLog(f"{episode.outcome} after {made}", level=level))
 
     def _log_plan(self, record: PlanRecord) -> None:
         """Log this plan in place of the last one."""
@@ -134,7 +136,8 @@ class EpisodeRecording(EpisodeCallback):
         stream.log("world/plan/pushes", arrows)
         expected = float(record.plan.expected_return[0])
         expectation = "" if np.isnan(expected) else f", expected return {expected:.0f}"
-        line = f"plan after {record.step} pushes, in {record.milliseconds:.0f} ms{expectation}{record.prospect}"
+        made = counted(record.step, "push", "pushes")
+        line = f"plan after {made}, in {record.milliseconds:.0f} ms{expectation}{record.prospect}"
         stream.log("log", rr.TextLog(line))
 
     def _log_paths(self, entity: str, paths: Mapping[int, NDArray[np.float64]], color: str, *, radius: float) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,10 +33,12 @@ def raising(error: BaseException) -> Callable[[], None]:
     return act
 
 
-def ended(action: Callable[[], object], capsys: pytest.CaptureFixture[str], name: str | None = None) -> tuple[int, str]:
+def ended(
+    action: Callable[[], object], capsys: pytest.CaptureFixture[str], name: str | None = None, words: Sequence[str] = ()
+) -> tuple[int, str]:
     """The exit status, and the one line on standard error."""
     with pytest.raises(SystemExit) as stop:
-        guarded(action, name)
+        guarded(action, name, words)
     output, errors = capsys.readouterr()
     assert output == "" and errors.startswith("error: ") and errors.count("\n") == 1
     return int(stop.value.code or 0), errors.removeprefix("error: ").strip()
@@ -123,11 +126,24 @@ def test_a_signal_ends_a_command_once_everything_is_saved(
     assert done == ["saved"]
 
 
-def test_only_the_reading_of_choices_turns_value_errors_into_bad_input() -> None:
-    with pytest.raises(UserError, match=r"^two lines$"), user_input():
-        raise ValueError("two\n   lines")
-    with pytest.raises(KeyError), user_input():
-        raise KeyError("a bug")
+def test_whatever_is_raised_while_choices_are_read_is_bad_input_of_the_options_in_question(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    read, words = user_input("scales", "planner"), ["scales.center=1e308", "planner/optimizer=cem", "seed=1"]
+    assert ended(read(raising(ValueError("two\n   lines"))), capsys) == (2, "two lines")
+    head = "scales.center=1e308, planner/optimizer=cem: "
+    said = ended(read(raising(OverflowError("too large"))), capsys, words=words)[1]
+    assert said.startswith(f"{head}OverflowError: too large; --traceback ")
+    assert ended(read(raising(ValueError("center is wrong"))), capsys, words=words)[1] == "center is wrong"
+    assert len(ended(read(raising(ValueError("1" * 5000))), capsys)[1]) < 500
+
+
+def test_a_path_outside_of_the_encoding_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    guarded(lambda: print("runs/b\u00fccher"))
+    output.seek(0)
+    assert output.read() == "runs/b\\xfccher\n"
 
 
 def test_packages_of_the_users_own_do_not_disturb_a_command(tmp_path: Path) -> None:
