@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cavin_pyro.storage.checkpoint import load, save
+    from cavin_pyro.training.run import fit
 
 __version__ = "0.2.0"
-__all__ = ["load", "save"]
+__all__ = ["fit", "load", "save"]
 _HOMES = {
+    "fit": "cavin_pyro.training.run",
     "load": "cavin_pyro.storage.checkpoint",
     "save": "cavin_pyro.storage.checkpoint",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pyro
 import torch
 from pyro import poutine
 from torch import nn
@@ -36,7 +37,8 @@ class AutomaticGuide(Guide):
             ValueError: an incompatible model, or a class that is no module.
         """
         super().__init__(model)
-        self.automatic = autoguide(model)
+        with pyro.settings.context(module_local_params=True):  # which Pyro's modules must know when they are made
+            self.automatic = autoguide(model)
         if not isinstance(self.automatic, nn.Module):
             raise ValueError(f"guide.autoguide makes a {type(self.automatic).__name__}, which is no torch module")
         self.register_buffer("fixed_actions", None)

@@ -4,18 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pyro
 import torch
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from pyro.infer import ELBO, Trace_ELBO
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from cavin_pyro.config.commands import TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device, free_memory
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured, shown
-from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, naming
+from cavin_pyro.config.parts import (
+    Config,
+    amortized_guides,
+    build_guide,
+    build_model,
+    check_sizes,
+    construct,
+    describe,
+    naming,
+)
 from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows
@@ -25,12 +37,14 @@ from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.checkpoint import load, save, verify_checkpoint
 from cavin_pyro.storage.files import file_digest, output_folder, write_json
 from cavin_pyro.storage.geometry import check_fit, chosen_geometry
-from cavin_pyro.storage.provenance import provenance
+from cavin_pyro.storage.provenance import provenance as of_this_process
 from cavin_pyro.storage.run_directory import check_same_data, check_same_run, write_config
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.objectives import Objective, as_objective
 from cavin_pyro.training.trainer import Trainer, fixed_windows
 
+FREE = ("data", "output", "device")  # options that may differ when a training resumes
+UNVALIDATED = {"validate_distributions_pyro": False, "validate_distributions_torch": False}
 DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
 
 
@@ -43,7 +57,7 @@ def train(config: DictConfig) -> Trainer:
     Raises:
         UserError: a configuration or data that cannot be used, or a loss that is not finite.
     """
-    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
+    pyro.settings.set(module_local_params=True, **UNVALIDATED)
     with output_folder(config.output) as folder:
         return _train(config, folder)
 
@@ -62,8 +76,8 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         objective.check(model, guide)
     started = start_from(config, model, guide, geometry) if config.initial else {}
     train_only(config.trained, model, guide)
-    signs = _mirror_signs(config.trainer.reflect, geometry, guide)
-    check_same_run(folder, config, ignore=("data", "output", "device"))
+    _mirror_signs(config.trainer.reflect, geometry, guide)
+    check_same_run(folder, config, ignore=FREE)
     check_fit(model, geometry, max(slots_of(read_metadata(folder)) for folder in data))
     windows = load_windows(
         data,
@@ -74,37 +88,114 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
         skip_corrupt=config.skip_corrupt,
         storage=folder,
     )
-    model.to(device), guide.to(device)  # made on the CPU: one seed makes the same weights for every device
-    where = place(windows, device)
+    return fit(
+        model,
+        guide,
+        windows,
+        objective=objective,
+        geometry=geometry,
+        output=folder,
+        config=config,
+        provenance={**training_provenance(data, origin, windows), **started},
+        seed=config.seed,
+        device=device.type,
+        **config.trainer,
+    )
+
+
+def fit(
+    model: Model,
+    guide: Guide,
+    windows: WindowTable,
+    *,
+    objective: Objective | ELBO | None = None,
+    geometry: Geometry | None = None,
+    output: str | Path | None = None,
+    config: Config | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    **trainer: Any,
+) -> Trainer:
+    """Train a model and its guide by stochastic variational inference; resumes an interrupted run in `output`.
+
+    run = cavin_pyro.fit(model, guide, windows, steps=2000, learning_rate=1e-3, output="runs/mine")
+
+    Args:
+        windows: of data (`cavin_pyro.data.windows.load_windows`) or of arrays (`WindowTable.from_arrays`).
+        objective: a bound of Pyro's or `cavin_pyro.training.objectives.Objective`, by default `Trace_ELBO`.
+        geometry: what made the windows' features, for the checkpoint and for `reflect`.
+        output: folder for `checkpoint.safetensors`, which `load` and the commands read, and for metrics; by default
+            nothing is written.
+        config, provenance: what the checkpoint says of itself, as in `cavin_pyro.save`.
+        seed: of batches and codes. device: cpu, cuda or auto; model and guide stay there.
+        trainer: options of `cavin_pyro.config.commands.TrainerConfig`: steps, batch_size, learning_rate and others.
+
+    Returns:
+        The run: `rows` of metrics, `best` validation loss and `best_step`, whose weights model and guide have.
+
+    Raises:
+        UserError: parts that do not fit together, an option out of its range, or a loss that is not finite.
+    """
+    options, place_of = configured(TrainerConfig, trainer, "trainer"), choose_device(device)
+    if unknown := sorted(set(trainer) - set(vars(options))):
+        raise UserError(f"fit has no option {unknown[0]!r}: choose from {', '.join(vars(options))}")
+    with user_input():
+        objective = as_objective(Trace_ELBO(max_plate_nesting=1) if objective is None else objective)
+        objective.check(model, guide)
+    signs = _mirror_signs(options.reflect, geometry, guide)
+    stored: Any = dict(config or {})
+    if "model" not in stored and output is not None:
+        parts = describe(model=model, guide=guide, geometry=geometry)
+        stored = {**parts, "trainer": vars(options), "seed": seed, **stored}
+    programs = nn.ModuleDict({"model": model, "guide": guide}).to(place_of)
+    best: dict[str, Tensor] = {}
+    with (
+        pyro.settings.context(module_local_params=True, **UNVALIDATED),
+        TemporaryDirectory() if output is None else output_folder(output) as name,
+    ):
+        folder, where = Path(name), place(windows, place_of)
+        path = folder / "checkpoint.safetensors"
+        _announce(model, guide, windows, options.batch_size, seed, where)
+        record = {**of_this_process(), **(provenance or {})}
+        if output is not None:
+            stored = OmegaConf.create(stored)
+            check_same_run(folder, stored, ignore=FREE)
+            if "data" in record:
+                check_same_data(folder, record["data"])
+            stored = write_config(folder, stored)
+
+        def keep(step: int, row: dict[str, float]) -> None:
+            best.update({name: value.clone() for name, value in programs.state_dict().items()})
+            if output is not None:
+                about = {**record, "step": step, "metrics": row}
+                save(path, model=model, guide=guide, geometry=geometry, config=stored, provenance=about)
+
+        run = Trainer(model, guide, objective, windows, folder, keep, options, seed=seed, mirror_signs=signs)
+        run.resume()
+        if run.rows:
+            _keep_best(run, path, keep)
+            best.update({name: value for name, value in load_file(path).items() if name in programs.state_dict()})
+        run.run()
+        programs.load_state_dict(best)
+        found = next(row for row in run.rows if row["step"] == run.best_step)
+        write_json(folder / "metrics.json", {**record, "steps": run.step, "best": found})
+    return run
+
+
+def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int, seed: int, where: str) -> None:
+    """Check that model and guide are compatible, and print which windows they learn from."""
     if guide.amortized:
         check_compatibility(model, guide, windows.batch(windows.training[:2]))
         print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation{where}")
     else:
-        count = len(fixed_windows(windows, config.trainer.batch_size, config.seed))
+        count = len(fixed_windows(windows, batch_size, seed))
         others = ", ".join(amortized_guides(model.name))
         print(
             f"{count} of {len(windows.training)} training windows (trainer.batch_size), for validation too{where}: "
             f"guide {type(guide).__name__} has parameters for each window, which other batches cannot train; "
             f"guides that infer any window: {others}"
         )
-
-    record = {**training_provenance(data, origin, windows), **started}
-    check_same_data(folder, record["data"])
-    stored_config = write_config(folder, config)
-    path = folder / "checkpoint.safetensors"
-
-    def keep(step: int, row: dict[str, float]) -> None:
-        about = {**record, "step": step, "metrics": row}
-        save(path, model=model, guide=guide, geometry=geometry, config=stored_config, provenance=about)
-
-    trainer = configured(TrainerConfig, config.trainer, "trainer")
-    run = Trainer(model, guide, objective, windows, folder, keep, trainer, seed=config.seed, mirror_signs=signs)
-    run.resume()
-    _keep_best(run, path, keep)
-    run.run()
-    best = next(row for row in run.rows if row["step"] == run.best_step)
-    write_json(folder / "metrics.json", {**record, "steps": run.step, "best": best})
-    return run
 
 
 def data_folders(data: str | Sequence[str]) -> list[Path]:
@@ -193,8 +284,8 @@ def _chosen_windows(config: DictConfig) -> WindowConfig:
     return chosen
 
 
-def _mirror_signs(reflect: bool, geometry: Geometry, guide: Guide) -> Tensor | None:
-    signs = geometry.mirror_signs() if reflect else None
+def _mirror_signs(reflect: bool, geometry: Geometry | None, guide: Guide) -> Tensor | None:
+    signs = geometry.mirror_signs() if reflect and geometry is not None else None
     if reflect and signs is None:
         raise UserError(
             f"trainer.reflect needs geometric features whose mirror image is known, and those of "
@@ -216,7 +307,7 @@ def place(windows: WindowTable, device: torch.device) -> str:
 def training_provenance(data: Sequence[Path], geometry: Mapping[str, Any], windows: WindowTable) -> dict[str, Any]:
     """The provenance of a trained model: the run, its data and what `geometry` says of the geometric features."""
     return {
-        **provenance(),
+        **of_this_process(),
         "data": [record for folder in data for record in content_records(folder)],
         **geometry,
         "training_windows": len(windows.training),
@@ -230,8 +321,6 @@ def _keep_best(run: Trainer, path: Path, save: Callable[[int, dict[str, float]],
     Raises:
         UserError: it is gone or damaged, and the weights in the resume file are later ones.
     """
-    if not run.rows:
-        return
     if not path.exists() and run.best_step == run.step:
         save(run.step, run.rows[-1])
     try:

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
+import pyro
 import pytest
 import torch
+from pyro.infer.autoguide import AutoNormal
+from torch import nn
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.envs.sensors.camera import Camera
 from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.factory import make_runner
+from cavin_pyro.guides.automatic import AutomaticGuide
+from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.flat import FlatModel
 from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
 from cavin_pyro.models.networks.contact.geometry import REACH, endpoints
 from cavin_pyro.models.networks.outline import Outline
@@ -20,7 +29,7 @@ from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.checkpoint import checkpoint_bytes, load
 from cavin_pyro.storage.files import file_digest
-from cavin_pyro.training.run import train
+from cavin_pyro.training.run import fit, train
 from cavin_pyro.training.trainer import Trainer, reflect
 
 CONTACT = ("geometry=outline", "dynamics=contact", "scales=predicted", "dynamics.object_width=16")
@@ -143,3 +152,40 @@ def test_a_mirrored_window_is_what_mirrored_clouds_give_and_others_stay() -> Non
 def test_the_world_is_symmetric_about_that_plane() -> None:
     assert (REACH_LOW[1], TABLE_LOW[1]) == (-REACH_HIGH[1], -TABLE_HIGH[1])
     assert (Camera().position[1], Camera().rotation) == (0.0, (0.0, 0.0, 0.0))
+
+
+def windows_by_hand() -> WindowTable:
+    generator = torch.Generator().manual_seed(0)
+    centers, features = torch.rand(20, 4, 2, 3, generator=generator), torch.randn(20, 4, 2, 64, generator=generator)
+    actions = 2 * torch.rand(20, 3, 4, generator=generator) - 1
+    features /= features.norm(dim=-1, keepdim=True)
+    return WindowTable.from_arrays(centers=centers, features=features, actions=actions)
+
+
+def test_programs_fitted_in_python_have_the_best_weights_and_resume_as_a_checkpoint(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = CascadedModel(width=8)
+    guide = CascadedGuide(model, width=8)
+    options = {"steps": 12, "validate_every": 2, "batch_size": 4, "learning_rate": 0.1, "output": tmp_path / "mine"}
+    whole = fit(model, guide, windows_by_hand(), geometry=Outline(), **options)
+    assert whole.best_step < 12  # so large a learning rate makes it worse again
+    trained = load(tmp_path / "mine" / "checkpoint.safetensors")
+    assert trained.provenance["step"] == whole.best_step
+    for part, saved in ((model, trained.model), (guide, trained.guide)):
+        assert all(torch.equal(value, saved.state_dict()[name]) for name, value in part.state_dict().items())
+    best = model.dynamics.change.head.weight.clone()
+    nn.init.zeros_(model.dynamics.change.head.weight)
+    assert fit(model, guide, windows_by_hand(), geometry=Outline(), **options).rows == whole.rows
+    assert torch.equal(model.dynamics.change.head.weight, best)
+    with pytest.raises(UserError, match=r"holds a run with seed=0, not 1: "):
+        fit(model, guide, windows_by_hand(), geometry=Outline(), seed=1, **options)
+    with pytest.raises(UserError, match=r"^fit has no option 'patients': choose from steps, .*, patience$"):
+        fit(model, guide, windows_by_hand(), patients=2)
+
+
+def test_an_automatic_guide_is_fitted_in_python_and_writes_nothing(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pyro.settings.context(module_local_params=False):  # as by default in Pyro
+        model = FlatModel(width=8)
+        run = fit(model, AutomaticGuide(model, autoguide=AutoNormal), windows_by_hand(), steps=2, batch_size=4)
+    assert run.best_step == 2 and not list(tmp_path.iterdir()) and not pyro.get_param_store().keys()
