@@ -5,27 +5,44 @@ The names of `__all__` do what the commands do. Each is imported when it is used
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from cavin_pyro.evaluation.comparison import compare
+    from cavin_pyro.evaluation.evaluation import evaluate
     from cavin_pyro.storage.checkpoint import load, save
     from cavin_pyro.training.run import fit
 
 __version__ = "0.2.0"
-__all__ = ["fit", "load", "save"]
+__all__ = ["compare", "evaluate", "fit", "load", "save"]
 _HOMES = {
-    "fit": "cavin_pyro.training.run",
-    "load": "cavin_pyro.storage.checkpoint",
-    "save": "cavin_pyro.storage.checkpoint",
+    "compare": "evaluation.comparison",
+    "evaluate": "evaluation.evaluation",
+    "fit": "training.run",
+    "load": "storage.checkpoint",
+    "save": "storage.checkpoint",
 }
+
+
+class _Package(ModuleType):
+    """`cavin_pyro.evaluate` is the function, also where the command of that name has been imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in _HOMES:
+            super().__setattr__(name, value)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+sys.modules[__name__].__class__ = _Package

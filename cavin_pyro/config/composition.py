@@ -18,13 +18,13 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.errors import UserError, one_line
-from cavin_pyro.config.options import check_options, options, with_defaults
+from cavin_pyro.config.options import check_options, flat_options, options, shown, with_defaults
 
 PRESETS = Path(__file__).parent / "presets"
 OUTPUT = {  # the folder of a run for which the user names none
@@ -39,9 +39,22 @@ SAME_RUN |= {"episodes", "compare", "merge"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
 
 
-def compose(name: str, *overrides: str) -> DictConfig:
-    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for callers in Python; see `composed`."""
-    return composed(name, overrides)[0]
+def compose(name: str, *overrides: str, **options: Any) -> DictConfig:
+    """The configuration of `python -m cavin_pyro.<name> <overrides>`, for callers in Python; see `composed`.
+
+    The same by keyword: compose("plan", task="crossing", env={"camera": "kinect2"}).
+    """
+    return composed(name, [*overrides, *(f"{one}={_word(value)}" for one, value in flat_options(options).items())])[0]
+
+
+def _word(value: Any) -> str:
+    """A value as a user types it."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(_word, value))}]"
+    if value is None or isinstance(value, bool | int | float):
+        return str(shown(value) if value is None or isinstance(value, bool) else value)
+    plain = re.fullmatch(r"(?!(null|true|false|nan|inf)$)[a-z_][\w./-]*", str(value), re.IGNORECASE)
+    return str(value) if plain else QuotedString(str(value), Quote.single).with_quotes()
 
 
 def composed(name: str, overrides: Sequence[str], config_dir: str | None = None) -> tuple[DictConfig, dict[str, str]]:

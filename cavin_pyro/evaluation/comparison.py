@@ -14,7 +14,7 @@ from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import flat_options
-from cavin_pyro.evaluation.rows import violation
+from cavin_pyro.evaluation.rows import Row, violation
 from cavin_pyro.evaluation.statistics import mcnemar
 from cavin_pyro.storage.run_directory import stored_options
 
@@ -41,14 +41,23 @@ class Comparison:
         return self.both + self.one_alone + self.other_alone + self.neither
 
 
-def compare(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]) -> Comparison:
-    """Compare rows as in `evaluation.episode_row` where both have the seed.
+Evaluation = str | Path | Mapping[str, Any] | Sequence[Mapping[str, Any]]
+"""The folder of a finished evaluation, what `evaluate` has returned, or its rows `per_episode`."""
+
+
+def compare(one: Evaluation, other: Evaluation) -> Comparison:
+    """Compare two evaluations scene by scene, where both have the seed.
+
+    cavin_pyro.compare("runs/evaluate/one", "runs/evaluate/other").p_value
 
     Raises:
-        UserError: they have no seed in common.
+        UserError: they have no seed in common, a folder holds no finished evaluation, or scenes of folders differ.
     """
-    theirs = {row["seed"]: row["outcome"] == "success" for row in other}
-    pairs = [(row["outcome"] == "success", theirs[row["seed"]]) for row in one if row["seed"] in theirs]
+    (mine, here), (theirs, there) = _opened(one), _opened(other)
+    if here is not None and there is not None:
+        _check_same_scenes(here, there, other)
+    solved = {row["seed"]: row["outcome"] == "success" for row in theirs}
+    pairs = [(row["outcome"] == "success", solved[row["seed"]]) for row in mine if row["seed"] in solved]
     if not pairs:
         raise UserError("the two evaluations have no seed in common: give both the same seed=")
     counts = {kind: pairs.count(kind) for kind in ((True, True), (True, False), (False, True), (False, False))}
@@ -56,12 +65,26 @@ def compare(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]
     return Comparison(counts[True, True], alone, others, counts[False, False], mcnemar(alone, others))
 
 
-def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
+def earlier_rows(folder: Path, config: DictConfig) -> list[Row]:
     """The episodes of another evaluation, whose scenes and rules must be those of `config`.
 
     Raises:
         UserError: there is no finished evaluation, it is damaged, or its scenes or rules differ.
     """
+    rows, theirs = _finished(folder)
+    _check_same_scenes(flat_options(OmegaConf.to_container(config, resolve=True)), theirs, folder)
+    return rows
+
+
+def _opened(evaluation: Evaluation) -> tuple[Sequence[Mapping[str, Any]], Row | None]:
+    """The rows of an evaluation, and its options if it is a folder."""
+    if isinstance(evaluation, str | Path):
+        return _finished(Path(evaluation))
+    return (evaluation["per_episode"] if isinstance(evaluation, Mapping) else evaluation), None
+
+
+def _finished(folder: Path) -> tuple[list[Row], Row]:
+    """The rows and the options of a finished evaluation."""
     try:
         rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["per_episode"]
         theirs = stored_options(folder / "config.yaml")
@@ -78,11 +101,13 @@ def earlier_rows(folder: Path, config: DictConfig) -> list[dict[str, Any]]:
     if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):
         why = "no list of episodes" if not isinstance(rows, list) else wrong
         raise UserError(f"compare={folder} holds damaged results ({why}): evaluate it again")
-    mine = flat_options(OmegaConf.to_container(config, resolve=True))
+    return rows, theirs
+
+
+def _check_same_scenes(mine: Row, theirs: Row, folder: object) -> None:
     for name in sorted(set(mine) | set(theirs)):
         if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):
             raise UserError(f"compare={folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes differ")
-    return list(rows)
 
 
 def sentences(result: Comparison, other: Path) -> str:

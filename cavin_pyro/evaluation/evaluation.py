@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
 
+from cavin_pyro.config.composition import compose
+from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
+from cavin_pyro.evaluation.comparison import compare, earlier_rows, sentences
+from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner, planner_name
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
+from cavin_pyro.evaluation.statistics import plan_summary, summarize, table
 from cavin_pyro.launching.launcher import Launcher, as_launcher, chosen_launcher, of_shard
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.files import atomic_write, output_folder, write_json
 from cavin_pyro.storage.progress import progress_bar
-from cavin_pyro.storage.run_directory import check_same_run
+from cavin_pyro.storage.provenance import provenance
+from cavin_pyro.storage.run_directory import check_same_run, write_config
 
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
@@ -29,7 +37,48 @@ NOT_COMPARED = (  # options that may differ between runs of one evaluation
 )
 
 
-def evaluate(config: DictConfig, folder: Path) -> list[Row]:
+def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]:
+    """Run seeded episodes as the command `evaluate` does, and write their results to its folder; resumes a killed one.
+
+    results = cavin_pyro.evaluate(task="crossing", checkpoint="mine.safetensors", episodes=20, output="runs/mine")
+    print(results["success"])
+
+    Args:
+        config: of the command; by default that of `options`, which are the command's: `task`, `checkpoint`, `planner`,
+            `episodes`, `workers` and others. With `workers=1` episodes run in this process, else a script needs
+            `if __name__ == "__main__":`.
+
+    Returns:
+        What `results.json` holds: `episodes`, the rates `success`, `violation`, `fall` and `timeout`, each with `rate`,
+        `low` and `high` (at 95 %), and a row for each episode in `per_episode`.
+
+    Raises:
+        UserError: an option out of its range, or a folder that holds another evaluation.
+    """
+    config = compose("evaluate", **options) if config is None else config
+    config.device = choose_device(config.device).type  # once, for all workers and for who resumes
+    with output_folder(config.output) as folder:
+        runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
+        runner.env.close()
+        seeds_of(config)
+        chosen_launcher(config)
+        others = earlier_rows(Path(config.compare), config) if config.compare else []
+        check_same_run(folder, config, ignore=NOT_COMPARED)
+        write_config(folder, config)
+        results = summarize((merge if config.merge else run_missing)(config, folder))
+        scene = f"{runner.task.name}, layout {config.layout}, {config.reward} reward, {config.objects} objects"
+        lines = [table(results, f"{scene}, {planner_name(config)}"), plan_summary(results["per_episode"], config)]
+        if others:
+            comparison = compare(results["per_episode"], others)
+            results["comparison"] = {"against": config.compare, **asdict(comparison)}
+            lines.append(sentences(comparison, Path(config.compare)))
+        write_json(folder / "results.json", {**results, "provenance": provenance()})
+        with atomic_write(folder / "results.txt") as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in lines if line), encoding="utf-8")
+    return results
+
+
+def run_missing(config: DictConfig, folder: Path) -> list[Row]:
     """Run the episodes that `episodes.jsonl` does not hold yet; returns all rows in the order of their seeds.
 
     Each finished episode is one line of that file. Rerun the same command to resume a killed evaluation; an incomplete

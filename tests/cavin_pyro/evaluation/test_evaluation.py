@@ -14,7 +14,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.pushing import PushingEnv
 from cavin_pyro.envs.workspace import executed_push
-from cavin_pyro.evaluation.evaluation import episode_row, evaluate
+from cavin_pyro.evaluation.evaluation import episode_row, run_missing
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import (
     OUTCOMES,
@@ -190,21 +190,21 @@ def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: Pushin
 
 def test_an_evaluation_runs_only_what_is_missing(configure: Any, tmp_path: Path) -> None:
     config = configure("planner=random", "seed=10")
-    first = evaluate(config, tmp_path)
+    first = run_missing(config, tmp_path)
     assert [row["seed"] for row in first] == [10, 11, 12]
     lines = (tmp_path / "episodes.jsonl").read_text().splitlines(keepends=True)
     assert [json.loads(line) for line in lines] == first
-    assert evaluate(config, tmp_path) == first
+    assert run_missing(config, tmp_path) == first
     # As after a kill: the second line is missing, and the last one was cut short.
     (tmp_path / "episodes.jsonl").write_text(lines[0] + lines[2][:-9])
     config.episodes = 4
-    again = evaluate(config, tmp_path)
+    again = run_missing(config, tmp_path)
     assert [row["seed"] for row in again] == [10, 11, 12, 13]
     assert again[0] == first[0]
     for row, earlier in zip(again, first, strict=False):
         assert {**row, "planning_ms": 0} == {**earlier, "planning_ms": 0}
     config.episodes = 2
-    assert evaluate(config, tmp_path) == again[:2]
+    assert run_missing(config, tmp_path) == again[:2]
 
 
 def parts(runner: EpisodeRunner) -> SimpleNamespace:
