@@ -120,7 +120,7 @@ def main() -> None:
         torch.manual_seed(0)
         model = CascadedModel()
         guide, window = CascadedGuide(model), random_windows(count)
-        bound = Objective(Trace_ELBO(max_plate_nesting=1)).bind(model, guide)
+        bound = Objective(Trace_ELBO(max_plate_nesting=1)).loss(model, guide)
         torch.manual_seed(1)
         ours = bound(window, 0).item()
         torch.manual_seed(1)

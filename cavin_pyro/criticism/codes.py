@@ -11,6 +11,8 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
+from cavin_pyro.criticism.loading import CheckContext
+from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, substitute, window_terms
 
@@ -73,6 +75,17 @@ def guide_density(guide: Program, window: Window, values: Codes, site: str) -> T
         trace.compute_log_prob(site_filter=lambda name, _: name == site)
         found.append(trace.nodes[site]["log_prob"].double())
     return torch.cat(found)
+
+
+def unsuitable_codes(context: CheckContext, window: Window) -> str:
+    """Why a check of codes does not apply to a model: it has none, or some are no vectors of numbers; else empty."""
+    if not context.codes:
+        return NO_CODES
+    with seeded(context.seed):
+        sampled = sample_guide(context.guide, window.map(lambda field: field[:2]), 1)
+    names = [name for name, value in sampled.items() if not value.is_floating_point() or value.dim() != 3]
+    names += [name for name in context.codes if name not in sampled]
+    return f"{', '.join(names)}: this check is of codes that the guide samples as vectors of numbers." if names else ""
 
 
 def _codes(trace: poutine.Trace) -> dict[str, Any]:

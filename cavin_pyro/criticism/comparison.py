@@ -118,7 +118,7 @@ def write_pair(config: DictConfig, names: Sequence[str], folder: Path, accept: A
     }
     pair = assess_pair({name: context for name, (context, _) in loaded.items()})
     joined = [render(verdicts_side_by_side(parts)), render(pair)]
-    write_report(folder, {**abouts["a"], **both, "trained": {}}, joined)
+    write_report(folder, {**abouts["a"], **both, "heading": "Comparison of a and b", "trained": {}}, joined)
     return joined
 
 
@@ -131,7 +131,7 @@ def verdicts_side_by_side(parts: Mapping[str, Sequence[Part]]) -> Section:
         "verdicts",
         "Verdicts side by side",
         "The whole report of each stands in the folders a and b, with each verdict's rule.",
-        Verdict(NONE, "A comparison of verdicts has none of its own."),
+        Verdict(NONE, ""),
         [f"The verdicts differ in: {'; '.join(differing)}." if differing else "All verdicts are the same."],
         levels,
         tables=[Table(["section", "a", "b"], [[one["title"], *levels[one["name"]].values()] for one, _ in pairs])],

@@ -146,7 +146,10 @@ def adjusted_difference(values: Tensor, held_out: Tensor, covariates: Tensor, ep
 
 
 def active_dimensions(context: CheckContext, window: Window) -> dict[str, dict[str, int]]:
-    """How many `dimensions` each code has, and how many of them are `active` in windows `[B]`, by the code's symbol."""
+    """How many `dimensions` each code has, and how many of them are `active` in windows `[B]`, by the code's symbol.
+
+    Codes that are no vectors of numbers are left out.
+    """
     if not context.codes:
         return {}
     return {
@@ -155,6 +158,7 @@ def active_dimensions(context: CheckContext, window: Window) -> dict[str, dict[s
             "dimensions": samples.shape[-1],
         }
         for name, samples in sample_guide(context.guide, window, SAMPLES_FOR_MEANS).items()
+        if samples.is_floating_point() and samples.dim() == 3
     }
 
 

@@ -12,7 +12,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS, Codes, guide_density, log_weights, sample_guide
+from cavin_pyro.criticism.codes import SYMBOLS, Codes, guide_density, log_weights, sample_guide, unsuitable_codes
 from cavin_pyro.criticism.estimates import Interval, arviz, covered, draw_ranks, mean_interval, rank
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
@@ -53,11 +53,11 @@ def assess_guide(
         weighted: held-out windows for importance weights, at most.
         particles: importance weights for each of these windows.
     """
-    if not context.codes:
-        return not_applicable(NAME, TITLE, NO_CODES)
     window, episodes = context.held_out(windows)
+    if reason := unsuitable_codes(context, window):
+        return not_applicable(NAME, TITLE, reason)
     with seeded(context.seed):
-        found = calibration(context.model, context.guide, window, samples=samples)
+        found = simulated_ranks(context.model, context.guide, window, samples=samples)
     joint = mean_interval((found.joint <= LEVEL).double(), episodes)
     codes = {name: code_coverage(found, name, episodes) for name in context.codes}
     graded = [joint, *(Interval(**one["informed"]) for one in codes.values())]
@@ -83,7 +83,7 @@ def assess_guide(
         ),
         [
             *(
-                f"90 % intervals of {SYMBOLS[name]} cover {Interval(**one['informed']).percent()} over the "
+                f"90 % intervals of {SYMBOLS.get(name, name)} cover {Interval(**one['informed']).percent()} over the "
                 f"{one['informed_dimensions']} informed dimensions of {one['dimensions']}."
                 for name, one in codes.items()
             ),
@@ -118,10 +118,10 @@ def simulate(model: Model, window: Window) -> tuple[Codes, Window]:
     )
     seen = torch.ones_like(window.transition_mask)
     simulated = Window(states, values.get("actions", window.actions), seen, seen[:, 0].clone())
-    return {name: values[name] for name in ("effect_code", "motion_code") if name in values}, simulated
+    return {name: values[name] for name in model.codes}, simulated
 
 
-class Calibration(NamedTuple):
+class SimulatedRanks(NamedTuple):
     """Of simulated windows `[B]`."""
 
     ranks: Codes  # by code, [B, D] in [0, 1]: uniform if the guide is the posterior
@@ -135,7 +135,9 @@ class Calibration(NamedTuple):
 
 
 @torch.no_grad()
-def calibration(model: Model, guide: Program, window: Window, *, samples: int, prior_samples: int = 32) -> Calibration:
+def simulated_ranks(
+    model: Model, guide: Program, window: Window, *, samples: int, prior_samples: int = 32
+) -> SimulatedRanks:
     """Where the true codes of windows simulated from those of `window: [B]` lie among `samples` of the guide."""
     codes, simulated = simulate(model, window)
     inferred = sample_guide(guide, simulated, samples)
@@ -148,10 +150,10 @@ def calibration(model: Model, guide: Program, window: Window, *, samples: int, p
     ]
     joint = rank(-densities[0], -densities[1][0])
     contraction = {name: 1 - inferred[name].var(0).mean(0) / prior[name].var(0).mean(0) for name in codes}
-    return Calibration(ranks, joint, contraction)
+    return SimulatedRanks(ranks, joint, contraction)
 
 
-def code_coverage(found: Calibration, name: str, episodes: Tensor) -> dict[str, Any]:
+def code_coverage(found: SimulatedRanks, name: str, episodes: Tensor) -> dict[str, Any]:
     """What 90 % intervals of a code cover, for windows of `episodes: [B]`.
 
     Returns:
@@ -193,12 +195,12 @@ def importance(context: CheckContext, windows: int, particles: int) -> dict[str,
     }
 
 
-def _figure(found: Calibration) -> Figure:
+def _figure(found: SimulatedRanks) -> Figure:
     figure = Figure(figsize=(6.5, 3.6), layout="constrained")
     panel = figure.subplots()
     for name in found.ranks:
         for number, ranks in enumerate(found.informed(name).T):
-            draw_ranks(panel, ranks, SYMBOLS[name] if number == 0 else "_", COLORS[name])
+            draw_ranks(panel, ranks, SYMBOLS.get(name, name) if number == 0 else "_", COLORS.get(name))
     draw_ranks(panel, found.joint, "jointly", JOINT_COLOR, band=True)
     panel.set(xlim=(0, 1), xlabel="rank", ylabel="ECDF minus uniform")
     panel.legend(fontsize=8, frameon=False)

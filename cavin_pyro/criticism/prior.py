@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from pyro import poutine
 from torch import Tensor, nn
 
-from cavin_pyro.criticism.codes import NO_CODES, Codes, sample_guide, sample_prior
+from cavin_pyro.criticism.codes import Codes, sample_guide, sample_prior, unsuitable_codes
 from cavin_pyro.criticism.estimates import Interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
@@ -53,14 +53,15 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
     Args:
         windows: held-out windows, at most.
     """
-    if not context.codes:
-        return not_applicable(NAME, TITLE, NO_CODES)
     window, episodes = context.held_out(windows)
+    if reason := unsuitable_codes(context, window):
+        return not_applicable(NAME, TITLE, reason)
     if len(episodes.unique()) < 2:
         return not_applicable(NAME, TITLE, "All held-out windows are of one episode: collect more transitions.")
     with seeded(context.seed):
         codes = {"guide": {name: value[0] for name, value in sample_guide(context.guide, window, 1).items()}}
-        codes["prior"] = sample_prior(context.model, window)
+        prior = sample_prior(context.model, window)
+        codes["prior"] = {name: prior[name] for name in codes["guide"]}
         elsewhere = other_episodes(episodes)
         codes["control"] = {name: value[elsewhere] for name, value in codes["prior"].items()}
         rows = {source: describe(context.model, window, values) for source, values in codes.items()}

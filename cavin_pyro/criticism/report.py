@@ -30,7 +30,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavin_pyro.criticism.section import Section
+from cavin_pyro.criticism.section import NONE, Section
 from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6
@@ -75,7 +75,11 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
     details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
     # Old checkpoints may lack some of these.
     trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
-    return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
+    heading = about.get("heading", f"Criticism of {about['model']}")
+    judged = any(part["verdict"]["level"] != NONE for part in parts)
+    return environment.from_string(source).render(
+        about=about, trained=trained, details=details, sections=parts, heading=heading, judged=judged
+    )
 
 
 def plain(value: Any) -> Any:

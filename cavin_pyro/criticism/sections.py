@@ -18,7 +18,7 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.predictive import assess_predictive
 from cavin_pyro.criticism.prior import assess_prior
 from cavin_pyro.criticism.report import Part, render
-from cavin_pyro.criticism.section import Section
+from cavin_pyro.criticism.section import NONE, Section
 from cavin_pyro.criticism.subgoals import assess_subgoals
 from cavin_pyro.storage.files import clear_abandoned, read_json, write_json
 from cavin_pyro.storage.provenance import program_fingerprint
@@ -86,9 +86,10 @@ def run_sections(
 
 
 def print_findings(parts: Sequence[Part]) -> None:
-    """Titles with their verdicts, and the findings."""
+    """Titles with their verdicts, if there are any, and the findings."""
     for part in parts:
-        print("\n  ".join([f"{part['title']} [{part['verdict']['level']}]", *part["findings"]]))
+        level = part["verdict"]["level"]
+        print("\n  ".join([part["title"] + (f" [{level}]" if level != NONE else ""), *part["findings"]]))
 
 
 def _finished(path: Path, fingerprint: str) -> Part | None:

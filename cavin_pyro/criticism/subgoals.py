@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.codes import NO_CODES
+from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS
 from cavin_pyro.criticism.estimates import Interval, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
@@ -79,6 +79,8 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
     check_objects(context.model, objects)
     if not context.codes:
         return not_applicable(NAME, TITLE, f"{NO_CODES} It generates no pushes.")
+    if others := [name for name in context.codes if name not in SYMBOLS]:
+        return not_applicable(NAME, TITLE, f"{', '.join(others)}: planning samples effect_code and motion_code alone.")
     groups: dict[str, list[SubgoalRollout]] = {}
     with progress_bar("executing", total=scenes, unit="scene") as bar:
         for rollouts in subgoal_rollouts(context, scenes=scenes, objects=objects, samples=samples):

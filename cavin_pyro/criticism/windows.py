@@ -101,7 +101,7 @@ def _tile(count: int, field: Tensor) -> Tensor:
 
 
 class _Means(Messenger):
-    """Gives every latent site but the codes the mean of its distribution."""
+    """Gives every latent site but the codes the mean of its distribution; discrete ones have none and are sampled."""
 
     def __init__(self, codes: Sequence[str]) -> None:
         super().__init__()
@@ -109,5 +109,7 @@ class _Means(Messenger):
 
     def _pyro_sample(self, message: Any) -> None:
         if message["is_observed"] or message["name"] in self._codes or site_is_subsample(message):
+            return
+        if message["fn"].has_enumerate_support:
             return
         message["value"], message["done"] = message["fn"].mean, True

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from pyro import poutine
+from pyro.infer import ELBO, TraceEnum_ELBO, TraceMeanField_ELBO
 from pyro.poutine.util import site_is_subsample
 from torch import nn
 
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import PARTS
+from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.resume import forked
 
@@ -20,26 +23,52 @@ Sites = dict[str, Site]
 
 @user_input(*PARTS)
 @torch.no_grad()
-def check_compatibility(model: nn.Module, guide: nn.Module, window: Window) -> None:
+def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: ELBO) -> None:
     """Run both programs once and check that the guide has the sites of the model's codes, and no others.
 
-    Pyro itself samples a code that the guide lacks from the prior, and counts sites that only the guide has.
-    `window: [B]`, with B of at least 2, so that one of them can be masked. The random generator's state is
-    restored afterwards.
+    Pyro itself samples a code that the guide lacks from the prior, and counts sites that only the guide has. With
+    `TraceEnum_ELBO` sites that are marked `infer={"enumerate": "parallel"}` need no guide. `window: [B]`, with B of at
+    least 2, so that one of them can be masked. The random generator's state is restored afterwards.
 
     Raises:
         UserError: a code that the guide lacks or the model does not have, one outside of the model's plates, of another
-            shape, or counted where the model does not count it.
+            shape, or counted where the model does not count it; or codes in another order than the model's, for a bound
+            whose divergences in closed form are those of the model's order; or a model that observes something where it
+            generates.
     """
     device = window.actions.device
     window = window._replace(sequence_mask=torch.arange(len(window.actions), device=device) == 0)
     with forked(device):
         wanted, found = _codes(model, window), _codes(guide, window)
+        generated = poutine.trace(model.generate).get_trace(window)
+    known = [name for name in generated.observation_nodes if not generated.nodes[name]["infer"].get("_deterministic")]
+    if known:
+        raise UserError(
+            f"model {type(model).__name__} observes {', '.join(known)} where it generates: write "
+            "obs=window.observed(...)"
+        )
     name = f"guide {type(guide).__name__}"
+    enumerated = {
+        code: site
+        for code, site in wanted.items()
+        if site["infer"].get("enumerate") == "parallel" and code not in found
+    }
+    if isinstance(elbo, TraceEnum_ELBO):
+        wanted = {code: site for code, site in wanted.items() if code not in enumerated}
+    elif enumerated:
+        raise UserError(
+            f"model {type(model).__name__} enumerates {_listed(enumerated)}, which the guide lacks: choose "
+            "objective.elbo._target_=pyro.infer.TraceEnum_ELBO"
+        )
     if wanted.keys() != found.keys():
         raise UserError(
             f"{name} samples {_listed(found)}, but the codes of model {type(model).__name__} are {_listed(wanted)}: "
             "give each code, and nothing else, a pyro.sample"
+        )
+    if isinstance(elbo, TraceMeanField_ELBO) and [*wanted] != [*found]:
+        raise UserError(
+            f"{name} samples {', '.join(found)} in this order, the model {', '.join(wanted)}: closed-form divergences "
+            "of a code given earlier ones need the model's order, so change it, or choose objective=trace_elbo"
         )
     for code, site in found.items():
         theirs = wanted[code]
@@ -66,5 +95,5 @@ def _codes(program: nn.Module, window: Window) -> Sites:
     return {name: site for name, site in sites.items() if not site_is_subsample(site)}
 
 
-def _listed(sites: Sites) -> str:
+def _listed(sites: Iterable[str]) -> str:
     return ", ".join(sorted(sites)) or "none"

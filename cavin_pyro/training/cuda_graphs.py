@@ -18,11 +18,11 @@ from torch import Tensor
 from cavin_pyro.models.networks.layers import fixed_shapes
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import elbo_terms
-from cavin_pyro.training.objectives import BoundObjective, Objective
+from cavin_pyro.training.objectives import Loss, Objective
 from cavin_pyro.training.resume import forked
 
 
-def capturable(loss: BoundObjective, window: Window) -> bool:
+def capturable(loss: Loss, window: Window) -> bool:
     """Whether a graph has the value and the gradients of this loss.
 
     The bound must be `Trace_ELBO` with one particle, whose loss for codes that are reparameterised is the sum of
@@ -30,7 +30,7 @@ def capturable(loss: BoundObjective, window: Window) -> bool:
     term. A subclass of the objective may do anything else.
     """
     objective = loss.objective
-    if type(objective) is not Objective or type(loss) is not BoundObjective or not loss.guide.amortized:
+    if type(objective) is not Objective or type(loss) is not Loss or not loss.guide.amortized:
         return False
     if type(objective.elbo) is not Trace_ELBO or objective.elbo.num_particles != 1:
         return False
@@ -42,7 +42,7 @@ def capturable(loss: BoundObjective, window: Window) -> bool:
     return all(code.has_rsample for code in codes)
 
 
-def capturable_loss(loss: BoundObjective, window: Window) -> Tensor:
+def capturable_loss(loss: Loss, window: Window) -> Tensor:
     """The loss of a batch `[B]` that is `capturable`, summed over its windows: a scalar."""
     with loss.model.encoding(window):
         terms = elbo_terms(loss.model, loss.guide, window)
@@ -52,7 +52,7 @@ def capturable_loss(loss: BoundObjective, window: Window) -> Tensor:
 class CapturedLoss:
     """Captures the mean loss per window, and its gradients, once for each shape of a batch, and replays it."""
 
-    def __init__(self, loss: BoundObjective) -> None:
+    def __init__(self, loss: Loss) -> None:
         self._loss = loss
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
         self._graphs: dict[torch.Size, tuple[Any, Window, Tensor, list[Tensor | None]]] = {}

@@ -9,6 +9,7 @@ from typing import Any
 import pyro
 import torch
 from pyro import poutine
+from pyro.distributions.util import scale_and_mask
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
@@ -28,7 +29,9 @@ def window_terms(
 ) -> dict[str, Tensor]:
     """Each term of -ELBO for each window of a batch [B], from one sample of the codes, or from K.
 
-    The sum over terms is minus the logarithm of the sample's importance weight.
+    The sum over terms is minus the logarithm of the sample's importance weight. Sites of the model that the guide lacks
+    and that are marked `infer={"enumerate": "parallel"}` are summed out: each other term is its mean over their
+    posterior given the sample, and theirs is the divergence of that from their prior.
 
     Args:
         particles: K, an outermost plate of independent samples; the programs must broadcast over it.
@@ -42,21 +45,60 @@ def window_terms(
     """
     with pyro.plate("particles", particles, dim=-2) if particles else nullcontext():
         guided = poutine.trace(substitute(guide, fixed or {})).get_trace(window)
-        joint = poutine.trace(poutine.replay(model, trace=guided)).get_trace(window)
+        replayed = poutine.enum(poutine.replay(model, trace=guided), first_available_dim=-3 if particles else -2)
+        joint = poutine.trace(replayed).get_trace(window)
     guided.compute_log_prob()
     joint.compute_log_prob()
+    expectation, divergences = sum_out(joint)
     terms = {}
     for name, site in joint.nodes.items():
         if site["type"] != "sample" or site_is_subsample(site):
             continue
-        if site["is_observed"]:
-            terms[f"nll_{name}"] = -site["log_prob"]
+        if name in divergences:
+            terms[f"kl_{name}"] = divergences[name]
+        elif site["is_observed"]:
+            terms[f"nll_{name}"] = -expectation(site["log_prob"])
         else:
-            terms[f"kl_{name}"] = guided.nodes[name]["log_prob"] - site["log_prob"]
+            terms[f"kl_{name}"] = guided.nodes[name]["log_prob"] - expectation(site["log_prob"])
     auxiliary = {
         name: site for name, site in guided.nodes.items() if site["type"] == "sample" and name not in joint.nodes
     }
     return terms | {f"kl_{name}": site["log_prob"] for name, site in auxiliary.items() if not site_is_subsample(site)}
+
+
+def sum_out(joint: poutine.Trace) -> tuple[Callable[[Tensor], Tensor], dict[str, Tensor]]:
+    """Sums enumerated sites out of a trace of the model, whose log densities are computed.
+
+    Returns:
+        The expectation of a log density over their exact posterior, and by site the divergence of that from its prior.
+        Without such sites the expectation is the identity.
+    """
+    samples = [site for site in joint.nodes.values() if site["type"] == "sample" and not site_is_subsample(site)]
+    dims = {site["name"]: site["infer"].get("_enumerate_dim") for site in samples}
+    dims = {name: dim for name, dim in dims.items() if dim is not None}  # -2, -3, ... in the order of sampling
+    if not dims:
+        return lambda log_density: log_density, {}
+    outermost = max(dims.values())
+    table = sum(site["log_prob"] for site in samples if site["log_prob"].dim() >= -outermost)
+    every = tuple(dims.values())
+    posterior = (table - table.logsumexp(every, keepdim=True)).detach()
+    weights = posterior.exp()
+
+    def expectation(log_density: Tensor) -> Tensor:
+        if log_density.dim() < -outermost:
+            return log_density
+        return (weights * log_density).where(weights > 0, 0.0).sum(every)
+
+    divergences = {}
+    given = torch.zeros(())
+    for place, name in enumerate(dims):
+        later = every[place + 1 :]
+        marginal = posterior.logsumexp(later, keepdim=True) if later else posterior
+        divergences[name] = scale_and_mask(
+            expectation(marginal - given) - expectation(joint.nodes[name]["log_prob"]), mask=joint.nodes[name]["mask"]
+        )
+        given = marginal
+    return expectation, divergences
 
 
 def substitute(program: Program, values: Mapping[str, Tensor]) -> Program:

@@ -127,14 +127,14 @@ class Objective:
                 f"{type(model).__name__} has none: choose objective=trace_elbo"
             )
 
-    def bind(self, model: Model, guide: Guide) -> BoundObjective:
+    def loss(self, model: Model, guide: Guide) -> Loss:
         """The loss of one model and guide, as a module with the parameters of both."""
         self.check(model, guide)
-        return BoundObjective(self, model, guide)
+        return Loss(self, model, guide)
 
 
-class BoundObjective(nn.Module):
-    """An objective together with the model and the guide whose parameters it trains."""
+class Loss(nn.Module):
+    """An objective of one model and guide, whose parameters it trains."""
 
     def __init__(self, objective: Objective, model: Model, guide: Guide) -> None:
         super().__init__()

@@ -156,6 +156,8 @@ def fit(
     ):
         folder, where = Path(name), place(windows, place_of)
         path = folder / "checkpoint.safetensors"
+        if guide.amortized:
+            check_compatibility(model, guide, windows.batch(windows.training[:2]), objective.elbo)
         _announce(model, guide, windows, options.batch_size, seed, where)
         record = {**of_this_process(), **(provenance or {})}
         if output is not None:
@@ -184,9 +186,8 @@ def fit(
 
 
 def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int, seed: int, where: str) -> None:
-    """Check that model and guide are compatible, and print which windows they learn from."""
+    """Print which windows model and guide learn from."""
     if guide.amortized:
-        check_compatibility(model, guide, windows.batch(windows.training[:2]))
         print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation{where}")
     else:
         count = len(fixed_windows(windows, batch_size, seed))

@@ -77,7 +77,7 @@ class Trainer:
         self._fixed = None if guide.amortized else fixed_windows(windows, config.batch_size, seed)
         if self._fixed is not None:
             guide(windows.batch(self._fixed))  # makes its parameters
-        self._loss = objective.bind(model, guide)
+        self._loss = objective.loss(model, guide)
         self._captured: CapturedLoss | None = None
         self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
         trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
@@ -87,11 +87,6 @@ class Trainer:
         torch.manual_seed(seed)
         self.step, self.best, self.best_step, self.stale = 0, math.inf, 0, 0
         self.rows: list[Row] = []
-
-    @property
-    def resume_path(self) -> Path:
-        """The file with the complete state of training at the last validation."""
-        return self.folder / "resume.safetensors"
 
     def run(self) -> None:
         """Train until the steps are done or patience is lost; resumes from the resume file if it exists.
@@ -111,8 +106,13 @@ class Trainer:
             # Pyro warns many times about one NaN; this loop checks and stops.
             warnings.filterwarnings("ignore", "Encountered", UserWarning)
             while self.step < config.steps and self.stale < config.patience:
-                running += self._loss_and_gradients(self._sample())
-                self._apply_gradients()
+                window = self._sample()
+                running += self._loss_and_gradients(window)
+                norm = nn.utils.clip_grad_norm_(self._loss.parameters(), config.clip_norm)
+                if not math.isfinite(norm.item()):
+                    self._stop_at("gradient")
+                self._optimizer.param_groups[0]["lr"] = config.rate(self.step)
+                self._optimizer.step()
                 self.step += 1
                 bar.update()
                 if self.step % config.validate_every == 0 or self.step == config.steps:
@@ -123,15 +123,6 @@ class Trainer:
                     board.add(row)
                     bar.set_postfix(validation=f"{row['validation_loss']:.1f}", best=f"{self.best:.1f}")
                     running, since = 0.0, time.perf_counter()
-
-    @user_input(*PARTS)
-    def _check_programs(self) -> None:
-        """Let Pyro validate model and guide once, instead of in every step."""
-        window = self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed)
-        with forked(self.windows.device):  # with gradients, which TraceEnum_ELBO demands
-            self._loss(window, self.step)
-        if self.config.cuda_graphs and self.windows.device.type == "cuda" and capturable(self._loss, window):
-            self._captured = CapturedLoss(self._loss)
 
     def _sample(self) -> Window:
         """A batch of training windows, some of them mirrored if there are mirror signs."""
@@ -166,22 +157,6 @@ class Trainer:
         if self._captured is None:
             loss.backward()
         return value
-
-    def _apply_gradients(self) -> None:
-        """A step of the optimizer with the clipped gradients and the scheduled learning rate."""
-        norm = nn.utils.clip_grad_norm_(self._loss.parameters(), self.config.clip_norm)
-        if not math.isfinite(norm.item()):
-            self._stop_at("gradient")
-        for group in self._optimizer.param_groups:
-            group["lr"] = self.config.rate(self.step)
-        self._optimizer.step()
-
-    def _stop_at(self, term: str) -> None:
-        kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
-        raise UserError(
-            f"training stopped after step {self.step}: the term {term} is not finite; {kept}: "
-            "look at the data, or lower trainer.learning_rate"
-        )
 
     def _validate(self, training_loss: float, windows_per_second: float) -> Row:
         """The metrics of a validation, which are also the last of `rows`."""
@@ -241,6 +216,27 @@ class Trainer:
         for part, module in (("model", self.model), ("guide", self.guide)):
             tensors |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
         write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {})
+
+    @property
+    def resume_path(self) -> Path:
+        """The file with the complete state of training at the last validation."""
+        return self.folder / "resume.safetensors"
+
+    @user_input(*PARTS)
+    def _check_programs(self) -> None:
+        """Let Pyro validate model and guide once, instead of in every step."""
+        window = self.windows.batch(self.windows.training[:2] if self._fixed is None else self._fixed)
+        with forked(self.windows.device):  # with gradients, which TraceEnum_ELBO demands
+            self._loss(window, self.step)
+        if self.config.cuda_graphs and self.windows.device.type == "cuda" and capturable(self._loss, window):
+            self._captured = CapturedLoss(self._loss)
+
+    def _stop_at(self, term: str) -> None:
+        kept = f"the best checkpoint, of step {self.best_step}, stays" if self.rows else "there is no checkpoint yet"
+        raise UserError(
+            f"training stopped after step {self.step}: the term {term} is not finite; {kept}: "
+            "look at the data, or lower trainer.learning_rate"
+        )
 
     def resume(self) -> None:
         """Take over the state in the resume file, if there is one.

@@ -30,6 +30,7 @@ from cavin_pyro.data.dataset import content_records
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.storage.checkpoint import load, save
 from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
+from tests.guides.user_programs import InferredKindsGuide, KindsGuide, KindsModel
 
 SMALL = [*SMALL_CHECK, "sizes.subgoals.scenes=2"]
 
@@ -84,6 +85,22 @@ def test_other_models_are_checked_for_what_they_have(
     parts = sections.run_sections(list(sections.SECTIONS), context, config.sizes, tmp_path, "")
     nothing = {part["name"] for part in parts if "The model has no codes" in " ".join(part["findings"])}
     assert nothing == ({"guide", "prior", "subgoals"} if name == "dynamics" else set())
+
+
+@pytest.mark.parametrize("kind", [KindsGuide, InferredKindsGuide])
+def test_a_discrete_latent_of_a_users_model_is_left_to_the_sections_that_it_suits(
+    kind: type[KindsGuide], cascade: CheckContext, tmp_path: Path
+) -> None:
+    model = KindsModel(width=8, motion_dimension=4).double().requires_grad_(False)
+    context = replace(cascade, model=model, guide=kind(model, width=8).double().requires_grad_(False))
+    names = ["elbo", "guide", "prior", "predictive", "intervals"]
+    sizes = {"guide": {"samples": 8, "particles": 20}, "predictive": {"replicates": 2}, "intervals": {"samples": 8}}
+    parts = {part["name"]: part for part in sections.run_sections(names, context, sizes, tmp_path, "")}
+    unsuited = {name for name, part in parts.items() if part["verdict"]["level"] == "none"}
+    assert unsuited == ({"guide", "prior"} if kind is InferredKindsGuide else set())
+    for name in unsuited:
+        assert parts[name]["findings"] == ["kind: this check is of codes that the guide samples as vectors of numbers."]
+    assert "kl_kind" in parts["elbo"]["values"]["validation"] and "z" in parts["elbo"]["values"]["active"]
 
 
 def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
@@ -204,6 +221,9 @@ def test_two_checkpoints_are_compared_on_the_windows_that_both_held_out(
     assert 0 < first["a"]["about"]["windows"]["validation"] < alone["windows"]["validation"]
     assert set(first["."]["sections"]) == {"verdicts", "comparison"}
     assert first["."]["about"]["checkpoint"] == f"a: {tmp_path / 'a'}; b: {tmp_path / 'b'}"
+    pages = {name: (folder / name / "report.html").read_text() for name in ("a", ".")}
+    assert "<h1>Comparison of a and b</h1>" in pages["."] and "<h1>Criticism of CascadedModel</h1>" in pages["a"]
+    assert "<li>f: next states: a minus b" in pages["."]
     trained("b", seed=1)  # another training under the same path, which held out all windows of a
     assert check()["a"]["about"]["windows"] == alone["windows"]
     assert check_pair(config) and not check_pair(compose("check"))

@@ -14,6 +14,7 @@ import pyro
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
+from pyro.infer import Trace_ELBO
 
 from cavin_pyro.config import parts as building
 from cavin_pyro.config.commands import TrainerConfig, WindowConfig
@@ -193,8 +194,8 @@ def test_model_and_guide_are_checked_by_their_sites(few: Window) -> None:
             model = building.build_model(config)
             guide = building.build_guide(config, model)
             torch.set_rng_state(state)
-            check_compatibility(model, guide, few)
+            check_compatibility(model, guide, few, Trace_ELBO())
             assert torch.equal(torch.get_rng_state(), state)
     model = building.build_model(composed("cascaded", "cascaded"))
     with pytest.raises(UserError, match="samples effect_code, more, motion_code, but the codes of model Cascaded"):
-        check_compatibility(model, WithMore(model, width=8), few)
+        check_compatibility(model, WithMore(model, width=8), few, Trace_ELBO())

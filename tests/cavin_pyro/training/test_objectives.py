@@ -25,7 +25,7 @@ from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.bounds import DifferentiableRenyiELBO
 from cavin_pyro.training.cuda_graphs import capturable, capturable_loss
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, term_counts
-from cavin_pyro.training.objectives import BoundObjective, Objective, as_objective, counterfactual_loss, rollout_loss
+from cavin_pyro.training.objectives import Loss, Objective, as_objective, counterfactual_loss, rollout_loss
 from cavin_pyro.training.run import build_objective
 
 Programs = tuple[nn.Module, nn.Module]
@@ -67,7 +67,7 @@ def windows(dtype: torch.dtype) -> Window:
 
 def loss_at(objective: Objective, programs: Programs, window: Window, step: int = 0) -> Tensor:
     torch.manual_seed(7)
-    return objective.bind(*programs)(window, step)
+    return objective.loss(*programs)(window, step)
 
 
 def terms(programs: Programs, window: Window) -> dict[str, Tensor]:
@@ -228,11 +228,11 @@ def test_a_plain_elbo_is_an_objective_and_nothing_else_is(programs: Programs, wi
 CONTACT = ("geometry=outline", "dynamics=contact", "scales=predicted", "prior=mixture", "objective=rollout")
 
 
-def bound_loss(*options: str) -> BoundObjective:
+def bound_loss(*options: str) -> Loss:
     config = compose("train", "model.width=8", *options)
     torch.manual_seed(0)
     model = build_model(config)
-    return build_objective(config, model).bind(model, build_guide(config, model))
+    return build_objective(config, model).loss(model, build_guide(config, model))
 
 
 @pytest.mark.parametrize(
