@@ -33,7 +33,7 @@ from cavin_pyro.data.features import cloud_features
 from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.randomness import collection_streams
 from cavin_pyro.envs.scene import FALLEN, Scene
-from cavin_pyro.models.state import State, Window, stack_steps
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.checkpoint import load
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
@@ -140,7 +140,8 @@ def predictions(path: str, episodes: Sequence[tuple[list[str], list[Push]]]) -> 
                 here = model.next_state(here, action)
             rolled.append(here.centers[0].numpy())
             if ahead == T and "effect_code" in model.codes:
-                states = stack_steps([first, *(state(push.after) for push in pushes)])
+                each = zip(first, *(state(push.after) for push in pushes), strict=True)
+                states = State(*(torch.stack(fields, dim) for fields, dim in zip(each, (-3, -3, -2), strict=True)))
                 window = Window(states, actions, torch.ones(1, T, dtype=torch.bool), torch.ones(1, dtype=torch.bool))
                 site: Any = poutine.trace(guide).get_trace(window).nodes["effect_code"]
                 inferred.append(model.subgoal(first, site["fn"].mean).centers[0].numpy())

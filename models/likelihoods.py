@@ -40,21 +40,20 @@ class Scales:
         `mask: [..., M]`: objects that count; others (padding) do not contribute. `predicted: [..., M, 2]`, scales of
         centres (metres) and features that the network of the mean predicts; only `PredictedScales` reads them.
         """
-        own = None if predicted is None else predicted[..., 0]
-        return self._around_centers(mean.centers, own).mask(mask).to_event(event_dims)
+        scale = None if predicted is None else predicted[..., 0]
+        return self._around(mean.centers, self.center, scale, of_centers=True).mask(mask).to_event(event_dims)
 
     def features(
         self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
     ) -> TorchDistribution:
         """Observed features around `mean`: event `[M, F]`, or `[T, M, F]` for `event_dims=2`."""
-        own = None if predicted is None else predicted[..., 1]
-        return self._around_features(mean.features, own).mask(mask).to_event(event_dims)
+        scale = None if predicted is None else predicted[..., 1]
+        return self._around(mean.features, self.feature, scale).mask(mask).to_event(event_dims)
 
-    def _around_centers(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
-        return IsotropicNormal(mean, self.center)
-
-    def _around_features(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
-        return IsotropicNormal(mean, self.feature)
+    def _around(
+        self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None, *, of_centers: bool = False
+    ) -> Isotropic:
+        return IsotropicNormal(mean, scale)
 
     def actions(self, mean: Tensor) -> TorchDistribution:
         """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
@@ -96,15 +95,12 @@ class PredictedScales(LikelihoodScales):
     degrees_of_freedom: float = 3.0
     height_ratio: float = 1.0
 
-    def _around_centers(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
+    def _around(
+        self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None, *, of_centers: bool = False
+    ) -> Isotropic:
         if predicted is None:
-            return super()._around_centers(mean, predicted)
-        return IsotropicStudentT(self.degrees_of_freedom, mean, predicted, self.height_ratio)
-
-    def _around_features(self, mean: Tensor, predicted: Tensor | None) -> Isotropic:
-        if predicted is None:
-            return super()._around_features(mean, predicted)
-        return IsotropicStudentT(self.degrees_of_freedom, mean, predicted)
+            return super()._around(mean, scale, predicted)
+        return IsotropicStudentT(self.degrees_of_freedom, mean, predicted, self.height_ratio if of_centers else None)
 
 
 class LearnedScales(Scales, Part):

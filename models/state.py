@@ -108,12 +108,3 @@ class Window(NamedTuple):
             function(self.transition_mask),
             function(self.sequence_mask),
         )
-
-
-def stack_steps(states: Sequence[State]) -> State:
-    """Stack states `[...]` of successive times into one state with leading dimensions `[..., T]`."""
-    return State(
-        torch.stack([state.centers for state in states], -3),
-        torch.stack([state.features for state in states], -3),
-        torch.stack([state.mask for state in states], -2),
-    )

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import pyro
 import torch
 from pyro import poutine
-from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.models.state import Window
-from cavin_pyro.training.elbo import Program, substitute, window_terms
+from cavin_pyro.training.elbo import Program, latent_sites, substitute, window_terms
 
 ROWS = 4096  # particles times windows at once: some 100 MB with five objects
 NO_CODES = "The model has no codes, so there is nothing to check here."
@@ -34,13 +32,13 @@ def log_weights(
     Returns:
         `[K, B]`, float64.
     """
-    found = []
+    pieces = []
     step = max(1, ROWS // max(1, len(window.actions)))
     for start in range(0, particles, step):
         here = {name: value[start : start + step] for name, value in (fixed or {}).items()}
         terms = window_terms(model, guide, window, particles=min(step, particles - start), fixed=here)
-        found.append(-torch.stack([term.double() for term in terms.values()]).sum(0))
-    return torch.cat(found)
+        pieces.append(-torch.stack([term.double() for term in terms.values()]).sum(0))
+    return torch.cat(pieces)
 
 
 @torch.no_grad()
@@ -51,7 +49,7 @@ def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
     for start in range(0, samples, step):
         with pyro.plate("particles", min(step, samples - start), dim=-2):
             trace = poutine.trace(guide).get_trace(window)
-        for name, site in _codes(trace).items():
+        for name, site in latent_sites(trace).items():
             pieces.setdefault(name, []).append(site["value"])
     return {name: torch.cat(values) for name, values in pieces.items()}
 
@@ -59,22 +57,22 @@ def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
 @torch.no_grad()
 def sample_prior(model: Program, window: Window) -> Codes:
     """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first."""
-    codes = _codes(poutine.trace(model).get_trace(window))
+    codes = latent_sites(poutine.trace(model).get_trace(window))
     return {name: site["value"] for name, site in codes.items()}
 
 
 @torch.no_grad()
 def guide_density(guide: Program, window: Window, values: Codes, site: str) -> Tensor:
     """log q(value | window) at one site for `values: [K, B, D]` of all sites: `[K, B]` float64."""
-    particles, found = len(values[site]), []
+    particles, pieces = len(values[site]), []
     step = max(1, ROWS // max(1, len(window.actions)))
     for start in range(0, particles, step):
         here = {name: value[start : start + step] for name, value in values.items()}
         with pyro.plate("particles", len(here[site]), dim=-2):
             trace = poutine.trace(substitute(guide, here)).get_trace(window)
         trace.compute_log_prob(site_filter=lambda name, _: name == site)
-        found.append(trace.nodes[site]["log_prob"].double())
-    return torch.cat(found)
+        pieces.append(trace.nodes[site]["log_prob"].double())
+    return torch.cat(pieces)
 
 
 def unsuitable_codes(context: CheckContext, window: Window) -> str:
@@ -86,9 +84,3 @@ def unsuitable_codes(context: CheckContext, window: Window) -> str:
     names = [name for name, value in sampled.items() if not value.is_floating_point() or value.dim() != 3]
     names += [name for name in context.codes if name not in sampled]
     return f"{', '.join(names)}: this check is of codes that the guide samples as vectors of numbers." if names else ""
-
-
-def _codes(trace: poutine.Trace) -> dict[str, Any]:
-    """Latent sites, without plates, which are sites of a trace too."""
-    sites = {name: trace.nodes[name] for name in trace.stochastic_nodes}
-    return {name: site for name, site in sites.items() if not site_is_subsample(site)}

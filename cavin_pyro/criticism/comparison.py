@@ -66,14 +66,16 @@ def load_pair(config: DictConfig, accept: Accept | None = None) -> dict[str, tup
     """
     world = collecting_world(config.env)
     both = {name: load_trained(config, config[name], accept) for name in ("a", "b")}
-    choices = [(one.checkpoint.model.segment_length, list(one.selection.held_out_objects)) for one in both.values()]
+    choices = [
+        (loaded.checkpoint.model.segment_length, list(loaded.selection.held_out_objects)) for loaded in both.values()
+    ]
     if choices[0] != choices[1]:
         raise UserError(
             "a and b cannot be compared on the same windows: they have segments of "
             f"{' and '.join(str(length) for length, _ in choices)} pushes and hold out the objects "
             f"{' and '.join(str(objects) for _, objects in choices)}"
         )
-    starts = [one.table.starts[unmasked_windows(one.table, _unseen(one))] for one in both.values()]
+    starts = [loaded.table.starts[unmasked_windows(loaded.table, _unseen(loaded))] for loaded in both.values()]
     common = starts[0][torch.isin(starts[0], starts[1])].sort().values
     if not len(common):
         raise UserError("no window was held out by both a and b: give other data=, on which neither was trained")
@@ -125,8 +127,8 @@ def write_pair(config: DictConfig, names: Sequence[str], folder: Path, accept: A
 def verdicts_side_by_side(parts: Mapping[str, Sequence[Part]]) -> Section:
     """A row for each section: the verdicts of `a` and `b`."""
     pairs = list(zip(parts["a"], parts["b"], strict=True))
-    levels = {one["name"]: {"a": one["verdict"]["level"], "b": other["verdict"]["level"]} for one, other in pairs}
-    differing = [one["title"] for one, _ in pairs if levels[one["name"]]["a"] != levels[one["name"]]["b"]]
+    levels = {part["name"]: {"a": part["verdict"]["level"], "b": other["verdict"]["level"]} for part, other in pairs}
+    differing = [part["title"] for part, _ in pairs if levels[part["name"]]["a"] != levels[part["name"]]["b"]]
     return Section(
         "verdicts",
         "Verdicts side by side",
@@ -134,7 +136,7 @@ def verdicts_side_by_side(parts: Mapping[str, Sequence[Part]]) -> Section:
         Verdict(NONE, ""),
         [f"The verdicts differ in: {'; '.join(differing)}." if differing else "All verdicts are the same."],
         levels,
-        tables=[Table(["section", "a", "b"], [[one["title"], *levels[one["name"]].values()] for one, _ in pairs])],
+        tables=[Table(["section", "a", "b"], [[part["title"], *levels[part["name"]].values()] for part, _ in pairs])],
     )
 
 
@@ -149,7 +151,7 @@ def assess_pair(contexts: Mapping[str, CheckContext], samples: int = 16) -> Sect
         window, episodes = context.held_out(len(context.validation.actions))
         with seeded(context.seed):
             terms[name] = terms_by_window(context.model, context.guide, window, samples, BATCH)
-    found = {
+    differences = {
         term: mean_interval(first - terms["b"][term], episodes)
         for term, first in terms["a"].items()
         if term in terms["b"]
@@ -159,8 +161,11 @@ def assess_pair(contexts: Mapping[str, CheckContext], samples: int = 16) -> Sect
         "a and b on the same held-out windows",
         EXPLANATION.format(windows=len(episodes), episodes=len(episodes.unique())),
         conclude(NONE, "A difference counts if its 95 % interval excludes 0.", "", episodes),
-        [f"{term}: a minus b {one.text()} nats per window: {better(one)}." for term, one in found.items()],
-        {term: {**one._asdict(), "better": better(one)} for term, one in found.items()},
+        [
+            f"{term}: a minus b {difference.text()} nats per window: {better(difference)}."
+            for term, difference in differences.items()
+        ],
+        {term: {**difference._asdict(), "better": better(difference)} for term, difference in differences.items()},
     )
 
 

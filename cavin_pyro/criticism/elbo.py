@@ -58,15 +58,17 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
         }
         active = active_dimensions(context, parts["validation"][0])
     means = {
-        name: {term: mean_interval(value, parts[name][1]) for term, value in found.items()}
-        for name, found in terms.items()
+        name: {term: mean_interval(value, parts[name][1]) for term, value in of_part.items()}
+        for name, of_part in terms.items()
     }
     covariates = torch.cat([scene_sizes(part) for part, _ in parts.values()])
     held_out = torch.arange(len(covariates)) >= len(parts["training"][1])
     # An episode is either in training or held out, so its number alone may name two: the sign tells them apart.
     clusters = torch.cat([parts["training"][1], -1 - parts["validation"][1]])
     differences = {
-        term: adjusted_difference(torch.cat([found[term] for found in terms.values()]), held_out, covariates, clusters)
+        term: adjusted_difference(
+            torch.cat([of_part[term] for of_part in terms.values()]), held_out, covariates, clusters
+        )
         for term in terms["training"]
     }
     counts = {name: len(episodes) for name, (_, episodes) in parts.items()}
@@ -84,8 +86,11 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
         ),
         _findings(differences, means["validation"], active),
         {
-            **{name: {term: one._asdict() for term, one in found.items()} for name, found in means.items()},
-            "difference": {term: one._asdict() for term, one in differences.items()},
+            **{
+                name: {term: interval._asdict() for term, interval in of_part.items()}
+                for name, of_part in means.items()
+            },
+            "difference": {term: interval._asdict() for term, interval in differences.items()},
             "active": active,
             "windows": counts,
         },
@@ -108,7 +113,7 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
 @torch.no_grad()
 def terms_by_window(model: Program, guide: Program, window: Window, samples: int, batch: int) -> dict[str, Tensor]:
     """Terms of -ELBO by label, and their sum, for each window: `[B]` float64."""
-    found: dict[str, list[Tensor]] = {}
+    pieces: dict[str, list[Tensor]] = {}
     for start in range(0, len(window.actions), batch):
         part = window.map(lambda field, rows=slice(start, start + batch): field[rows])  # type: ignore[misc]
         terms: dict[str, Tensor] = {}
@@ -117,8 +122,8 @@ def terms_by_window(model: Program, guide: Program, window: Window, samples: int
             terms[label] = terms.get(label, torch.zeros(())) + term.double().mean(0)
         terms[TOTAL] = torch.stack(list(terms.values())).sum(0)
         for label, term in terms.items():
-            found.setdefault(label, []).append(term)
-    return {label: torch.cat(parts) for label, parts in found.items()}
+            pieces.setdefault(label, []).append(term)
+    return {label: torch.cat(parts) for label, parts in pieces.items()}
 
 
 def scene_sizes(window: Window) -> Tensor:
@@ -179,7 +184,7 @@ def _findings(
         f"On held-out windows -ELBO is {total.text(1)} nats higher than on training windows, {clear} than chance "
         "explains."
     ]
-    losses = {term: one for term, one in differences.items() if term != TOTAL and one.low > 0}
+    losses = {term: interval for term, interval in differences.items() if term != TOTAL and interval.low > 0}
     if losses:
         term = max(losses, key=lambda name: losses[name].mean)
         sentences.append(f"The largest clear loss is in {term}: {losses[term].text()} nats per window.")
@@ -195,8 +200,14 @@ def _figure(differences: Mapping[str, Interval]) -> Figure:
     terms = list(differences)
     figure = Figure(figsize=(6.5, 0.9 + 0.34 * len(terms)), layout="constrained")
     panel = figure.subplots()
-    for place, one in enumerate(differences.values()):
-        panel.errorbar(one.mean, place, xerr=[[one.mean - one.low], [one.high - one.mean]], fmt="o", color="#0072B2")
+    for place, interval in enumerate(differences.values()):
+        panel.errorbar(
+            interval.mean,
+            place,
+            xerr=[[interval.mean - interval.low], [interval.high - interval.mean]],
+            fmt="o",
+            color="#0072B2",
+        )
     panel.axvline(0.0, color="#9A9A9A", linestyle="--", linewidth=1.0)
     panel.set(yticks=range(len(terms)), yticklabels=terms, xlabel="held-out minus training (nats per window)")
     panel.invert_yaxis()

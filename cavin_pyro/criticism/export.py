@@ -127,8 +127,8 @@ def predictions(values: Mapping[str, Tensor], mask: Tensor, steps: Tensor | None
     if "next_centers" not in values:
         values = {**values, "next_centers": all_pushes(values, "next_centers")}
     masks = {"subgoal_centers": mask, "next_centers": mask.unsqueeze(-2) if steps is None else steps}
-    found = {name: values[name] for name in PREDICTED if name in values}
-    return {name: without_padding(value, masks[name]) if name in masks else value for name, value in found.items()}
+    predicted = {name: values[name] for name in PREDICTED if name in values}
+    return {name: without_padding(value, masks[name]) if name in masks else value for name, value in predicted.items()}
 
 
 def without_padding(centers: Tensor, mask: Tensor) -> Tensor:

@@ -57,9 +57,9 @@ def assess_guide(
     if reason := unsuitable_codes(context, window):
         return not_applicable(NAME, TITLE, reason)
     with seeded(context.seed):
-        found = simulated_ranks(context.model, context.guide, window, samples=samples)
-    joint = mean_interval((found.joint <= LEVEL).double(), episodes)
-    codes = {name: code_coverage(found, name, episodes) for name in context.codes}
+        simulated = simulated_ranks(context.model, context.guide, window, samples=samples)
+    joint = mean_interval((simulated.joint <= LEVEL).double(), episodes)
+    codes = {name: code_coverage(simulated, name, episodes) for name in context.codes}
     graded = [joint, *(Interval(**one["informed"]) for one in codes.values())]
     weights = importance(context, weighted, particles)
     shares = {key: Interval(**weights[key]) for key in ("unreliable", "effective")}
@@ -94,7 +94,7 @@ def assess_guide(
         {"windows": len(episodes), "samples": samples, "joint": joint._asdict(), "codes": codes, "importance": weights},
         "coverage of 90 % regions of all codes",
         joint,
-        figure=_figure(found),
+        figure=_figure(simulated),
         caption="Distribution of the true codes' ranks among the guide's samples, minus the uniform one: each informed "
         "dimension, and the joint rank by density with a pointwise 95 % band. Zero if the guide is the posterior; "
         "ranks heaped at the ends (rising, then falling) mean too narrow.",
@@ -153,21 +153,21 @@ def simulated_ranks(
     return SimulatedRanks(ranks, joint, contraction)
 
 
-def code_coverage(found: SimulatedRanks, name: str, episodes: Tensor) -> dict[str, Any]:
+def code_coverage(simulated: SimulatedRanks, name: str, episodes: Tensor) -> dict[str, Any]:
     """What 90 % intervals of a code cover, for windows of `episodes: [B]`.
 
     Returns:
         Intervals over `all` dimensions and over the `informed` ones; `by_dimension`; `dimensions` and
         `informed_dimensions`; `contraction`.
     """
-    inside = covered(found.ranks[name], LEVEL)
+    inside = covered(simulated.ranks[name], LEVEL)
     return {
         "all": mean_interval(inside.mean(1), episodes)._asdict(),
-        "informed": mean_interval(covered(found.informed(name), LEVEL).mean(1), episodes)._asdict(),
+        "informed": mean_interval(covered(simulated.informed(name), LEVEL).mean(1), episodes)._asdict(),
         "by_dimension": inside.mean(0).tolist(),
         "dimensions": inside.shape[1],
-        "informed_dimensions": int((found.contraction[name] > INFORMED).sum()),
-        "contraction": found.contraction[name].tolist(),
+        "informed_dimensions": int((simulated.contraction[name] > INFORMED).sum()),
+        "contraction": simulated.contraction[name].tolist(),
     }
 
 
@@ -195,13 +195,13 @@ def importance(context: CheckContext, windows: int, particles: int) -> dict[str,
     }
 
 
-def _figure(found: SimulatedRanks) -> Figure:
+def _figure(simulated: SimulatedRanks) -> Figure:
     figure = Figure(figsize=(6.5, 3.6), layout="constrained")
     panel = figure.subplots()
-    for name in found.ranks:
-        for number, ranks in enumerate(found.informed(name).T):
-            draw_ranks(panel, ranks, SYMBOLS.get(name, name) if number == 0 else "_", COLORS.get(name))
-    draw_ranks(panel, found.joint, "jointly", JOINT_COLOR, band=True)
+    for name in simulated.ranks:
+        for number, ranks in enumerate(simulated.informed(name).T):
+            draw_ranks(panel, ranks, SYMBOLS.get(name, name) if number == 0 else "_", COLORS.get(name, "#000000"))
+    draw_ranks(panel, simulated.joint, "jointly", JOINT_COLOR, band=True)
     panel.set(xlim=(0, 1), xlabel="rank", ylabel="ECDF minus uniform")
     panel.legend(fontsize=8, frameon=False)
     return figure

@@ -63,11 +63,13 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
     window, episodes = context.held_out(windows)
     with seeded(context.seed):
         predictions = predict(context, window, samples)
-        ranks = {name: rank(one.samples, one.real) for name, one in predictions.items()}
-    found = {name: score(one, ranks[name], episodes) for name, one in predictions.items()}
-    levels = {name: within(*found[name]["90"][1:], good=GOOD, bad=BAD) for name in found if not name.endswith("moved")}
+        ranks = {name: rank(prediction.samples, prediction.real) for name, prediction in predictions.items()}
+    scores_of = {name: score(prediction, ranks[name], episodes) for name, prediction in predictions.items()}
+    levels = {
+        name: within(*scores_of[name]["90"][1:], good=GOOD, bad=BAD) for name in scores_of if not name.endswith("moved")
+    }
     level = worst(levels.values())
-    texts = {name: f"{LABELS[name.split()[1]]} by {PREDICTORS[name.split()[0]]}" for name in found}
+    texts = {name: f"{LABELS[name.split()[1]]} by {PREDICTORS[name.split()[0]]}" for name in scores_of}
     return Section(
         NAME,
         TITLE,
@@ -89,18 +91,18 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
         [
             f"90 % intervals of {texts[name]}, cover {one['90'].percent()}; the stated scale is {one['stated']:.3g}, "
             f"the RMS error {one['error']:.3g}."
-            for name, one in found.items()
+            for name, one in scores_of.items()
         ],
         {
             "windows": len(episodes),
             "samples": samples,
             "predictions": {
                 name: {key: one._asdict() if isinstance(one, Interval) else one for key, one in scores.items()}
-                for name, scores in found.items()
+                for name, scores in scores_of.items()
             },
         },
         "coverage of 90 % intervals of f, x and y of all objects",
-        found["f centres"]["90"],
+        scores_of["f centres"]["90"],
         figure=_figure(predictions, ranks),
         caption="Distribution of the PIT (where the truth lies among the samples) minus the uniform one, with a "
         "pointwise 95 % band: zero if the prediction is right; rising, then falling if its intervals are too narrow.",
@@ -124,16 +126,18 @@ def predict(context: CheckContext, window: Window, samples: int) -> dict[str, Pr
     sampled = nodes["next_centers"]["fn"].sample((samples,))
     # One sample at a time: all of them with all components would be large.
     features = torch.stack([nodes["next_features"]["fn"].sample()[..., chosen] for _ in range(samples)])
-    found = _states("f", sampled, features, before, after, chosen, window.transition_mask.unsqueeze(-1))
+    predictions = _states("f", sampled, features, before, after, chosen, window.transition_mask.unsqueeze(-1))
     if "subgoal_centers" in nodes:
         for name, guide in (("h_prior", None), ("h_guide", context.guide)):
             sites = sample_sites(model, window, samples, ("subgoal_centers", "subgoal_features"), guide)
             centers, features = sites["subgoal_centers"], sites["subgoal_features"][..., chosen]
-            found |= _states(name, centers, features, window.first, window.last, chosen)
+            predictions |= _states(name, centers, features, window.first, window.last, chosen)
     if "actions" in nodes and context.codes:
         pushes = sample_sites(model, window, samples, ("actions",), context.guide)["actions"]
-        found["g_guide pushes"] = Prediction(pushes, window.actions, torch.ones_like(window.actions, dtype=torch.bool))
-    return found
+        predictions["g_guide pushes"] = Prediction(
+            pushes, window.actions, torch.ones_like(window.actions, dtype=torch.bool)
+        )
+    return predictions
 
 
 def _states(
@@ -196,10 +200,10 @@ def _figure(predictions: Mapping[str, Prediction], ranks: Mapping[str, Tensor]) 
     predictors = list(dict.fromkeys(name.split()[0] for name in predictions))
     figure = Figure(figsize=(3.3 * len(predictors), 3.2), layout="constrained")
     panels = dict(zip(predictors, figure.subplots(1, len(predictors), squeeze=False)[0], strict=True))
-    for name, one in predictions.items():
+    for name, prediction in predictions.items():
         predictor, quantity = name.split()
         band = quantity in ("centres", "pushes")
-        draw_ranks(panels[predictor], ranks[name][one.counted], LABELS[quantity], COLORS[quantity], band=band)
+        draw_ranks(panels[predictor], ranks[name][prediction.counted], LABELS[quantity], COLORS[quantity], band=band)
     for predictor, panel in panels.items():
         panel.set(xlim=(0, 1), xlabel="PIT", ylabel="ECDF minus uniform")
         panel.set_title(PREDICTORS[predictor], fontsize=9)

@@ -60,17 +60,19 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     with seeded(context.seed):
         outcome = generated(context.model, window)
         missing = {"h": outcome.subgoal is None, "g": not outcome.chosen}
-        statistics = [one for one in statistics_of(nearness) if not missing.get(one.part)]
+        statistics = [statistic for statistic in statistics_of(nearness) if not missing.get(statistic.part)]
         for source in sources:
             guide = context.guide if source.startswith("guide") else None
             means = context.codes if source.endswith("means") else None
             replicated[source] = replicate(
                 context.model, window, statistics, replicates=replicates, guide=guide, means=means
             )
-    real = {one.name: one.function(observed(window)) for one in statistics}
+    real = {statistic.name: statistic.function(observed(window)) for statistic in statistics}
     compared = {
-        one.name: {source: compare(replicated[source][one.name], real[one.name]) for source in sources}
-        for one in statistics
+        statistic.name: {
+            source: compare(replicated[source][statistic.name], real[statistic.name]) for source in sources
+        }
+        for statistic in statistics
     }
     effects = {
         one.name: effect_size(replicated["prior_means"][one.name], real[one.name], episodes) for one in statistics

@@ -66,8 +66,8 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
         codes["control"] = {name: value[elsewhere] for name, value in codes["prior"].items()}
         rows = {source: describe(context.model, window, values) for source, values in codes.items()}
         logits = {source: held_out_logits(rows["guide"], rows[source], episodes, context.seed) for source in SOURCES}
-    found = {source: area_under_curve(*pair, episodes) for source, pair in logits.items()}
-    auc = found["prior"]
+    areas = {source: area_under_curve(*pair, episodes) for source, pair in logits.items()}
+    auc = areas["prior"]
     return Section(
         NAME,
         TITLE,
@@ -82,9 +82,9 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
         ),
         [
             f"A classifier of (s, c, z) orders {auc.percent()} of held-out pairs correctly (50 % by chance), and "
-            f"{found['control'].percent()} when the prior's codes are those of another scene."
+            f"{areas['control'].percent()} when the prior's codes are those of another scene."
         ],
-        {"windows": len(episodes), "auc": {source: one._asdict() for source, one in found.items()}},
+        {"windows": len(episodes), "auc": {source: area._asdict() for source, area in areas.items()}},
         "AUC of a classifier, guide against prior",
         auc,
         figure=_figure(logits),

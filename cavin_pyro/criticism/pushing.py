@@ -58,11 +58,11 @@ class Statistic:
 def statistics_of(nearness: Nearness) -> list[Statistic]:
     """All statistics. Those of h look at its subgoal, those of f at the states after each push."""
     pair, tool = 100 * nearness.pair, 100 * nearness.tool  # centimetres
-    found = []
+    statistics = []
     for part in ("h", "f"):
         move, moved = f"farthest move over the segment, {part}", f"objects that move more than 1 cm, {part}"
         near = f"pairs of centres nearer than {pair:.1f} cm, {part}"
-        found += [
+        statistics += [
             Statistic(f"farthest_move_{part}", move, partial(_farthest_move, part), part, "m"),
             Statistic(f"moved_objects_{part}", moved, partial(_moved_objects, part), part),
             Statistic(f"close_pairs_{part}", near, partial(_close_pairs, part, nearness.pair), part),
@@ -72,7 +72,7 @@ def statistics_of(nearness: Nearness) -> list[Statistic]:
         f"share of pushes that pass within {tool:.1f} cm of a centre",
     )
     return [
-        *found,
+        *statistics,
         Statistic("start_to_nearest", start, lambda outcome: start_distances(outcome).amin(-1), "g", "m"),
         Statistic("touching", touching, partial(_touching, nearness.tool), "g"),
     ]

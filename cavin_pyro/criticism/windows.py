@@ -16,7 +16,7 @@ from torch import Tensor
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State, Window
-from cavin_pyro.training.elbo import substitute
+from cavin_pyro.training.elbo import sampled_sites, substitute
 
 WINDOWS_AT_ONCE = 4096  # a few megabytes per layer, so that a pass stays in the processor's cache
 
@@ -77,8 +77,8 @@ def generated(
 
 def sampled_values(program: Any, window: Window) -> dict[str, Tensor]:
     """The value of every site that one run of a program has sampled or observed."""
-    nodes = poutine.trace(program).get_trace(window).nodes
-    return {name: site["value"] for name, site in nodes.items() if site["type"] == "sample"}
+    sites = sampled_sites(poutine.trace(program).get_trace(window))
+    return {name: site["value"] for name, site in sites.items()}
 
 
 def all_pushes(values: Mapping[str, Tensor], site: str) -> Tensor:

@@ -60,11 +60,11 @@ def loss_with_gradients(
     local = isinstance(elbo, TraceGraph_ELBO)
     with pyro.settings.context(module_local_params=local), pyro.get_param_store().scope():
         if not torch.is_grad_enabled():
-            found = elbo.loss(model, guide, window)
-            return torch.as_tensor(found[0] if isinstance(found, tuple) else found)
+            losses = elbo.loss(model, guide, window)
+            return torch.as_tensor(losses[0] if isinstance(losses, tuple) else losses)
         for parameter in parameters:
             parameter.grad = None
-        found = elbo.loss_and_grads(model, guide, window)
+        losses = elbo.loss_and_grads(model, guide, window)
     gradients = [parameter.grad for parameter in parameters]
     for parameter, kept in zip(parameters, before, strict=True):
         parameter.grad = kept
@@ -74,4 +74,4 @@ def loss_with_gradients(
         for parameter, gradient in zip(parameters, gradients, strict=True)
         if gradient is not None
     )
-    return carrier + (found[0] if isinstance(found, tuple) else found)
+    return carrier + (losses[0] if isinstance(losses, tuple) else losses)

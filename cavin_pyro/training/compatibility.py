@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import torch
 from pyro import poutine
 from pyro.infer import ELBO, TraceEnum_ELBO, TraceMeanField_ELBO
-from pyro.poutine.util import site_is_subsample
 from torch import nn
 
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import PARTS
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
+from cavin_pyro.training.elbo import Sites, latent_sites, sampled_sites
 from cavin_pyro.training.resume import forked
-
-Site = Any  # of a trace: a dictionary of Pyro's
-Sites = dict[str, Site]
 
 
 @user_input(*PARTS)
@@ -39,9 +35,9 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
     device = window.actions.device
     window = window._replace(sequence_mask=torch.arange(len(window.actions), device=device) == 0)
     with forked(device):
-        wanted, found = _codes(model, window), _codes(guide, window)
-        generated = poutine.trace(model.generate).get_trace(window)
-    known = [name for name in generated.observation_nodes if not generated.nodes[name]["infer"].get("_deterministic")]
+        wanted, sampled = _codes(model, window), _codes(guide, window)
+        generated = sampled_sites(poutine.trace(model.generate).get_trace(window))
+    known = [name for name, site in generated.items() if site["is_observed"] and "_deterministic" not in site["infer"]]
     if known:
         raise UserError(
             f"model {type(model).__name__} observes {', '.join(known)} where it generates: write "
@@ -51,7 +47,7 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
     enumerated = {
         code: site
         for code, site in wanted.items()
-        if site["infer"].get("enumerate") == "parallel" and code not in found
+        if site["infer"].get("enumerate") == "parallel" and code not in sampled
     }
     if isinstance(elbo, TraceEnum_ELBO):
         wanted = {code: site for code, site in wanted.items() if code not in enumerated}
@@ -60,24 +56,24 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
             f"model {type(model).__name__} enumerates {_listed(enumerated)}, which the guide lacks: choose "
             "objective.elbo._target_=pyro.infer.TraceEnum_ELBO"
         )
-    if wanted.keys() != found.keys():
+    if wanted.keys() != sampled.keys():
         raise UserError(
-            f"{name} samples {_listed(found)}, but the codes of model {type(model).__name__} are {_listed(wanted)}: "
+            f"{name} samples {_listed(sampled)}, but the codes of model {type(model).__name__} are {_listed(wanted)}: "
             "give each code, and nothing else, a pyro.sample"
         )
-    if isinstance(elbo, TraceMeanField_ELBO) and [*wanted] != [*found]:
+    if isinstance(elbo, TraceMeanField_ELBO) and [*wanted] != [*sampled]:
         raise UserError(
-            f"{name} samples {', '.join(found)} in this order, the model {', '.join(wanted)}: closed-form divergences "
-            "of a code given earlier ones need the model's order, so change it, or choose objective=trace_elbo"
+            f"{name} samples {', '.join(sampled)} in this order, the model {', '.join(wanted)}: closed-form "
+            "divergences of a code given earlier ones need the model's order: keep it, or choose objective=trace_elbo"
         )
-    for code, site in found.items():
+    for code, site in sampled.items():
         theirs = wanted[code]
-        plates, given = ({frame.name for frame in one["cond_indep_stack"]} for one in (theirs, site))
+        plates, given = ({frame.name for frame in each["cond_indep_stack"]} for each in (theirs, site))
         if missing := plates - given:
             raise UserError(
                 f"{name} samples {code} outside of the plate {', '.join(sorted(missing))}: use windows_plate"
             )
-        shape, wanted_shape = (f"{[*one['fn'].batch_shape]} {[*one['fn'].event_shape]}" for one in (site, theirs))
+        shape, wanted_shape = (f"{[*each['fn'].batch_shape]} {[*each['fn'].event_shape]}" for each in (site, theirs))
         if shape != wanted_shape:
             raise UserError(
                 f"{name} samples {code} with batch and event shape {shape}, the model's is {wanted_shape}: "
@@ -91,8 +87,7 @@ def _codes(program: nn.Module, window: Window) -> Sites:
     """Sampled sites by name, with their log densities."""
     trace = poutine.trace(program).get_trace(window)
     trace.compute_log_prob()
-    sites: Sites = {name: trace.nodes[name] for name in trace.stochastic_nodes}
-    return {name: site for name, site in sites.items() if not site_is_subsample(site)}
+    return latent_sites(trace)
 
 
 def _listed(sites: Iterable[str]) -> str:

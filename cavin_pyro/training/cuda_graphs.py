@@ -12,12 +12,11 @@ from typing import Any
 import torch
 from pyro import poutine
 from pyro.infer import Trace_ELBO
-from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from cavin_pyro.models.networks.layers import fixed_shapes
 from cavin_pyro.models.state import Window
-from cavin_pyro.training.elbo import elbo_terms
+from cavin_pyro.training.elbo import elbo_terms, latent_sites
 from cavin_pyro.training.objectives import Loss, Objective
 from cavin_pyro.training.resume import forked
 
@@ -37,9 +36,8 @@ def capturable(loss: Loss, window: Window) -> bool:
     if objective.weighted or objective.counterfactual_weight:
         return False
     with forked(window.actions.device), torch.no_grad():
-        sites = [*poutine.trace(loss.guide).get_trace(window).nodes.values()]
-    codes: list[Any] = [site["fn"] for site in sites if site["type"] == "sample" and not site_is_subsample(site)]
-    return all(code.has_rsample for code in codes)
+        sites = latent_sites(poutine.trace(loss.guide).get_trace(window))
+    return all(site["fn"].has_rsample for site in sites.values())
 
 
 def capturable_loss(loss: Loss, window: Window) -> Tensor:
@@ -104,4 +102,4 @@ class CapturedLoss:
         loss = capturable_loss(self._loss, window) / len(window.sequence_mask)
         gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
         # Copies: a gradient may be a view of another one, and the caller clips them in place.
-        return loss.detach(), [None if one is None else one.clone().contiguous() for one in gradients]
+        return loss.detach(), [None if gradient is None else gradient.clone().contiguous() for gradient in gradients]

@@ -16,6 +16,7 @@ from torch import Tensor
 from cavin_pyro.models.state import Window
 
 EFFECT_AND_MOTION_SITES = ("subgoal_centers", "subgoal_features", "actions", "effect_code", "motion_code")
+Sites = dict[str, Any]  # of a trace: dictionaries of Pyro's, by name
 Program = Callable[..., Any]  # a Pyro program, or one with a handler around it; called with a window
 
 
@@ -49,43 +50,49 @@ def window_terms(
         joint = poutine.trace(replayed).get_trace(window)
     guided.compute_log_prob()
     joint.compute_log_prob()
-    expectation, divergences = sum_out(joint)
+    sites, samples_of_guide = sampled_sites(joint), sampled_sites(guided)
+    expectation, divergences = sum_out(sites)
     terms = {}
-    for name, site in joint.nodes.items():
-        if site["type"] != "sample" or site_is_subsample(site):
-            continue
+    for name, site in sites.items():
         if name in divergences:
             terms[f"kl_{name}"] = divergences[name]
         elif site["is_observed"]:
             terms[f"nll_{name}"] = -expectation(site["log_prob"])
         else:
-            terms[f"kl_{name}"] = guided.nodes[name]["log_prob"] - expectation(site["log_prob"])
-    auxiliary = {
-        name: site for name, site in guided.nodes.items() if site["type"] == "sample" and name not in joint.nodes
+            terms[f"kl_{name}"] = samples_of_guide[name]["log_prob"] - expectation(site["log_prob"])
+    return terms | {f"kl_{name}": site["log_prob"] for name, site in samples_of_guide.items() if name not in sites}
+
+
+def sampled_sites(trace: poutine.Trace) -> Sites:
+    """Sampled and observed sites by name, without plates, which are sites of a trace too."""
+    return {
+        name: site for name, site in trace.nodes.items() if site["type"] == "sample" and not site_is_subsample(site)
     }
-    return terms | {f"kl_{name}": site["log_prob"] for name, site in auxiliary.items() if not site_is_subsample(site)}
 
 
-def sum_out(joint: poutine.Trace) -> tuple[Callable[[Tensor], Tensor], dict[str, Tensor]]:
-    """Sums enumerated sites out of a trace of the model, whose log densities are computed.
+def latent_sites(trace: poutine.Trace) -> Sites:
+    """Sampled sites by name, without those that are observed."""
+    return {name: site for name, site in sampled_sites(trace).items() if not site["is_observed"]}
+
+
+def sum_out(sites: Sites) -> tuple[Callable[[Tensor], Tensor], dict[str, Tensor]]:
+    """Sums enumerated sites out of the model's `sites`, whose log densities are computed.
 
     Returns:
         The expectation of a log density over their exact posterior, and by site the divergence of that from its prior.
         Without such sites the expectation is the identity.
     """
-    samples = [site for site in joint.nodes.values() if site["type"] == "sample" and not site_is_subsample(site)]
-    dims = {site["name"]: site["infer"].get("_enumerate_dim") for site in samples}
-    dims = {name: dim for name, dim in dims.items() if dim is not None}  # -2, -3, ... in the order of sampling
+    dims = {name: site["infer"]["_enumerate_dim"] for name, site in sites.items() if "_enumerate_dim" in site["infer"]}
     if not dims:
         return lambda log_density: log_density, {}
-    outermost = max(dims.values())
-    table = sum(site["log_prob"] for site in samples if site["log_prob"].dim() >= -outermost)
-    every = tuple(dims.values())
+    every = tuple(dims.values())  # -2, -3, ... or, beside particles, -3, -4, ...
+    densities = [site["log_prob"] for site in sites.values() if site["log_prob"].dim() >= -every[0]]
+    table = sum(densities, torch.zeros(()))
     posterior = (table - table.logsumexp(every, keepdim=True)).detach()
     weights = posterior.exp()
 
     def expectation(log_density: Tensor) -> Tensor:
-        if log_density.dim() < -outermost:
+        if log_density.dim() < -every[0]:
             return log_density
         return (weights * log_density).where(weights > 0, 0.0).sum(every)
 
@@ -94,9 +101,8 @@ def sum_out(joint: poutine.Trace) -> tuple[Callable[[Tensor], Tensor], dict[str,
     for place, name in enumerate(dims):
         later = every[place + 1 :]
         marginal = posterior.logsumexp(later, keepdim=True) if later else posterior
-        divergences[name] = scale_and_mask(
-            expectation(marginal - given) - expectation(joint.nodes[name]["log_prob"]), mask=joint.nodes[name]["mask"]
-        )
+        divergence = expectation(marginal - given) - expectation(sites[name]["log_prob"])
+        divergences[name] = scale_and_mask(divergence, mask=sites[name]["mask"])
         given = marginal
     return expectation, divergences
 

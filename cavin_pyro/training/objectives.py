@@ -238,5 +238,5 @@ def rollout_loss(model: Model, window: Window) -> Tensor:
     return loss
 
 
-def _distance(one: Tensor, other: Tensor) -> Tensor:
-    return ((one - other).square().sum(-1) + SMOOTHING).sqrt()
+def _distance(predicted: Tensor, observed: Tensor) -> Tensor:
+    return ((predicted - observed).square().sum(-1) + SMOOTHING).sqrt()

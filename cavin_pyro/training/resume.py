@@ -79,7 +79,7 @@ def load_optimizer(optimizer: torch.optim.Adam, tensors: Mapping[str, Tensor]) -
     for name, value in section(tensors, "adam").items():
         place, _, entry = name.partition(".")
         moments.setdefault(int(place), {})[entry] = value
-    parameters: list[nn.Parameter] = [one for group in optimizer.param_groups for one in group["params"]]
+    parameters: list[nn.Parameter] = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, entries in moments.items():
         if not 0 <= number < len(parameters):
             raise ValueError(f"adam.{number} belongs to no weight")

@@ -180,8 +180,8 @@ def fit(
             best.update({name: value for name, value in load_file(path).items() if name in programs.state_dict()})
         run.run()
         programs.load_state_dict(best)
-        found = next(row for row in run.rows if row["step"] == run.best_step)
-        write_json(folder / "metrics.json", {**record, "steps": run.step, "best": found})
+        row = next(row for row in run.rows if row["step"] == run.best_step)
+        write_json(folder / "metrics.json", {**record, "steps": run.step, "best": row})
     return run
 
 

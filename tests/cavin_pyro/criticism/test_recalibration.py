@@ -33,7 +33,7 @@ from cavin_pyro.models.dynamics_only import DynamicsModel
 from cavin_pyro.models.likelihoods import PredictedScales
 from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
 from cavin_pyro.models.networks.outline import Outline
-from cavin_pyro.models.state import State, Window, stack_steps
+from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.checkpoint import load
 from cavin_pyro.storage.files import file_digest
 from cavin_pyro.training.run import train
@@ -140,7 +140,7 @@ def windows_of(model: DynamicsModel, *, wider: float, count: int = 3000, still: 
     errors = wider * scales[..., :1] * torch.distributions.StudentT(3.0).sample((count, 2, 2))
     after = torch.cat((mean.centers[..., :2] + errors, mean.centers[..., 2:]), -1)
     after[:still] = centers[:still]
-    states = stack_steps([before, State(after, features, before.mask)])
+    states = State(*(torch.stack(fields, 1) for fields in zip(before, (after, features, before.mask), strict=True)))
     return Window(states, actions, torch.ones(count, 1, dtype=torch.bool), torch.ones(count, dtype=torch.bool))
 
 
