@@ -12,7 +12,7 @@ def main(config: DictConfig) -> None:
     import torch
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.config.parts import check_sizes, construct, naming
+    from cavin_pyro.config.parts import build_part
     from cavin_pyro.data.features import sample_clouds
     from cavin_pyro.storage.checkpoint import save
     from cavin_pyro.storage.files import output_folder, write_json
@@ -22,13 +22,11 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.training.run import data_folders
     from cavin_pyro.visualization.training import draw_reconstructions
 
-    check_sizes("autoencoder", config.autoencoder)
     device = choose_device(config.device)
     config.device = device.type
     torch.manual_seed(config.seed)
     with output_folder(config.output) as folder:
-        with naming("autoencoder", config.autoencoder):
-            autoencoder = construct(config.autoencoder)
+        autoencoder = build_part("autoencoder", config.autoencoder)
         clouds = sample_clouds(
             data_folders(config.data),
             count=config.clouds,

@@ -112,9 +112,15 @@ def guarded(action: Callable[[], T], name: str | None = None, words: Sequence[st
 def _line(error: Exception, words: Sequence[str]) -> str | None:
     """What to say of an error instead of a traceback; None for a bug."""
     if isinstance(error, UserError):
-        given = [word for word in words if re.split(r"[./=]", word.lstrip("+"))[0] in error.sections]
-        named = any(word.partition("=")[0].rpartition(".")[2] in str(error) for word in given)
-        return f"{', '.join(given)}: {error}" if given and not named else str(error)
+        said, sections = str(error), {section.partition(".")[0] for section in error.sections}
+        given = [word for word in words if re.split(r"[./=]", word.lstrip("+"))[0] in sections]
+        about = given if error.__cause__ else []
+        for key, _, value in (word.lstrip("+").partition("=") for word in given):
+            if key in said:
+                return said
+            if re.search(rf"\b{key.rpartition('.')[2]}\b", said) or (len(value) > 3 and value in said):
+                about = [f"{key}={value}"]
+        return f"{', '.join(about)}: {said}" if about else said
     if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
         return _refusal(error)
     return one_line(error) if lacks_memory(error) else None

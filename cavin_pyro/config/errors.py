@@ -34,7 +34,10 @@ def user_input(*sections: str) -> Iterator[None]:
     """
     try:
         yield
-    except (UserError, OSError):  # `guarded` says what a disk refuses
+    except OSError:  # `guarded` says what a disk refuses
+        raise
+    except UserError as error:
+        error.sections = error.sections or sections
         raise
     except Exception as error:
         kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "

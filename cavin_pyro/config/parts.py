@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import functools
 import inspect
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import math
+from collections.abc import Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
 import yaml
 from hydra.errors import InstantiationException
 from hydra.utils import get_class, instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line, user_input
@@ -46,51 +45,32 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
     except UserError:
         raise
     except Exception as error:
-        cause, section, place = error, config, ""
-        if isinstance(error, InstantiationException):
-            cause = error.__cause__ or error  # type: ignore[assignment]
-            inner = re.search(r"full_key: ([\w.]+)$", str(error))  # Hydra's name of a part, from the root of its tree
-            place = inner[1] if inner else ""
-            while place and not isinstance(
-                found := OmegaConf.select(OmegaConf.create(dict(config)), place), DictConfig
-            ):
-                place = place.partition(".")[2]
-            section = found if place else config
-        said = "" if isinstance(cause, ValueError) else f"_target_={section.get('_target_')} cannot be built: "
-        with naming(place, section):
-            raise UserError(said + one_line(cause)) from error
-
-
-@contextmanager
-def naming(section: str, config: Config) -> Iterator[None]:
-    """Let a `UserError` from building a part name its options as users type them: `planner.samples`, not `samples`."""
-    names = "|".join(re.escape(str(name)) for name in config)
-    mention = rf"^(unknown )?({names})(?=[ =.])|(?<![\w.])({names})(?==)"
-    try:
-        yield
-    except UserError as error:
-        if not names or not section:
-            raise
-        said = re.sub(mention, lambda one: f"{one[1] or ''}{section}.{one[2] or one[3]}", str(error))
-        raise UserError(said) from error
+        cause = (isinstance(error, InstantiationException) and error.__cause__) or error
+        said = "" if isinstance(cause, ValueError) else f"{config['_target_']} cannot be built: "
+        raise UserError(said + one_line(cause)) from error
 
 
 def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
-    """Raise a `UserError` for a whole number of a section, but weights and margins, that is too small or a slip."""
+    """Raise a `UserError` for a number that is not finite, or a whole one that is too small or a slip.
+
+    Weights and margins may be small.
+    """
     for name, value in config.items():
+        option = f"{section}.{name!s}"
         if isinstance(value, Mapping | DictConfig):
-            check_sizes(f"{section}.{name!s}", value, minimum)
-        elif type(value) is int and not str(name).endswith(("_weight", "_margin")):
-            if value < minimum:
-                raise UserError(f"{section}.{name!s} must be at least {minimum:g}, not {value}")
-            if value > LARGEST_SIZE:
-                raise UserError(f"{section}.{name!s} must be at most {LARGEST_SIZE}, not {value}")
+            check_sizes(option, value, minimum)
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise UserError(f"{option} must be finite, not {value}")
+        elif (
+            type(value) is int and not option.endswith(("_weight", "_margin")) and not minimum <= value <= LARGEST_SIZE
+        ):
+            raise UserError(f"{option} must be between {minimum:g} and {LARGEST_SIZE}, not {value}")
 
 
 def build_part(section: str, config: Config, *arguments: Any, **keywords: Any) -> Any:
-    """Build the part of a section, whose name the lines of `check_sizes` and `construct` have."""
+    """Build the part of a section, which the line about what is wrong with it names."""
     check_sizes(section, config)
-    with naming(section, config):
+    with user_input(section):
         return construct(config, *arguments, **keywords)
 
 

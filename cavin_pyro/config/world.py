@@ -11,7 +11,7 @@ from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError, one_line, user_input
-from cavin_pyro.config.parts import construct, naming
+from cavin_pyro.config.parts import construct
 from cavin_pyro.envs.layouts import task_class
 from cavin_pyro.envs.objects.object_sets import ObjectSet, chosen, load_object_set, plain_name
 from cavin_pyro.envs.objects.sampling import ObjectRanges
@@ -97,7 +97,7 @@ def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:
 
 
 def _made(name: str, section: Mapping[str, Any], protocol: type, *arguments: Any) -> Any:
-    with naming(name, section):
+    with user_input(name):
         made = construct(section, *arguments)
     wanted = [member for member in {**vars(protocol), **protocol.__annotations__} if not member.startswith("_")]
     if lacking := [member for member in wanted if not hasattr(made, member)]:

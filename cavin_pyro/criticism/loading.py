@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from cavin_pyro.config.commands import WindowConfig
-from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.dataset import content_records, read_metadata
@@ -92,7 +92,6 @@ class Loaded(NamedTuple):
     folders: list[Path]
 
 
-@user_input("checkpoint", "data", "a", "b")
 def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
@@ -113,6 +112,7 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
     return context_of(config, loaded, world, loaded.table.validation)
 
 
+@user_input("checkpoint", "data", "a", "b")
 def load_trained(config: DictConfig, name: str, accept: Accept | None = None) -> Loaded:
     """A checkpoint by its name or path, with its programs, and the windows of the option `data` as its training split.
 
@@ -221,10 +221,10 @@ def trained_windows(checkpoint: Checkpoint) -> tuple[WindowConfig, int, int]:
         # A default in place of a value that lacks would hold out other windows.
         windows = configured(WindowConfig, {**stored, **{name: stored[name] for name in ALWAYS_STORED}}, "windows")
         return windows, int(checkpoint.config["model"]["segment_length"]), int(checkpoint.config["seed"])
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
-            f"checkpoint {checkpoint.path} does not tell which windows its training held out (its configuration lacks "
-            f"{' '.join(str(error).split())}): give one that train has written"
+            f"checkpoint {checkpoint.path} does not tell which windows its training held out ("
+            f"{type(error).__name__}: {one_line(error)}): give one that train has written"
         ) from error
 
 

@@ -17,7 +17,7 @@ from cavin_pyro.config.commands import CHECKPOINTS
 from cavin_pyro.config.device import choose_device, keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import About, check_value
-from cavin_pyro.config.parts import check_sizes, class_of, construct, naming
+from cavin_pyro.config.parts import check_sizes, class_of, construct
 from cavin_pyro.config.world import object_ranges, part_of, task_of
 from cavin_pyro.envs.layouts import GENERATED
 from cavin_pyro.envs.objects.sampling import NoRoomError
@@ -168,7 +168,7 @@ def make_planner(config: DictConfig, reward: RewardFunction, device: torch.devic
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
-        with naming("planner", options):
+        with user_input("planner"):
             return construct(options), geometry
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     model = checkpoint.model.to(device)
@@ -179,7 +179,7 @@ def make_planner(config: DictConfig, reward: RewardFunction, device: torch.devic
         options["tracking_at"] = END  # the first push alone counts only where it alone is executed
     torch.manual_seed(config.seed)
     optimizers = _optimizers(options)
-    with naming("planner", config.planner):
+    with user_input("planner"):
         return construct(options, model=model, reward=reward, **optimizers), geometry
 
 
@@ -229,7 +229,7 @@ def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
             own = class_of(section)
             taken = inspect.signature(own).parameters if callable(own) else usual
             given = {str(key): value for key, value in section.items() if key in taken or key not in usual}
-            with naming(f"planner.{name}", given):
+            with user_input("planner"):
                 built[name] = construct(given)
             del options[name]
     return built

@@ -26,7 +26,6 @@ from cavin_pyro.config.parts import (
     check_sizes,
     construct,
     describe,
-    naming,
 )
 from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
@@ -43,7 +42,7 @@ from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.objectives import Objective, as_objective
 from cavin_pyro.training.trainer import Trainer, fixed_windows
 
-FREE = ("data", "output", "device")  # options that may differ when a training resumes
+FREE = ("data", "output", "device", "trainer.patience")  # options that may differ when a training resumes
 UNVALIDATED = {"validate_distributions_pyro": False, "validate_distributions_torch": False}
 DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
 
@@ -77,7 +76,7 @@ def _train(config: DictConfig, folder: Path) -> Trainer:
     started = start_from(config, model, guide, geometry) if config.initial else {}
     train_only(config.trained, model, guide)
     _mirror_signs(config.trainer.reflect, geometry, guide)
-    check_same_run(folder, config, ignore=FREE)
+    check_same_run(folder, config, ignore=free(config.trainer.schedule))
     check_fit(model, geometry, max(slots_of(read_metadata(folder)) for folder in data))
     windows = load_windows(
         data,
@@ -162,7 +161,7 @@ def fit(
         record = {**of_this_process(), **(provenance or {})}
         if output is not None:
             stored = OmegaConf.create(stored)
-            check_same_run(folder, stored, ignore=FREE)
+            check_same_run(folder, stored, ignore=free(options.schedule))
             if "data" in record:
                 check_same_data(folder, record["data"])
             stored = write_config(folder, stored)
@@ -175,6 +174,8 @@ def fit(
 
         run = Trainer(model, guide, objective, windows, folder, keep, options, seed=seed, mirror_signs=signs)
         run.resume()
+        if run.step > options.steps:
+            raise UserError(f"{folder} holds {run.step} steps, not {options.steps}: give more, or another output=DIR")
         if run.rows:
             _keep_best(run, path, keep)
             best.update({name: value for name, value in load_file(path).items() if name in programs.state_dict()})
@@ -199,6 +200,11 @@ def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int,
         )
 
 
+def free(schedule: str) -> tuple[str, ...]:
+    """Options that may differ when a training goes on: its steps too, unless their number decides every rate."""
+    return FREE if schedule == "cosine" else (*FREE, "trainer.steps")
+
+
 def data_folders(data: str | Sequence[str]) -> list[Path]:
     """The option `data`: a folder, or a list of them.
 
@@ -220,9 +226,7 @@ def build_objective(config: Config, model: Model) -> Objective:
     """
     section = config["objective"]
     check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
-    if "elbo" in section and section["elbo"] is None:
-        raise UserError("objective.elbo must be a section, not null")
-    with user_input("objective"), naming("objective", section):
+    with user_input("objective"):
         objective = as_objective(construct(section))
         objective.check(model)
     return objective

@@ -97,10 +97,11 @@ class Trainer:
         self.resume()
         self._check_programs()
         config, running, since = self.config, 0.0, time.perf_counter()
+        steps = config.steps if self.stale < config.patience else self.step
         with (
             warnings.catch_warnings(),
             unchecked_programs(),
-            progress_bar("training", total=config.steps, initial=self.step) as bar,
+            progress_bar("training", total=steps, initial=self.step) as bar,
             ScalarLog(self.folder / "tensorboard", self.rows) as board,
         ):
             # Pyro warns many times about one NaN; this loop checks and stops.

@@ -99,6 +99,21 @@ def test_what_cannot_be_trained_gives_its_line_and_writes_nothing(folder: Path, 
     assert not (folder / "bad").exists()
 
 
+def test_a_finished_training_is_extended_and_what_changes_its_meaning_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for options in ((), (), ("trainer.steps=6", "trainer.patience=30")):
+        grown = run(folder, "grown", *options)
+    assert capsys.readouterr().err.count("training: finished at step 4") == 1
+    whole = run(folder, "whole", "trainer.steps=6")
+    assert grown.step == 6 and [row["validation_loss"] for row in grown.rows] == [
+        row["validation_loss"] for row in whole.rows
+    ]
+    for option in ("trainer.steps=2", "trainer.batch_size=8", "seed=1", "trainer.schedule=cosine"):
+        with pytest.raises(UserError, match=option.partition("=")[0]):
+            run(folder, "grown", "trainer.steps=6", option)
+
+
 @pytest.mark.parametrize("guide", ["auto_normal", "auto_iaf"])
 def test_an_automatic_guide_learns_its_windows_resumes_and_says_what_it_is(
     guide: str, folder: Path, capsys: pytest.CaptureFixture[str]
