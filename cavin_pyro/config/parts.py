@@ -61,10 +61,10 @@ def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
             check_sizes(option, value, minimum)
         elif isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"{option} must be finite, not {value}")
-        elif (
-            type(value) is int and not option.endswith(("_weight", "_margin")) and not minimum <= value <= LARGEST_SIZE
-        ):
-            raise UserError(f"{option} must be between {minimum:g} and {LARGEST_SIZE}, not {value}")
+        elif type(value) is int and not option.endswith(("_weight", "_margin")) and value < minimum:
+            raise UserError(f"{option} must be at least {minimum:g}, not {value}")
+        elif type(value) is int and value > LARGEST_SIZE:
+            raise UserError(f"{option} must be at most {LARGEST_SIZE}, not {value}")
 
 
 def build_part(section: str, config: Config, *arguments: Any, **keywords: Any) -> Any:

@@ -13,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from cavin_pyro.data.dataset import read_metadata, shard_path, write_metadata
+from tests.cavin_pyro.conftest import WINDOWS
 
 GOOD = {  # options that are valid and small; @name is a file or folder of `material`
     "collect": "transitions=2 steps=1 episodes_per_shard=1 workers=1",
@@ -21,15 +22,20 @@ GOOD = {  # options that are valid and small; @name is a file or folder of `mate
     "trainer.batch_size=2 windows.minimum_move=0.001 windows.validation_fraction=0.4",
     "plan": "checkpoint=@checkpoint maximum_steps=1 video=false",
     "evaluate": "checkpoint=@checkpoint maximum_steps=1 episodes=1 workers=1",
+    "check": "checkpoint=@trained data=@pushes windows=2 sections=[elbo]",
 }
 BAD = [  # (command, options added to the good ones, what the line must say)
-    ("plan", "planner.samples=0", "planner.samples must be at least 1, not 0"),
-    ("plan", "planner.horizon=10", "planner.horizon=10 is not divisible by the model's segment length T=3"),
-    ("plan", "planner.optimizer=cem planner.optimizer.iterations=0", "planner.optimizer.iterations must be at least"),
+    ("plan", "planner.samples=0", "planner.samples=0: samples must be at least 1, not 0"),
+    ("plan", "planner.horizon=10", "planner.horizon=10: horizon=10 is not divisible by the model's segment length T=3"),
+    (
+        "plan",
+        "planner.optimizer=cem planner.optimizer.iterations=0",
+        "planner.optimizer.iterations=0: iterations must be at least",
+    ),
     ("plan", "planner.robustness.rollouts=0", "rollouts must be"),
-    ("plan", "+planner.unknown=1", "planner._target_=cavin_pyro.planning.CavinPlanner cannot be built: "),
-    ("plan", "planner._target_=my_lab.Mine", "planner._target_=my_lab.Mine cannot be built: "),
-    ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine cannot be built: "),
+    ("plan", "+planner.unknown=1", "planner.unknown=1: cavin_pyro.planning.CavinPlanner cannot be built: "),
+    ("plan", "planner._target_=my_lab.Mine", "planner._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
+    ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
     ("evaluate", "env.camera._target_=builtins.dict", "env.camera._target_=builtins.dict is no DepthSensor: it lacks "),
     ("plan", "pushes_per_plan=4", "pushes_per_plan must be between 1 and 3, not 4"),
     ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, random, generated or the path of a YAML file"),
@@ -45,12 +51,21 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("train", "model.width=0", "model.width must be at least 1, not 0"),
     ("train", "model.width=1000000000", "model.width must be at most 1000000, not 1000000000"),
     ("train", "scales.center=0", "scales.center must be positive, not 0"),
+    ("train", "scales.center=1e308", "scales.center=1e308: OverflowError"),
+    ("train", "scales.feature=1e-300", "scales.feature=1e-300: ZeroDivisionError"),
+    ("train", "dynamics.maximum_displacement=nan", "dynamics.maximum_displacement must be finite, not nan"),
+    ("train", "dynamics._target_=torch.nn.Identity", "dynamics._target_=torch.nn.Identity: AttributeError"),
+    ("train", "objective.elbo._target_=builtins.dict", "objective.elbo._target_=builtins.dict: AttributeError"),
+    ("evaluate", "planner._target_=builtins.dict", "planner._target_=builtins.dict: AttributeError"),
+    ("check", "sizes.subgoals=3 sections=[subgoals]", "sizes.subgoals=3: AttributeError"),
+    ("check", "checkpoint=@checkpoint", "does not tell which windows its training held out (KeyError: 'windows')"),
+    ("check", "checkpoint=@odd_seed", "does not tell which windows its training held out (ValueError: "),
     ("train", "guide=flat", "guide cavin_pyro.guides.flat.FlatGuide does not fit model CascadedModel"),
     ("train", "data=3", "data must be a dataset folder from collect, or a list of them, not 3"),
     ("train", "data=@nothing", "python -m cavin_pyro.collect"),
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
     ("pretrain", "data=@old_data", "has format version 0, this program reads 1: collect it again"),
-    ("pretrain", "autoencoder._target_=my_lab.Mine", "autoencoder._target_=my_lab.Mine cannot be built: "),
+    ("pretrain", "autoencoder._target_=my_lab.Mine", "autoencoder._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
     ("collect", "output=@pushes seed=4", "holds a dataset with"),
     ("collect", "motions=3", "motions=3 is of policy=model: add that, or leave motions"),
     *((command, "output=@checkpoint/below", "cannot be written (Not a directory)") for command in GOOD),
@@ -68,6 +83,9 @@ def material(
     with safe_open(good, framework="pt") as file:
         header = {name: value for name, value in file.metadata().items() if name != "sha256"}
     config = json.loads(header["config"])
+    for name, seed in (("trained", 0), ("odd_seed", "x")):
+        told = json.dumps({**config, "windows": WINDOWS, "seed": seed})
+        save_file(load_file(good), folder / name, metadata={**header, "config": told})
     config["model"]["scales"] = {"_target_": "numpy.save", "_args_": ["written.npy", 0]}
     save_file(load_file(good), folder / "untrusted", metadata={**header, "config": json.dumps(config)})
     small.save_baseline(folder / "flat", "flat")

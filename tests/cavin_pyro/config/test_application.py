@@ -22,7 +22,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.application import Interruption, guarded, read_command_line
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.files import atomic_write, write_json
 from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT
 
 
@@ -80,6 +80,14 @@ def test_an_input_that_cannot_be_read_is_no_full_disk(
     assert ended(lambda: Path("a" * 300).read_bytes(), capsys)[1].startswith(f"{'a' * 300} is no file: ")
 
 
+def test_a_name_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "report.json").mkdir()
+    said = ended(lambda: write_json(tmp_path / "report.json", {}), capsys)[1]
+    assert said.startswith("something else is at ") and str(tmp_path) in said
+    (tmp_path / "sections").touch()
+    assert ended(lambda: (tmp_path / "sections").mkdir(), capsys)[1].startswith(f"something else is at {tmp_path}")
+
+
 @pytest.mark.parametrize("ask", [lambda: torch.empty(10**14), lambda: np.zeros(10**15)])
 def test_more_memory_than_there_is_is_one_line(ask: Callable, capsys: pytest.CaptureFixture[str]) -> None:
     assert ended(ask, capsys)[1].startswith("these options need more memory than there is: choose smaller ones (")
@@ -134,7 +142,10 @@ def test_whatever_is_raised_while_choices_are_read_is_bad_input_of_the_options_i
     head = "scales.center=1e308, planner/optimizer=cem: "
     said = ended(read(raising(OverflowError("too large"))), capsys, words=words)[1]
     assert said.startswith(f"{head}OverflowError: too large; --traceback ")
-    assert ended(read(raising(ValueError("center is wrong"))), capsys, words=words)[1] == "center is wrong"
+    assert (
+        ended(read(raising(ValueError("center is wrong"))), capsys, words=words)[1]
+        == "scales.center=1e308: center is wrong"
+    )
     assert len(ended(read(raising(ValueError("1" * 5000))), capsys)[1]) < 500
 
 

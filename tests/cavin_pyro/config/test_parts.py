@@ -136,7 +136,7 @@ def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> N
 
 
 @pytest.mark.parametrize("margin", [-1, -0.01])
-def test_a_negative_reach_margin_is_named_as_users_type_it(small: SimpleNamespace, margin: float) -> None:
+def test_a_negative_reach_margin_is_named_with_what_would_be_right(small: SimpleNamespace, margin: float) -> None:
     contact = {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
-    with pytest.raises(UserError, match=f"^dynamics.reach_margin must be null or at least 0 metres, not {margin}$"):
+    with pytest.raises(UserError, match=f"^reach_margin must be null or at least 0 metres, not {margin}$"):
         build_model(small.config() | {"dynamics": contact})
