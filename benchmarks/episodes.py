@@ -81,7 +81,7 @@ SUCCESS = [
 
 
 def generated(task: str, tiles: int) -> Row:
-    options = ("layout=generated", f"generated.tiles={tiles}", "planner.guidance=layout", "maximum_steps=120")
+    options = ("layout=generated", f"generated.tiles={tiles}", "planner.add=[guidance]", "maximum_steps=120")
     return Row(f"generated, {tiles} tiles", task, 3, options)
 
 
@@ -96,14 +96,14 @@ FARTHER = [
 LEFT_OUT = {  # an addition, and the options without it
     "nothing": (),
     "one push per plan": ("pushes_per_plan=null",),
-    "perturbed rollouts": ("planner.robustness=null",),
-    "failure avoidance": ("planner.avoid_failures=false",),
+    "perturbed rollouts": ("planner.drop=[perturbed_rollouts]",),
+    "failure avoidance": ("planner.drop=[failure_avoidance]",),
     "margin": ("margin=0",),
-    "touchdown": ("planner.touchdown_distance=0",),
-    "plans about the target": ("planner.nearest_objects=null",),
-    "first push": ("planner.tracking_at=end",),
-    "another effect": ("planner.effect_retries=0",),
-    "fewer motions": ("planner.motion_samples=1024",),
+    "touchdown": ("planner.drop=[touchdown]",),
+    "plans about the target": ("planner.drop=[nearest_objects]",),
+    "first push": ("planner.drop=[first_push]",),
+    "another effect": ("planner.drop=[effect_retries]",),
+    "fewer motions": ("planner.motion_share=1",),
 }
 ADDITIONS = [
     Row(name, task, objects, options)

@@ -5,7 +5,7 @@ operations in it, and the share of this machine's own rate of float32 matrix pro
 flat problem (30 pushes searched at once, the same dynamics, reward and samples) for our MPC and two public planners.
 Wall time, all in turn, medians and the fastest; crossing, sparse, horizon 30, T = 3, the first scenes of 16 episodes,
 planned one after another or all at once: how long a search goes on depends on the scene. "Algorithm 1" is compiled
-planning without the perturbed rollouts of `planner.robustness`, which are not in the paper. Set OMP_NUM_THREADS for the
+planning without the addition `perturbed_rollouts`, which are not in the paper. Set OMP_NUM_THREADS for the
 number of threads. Compiling takes a minute for each number of samples and of objects, a quarter of an hour in all. The
 public planners come with the extra `benchmarks`; `--no-grid`, `--no-flat` and `--no-compile` leave things out, and
 `--first` times the first compiled plan of a process. Options of `evaluate` come last, such as
@@ -30,7 +30,8 @@ from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.tasks import TaskReward
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.models.state import State
-from cavin_pyro.planning import MpcPlanner, Planner, PlanningModel
+from cavin_pyro.planning import MpcPlanner, Planner, PlanningModel, Reward
+from cavin_pyro.planning.additions import PerturbedRollouts
 
 HORIZON = 30
 SCENES = 16  # also the larger batch
@@ -71,14 +72,14 @@ def milliseconds(actions: dict[str, Callable[[], object]], repetitions: int) -> 
     return {name: Times(statistics.median(values), min(values)) for name, values in times.items()}
 
 
-def planning(planner: Planner, state: State, batch: int) -> Callable[[], object]:
+def planning(planner: Planner, state: State, reward: Reward, batch: int) -> Callable[[], object]:
     """Plans for all scenes, as many at once as `batch`."""
 
     def plan() -> None:
         sources = generators(len(state.centers))
         for begin in range(0, len(sources), batch):
             chunk = slice(begin, begin + batch)
-            planner.plan(state.scene(chunk), sources[chunk])
+            planner.plan(state.scene(chunk), reward=reward, generators=sources[chunk])
 
     return plan
 
@@ -99,18 +100,21 @@ def operations(action: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def planners(objects: int, samples: int, ways: list[str], options: list[str]) -> tuple[dict[str, Any], State]:
-    """A planner for each of the `ways`, and the scenes that they plan for."""
-    found: dict[str, Any] = {}
+def planners(
+    objects: int, samples: int, ways: list[str], options: list[str]
+) -> tuple[dict[str, Planner], State, Reward]:
+    """A planner for each of the `ways`, the scenes that they plan for, and their reward."""
+    found: dict[str, Planner] = {}
     torch.compiler.reset()  # which keeps eight versions of a function
     for way in ways:
         one = runner(objects, samples, f"planner.compile={str(way == 'compiled').lower()}", *options)
-        found[way], state = one.planner, scenes(one, SCENES)
+        found[way], state, reward = one.planner, scenes(one, SCENES), one.reward(one.task)
         one.env.close()
     if "compiled" in found:
-        found["Algorithm 1"] = copy.copy(found["compiled"])  # with what has been compiled
-        found["Algorithm 1"].robustness = None
-    return found, state
+        plain: Any = copy.copy(found["compiled"])  # with what has been compiled
+        plain.additions = [one for one in plain.additions if not isinstance(one, PerturbedRollouts)]
+        found["Algorithm 1"] = plain
+    return found, state, reward
 
 
 def grid(
@@ -123,11 +127,11 @@ def grid(
     print("  ".join(["samples  objects  batch  GFLOP  matrix GFLOP/s", *titles]))
     for count in samples:
         for number in objects:
-            found, state = planners(number, count, ways, options)
-            work = operations(planning(found["eager"], state, 1)) / SCENES
+            found, state, reward = planners(number, count, ways, options)
+            work = operations(planning(found["eager"], state, reward, 1)) / SCENES
             for batch in (1, SCENES):
                 rate = matrix_rate(size)  # anew each time: where cores are shared, it changes by the minute
-                actions = {way: planning(found[way], state, batch) for way in (*ways, *plain)}
+                actions = {way: planning(found[way], state, reward, batch) for way in (*ways, *plain)}
                 figures = [f"{count:7d}  {number:7d}  {batch:5d}  {work / 1e9:5.2f}  {rate / 1e9:14.0f}"]
                 for way, times in milliseconds(actions, repetitions if count < 8192 else 2).items():
                     median, fastest = times.median / SCENES, times.fastest / SCENES
@@ -143,7 +147,7 @@ def first(objects: list[int], samples: int, options: list[str]) -> None:
         state = scenes(one, 1)
         for name in ("first", "second"):
             began, spent = time.perf_counter(), time.process_time()
-            planning(one.planner, state, 1)()
+            planning(one.planner, state, one.reward(one.task), 1)()
             took, spent = time.perf_counter() - began, time.process_time() - spent
             print(f"{number} objects, {name} plan: {took:.2f} s, of this process's processor {spent:.2f} s", flush=True)
         one.env.close()
@@ -245,7 +249,7 @@ def flat(samples: list[int], repetitions: int, ways: list[str], options: list[st
         ours, theirs = {}, {}
         for way, one in runners.items():
             problem = FlatProblem(one, scenes(one, 1))
-            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1), 1)
+            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1), one.reward(one.task), 1)
             theirs[f"pytorch_mppi, f {way}"] = mppi_planner(problem, count)
             theirs[f"torchrl CEM, f {way}"] = cem_planner(problem, count)
         with torch.inference_mode():

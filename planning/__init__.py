@@ -4,7 +4,7 @@
 search candidates (`rollout`, `returns`) with one of the `optimizers`; `protocol` says what a model and a reward offer.
 """
 
-from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts
+from cavin_pyro.planning.additions import Addition
 from cavin_pyro.planning.baselines import (
     CavinWithoutEffectsPlanner,
     CvaeMpcPlanner,
@@ -13,20 +13,21 @@ from cavin_pyro.planning.baselines import (
     SectarPlanner,
 )
 from cavin_pyro.planning.cavin import MOTION_HORIZONS, CavinPlanner
-from cavin_pyro.planning.protocol import Outcome, Plan, Planner, PlanningModel, RewardFunction
+from cavin_pyro.planning.protocol import Plan, Planner, PlanningModel, Reward, RewardFunction, StepOutcome
 
 __all__ = [
     "MOTION_HORIZONS",
+    "Addition",
     "CavinPlanner",
     "CavinWithoutEffectsPlanner",
     "CvaeMpcPlanner",
     "MpcPlanner",
-    "Outcome",
-    "PerturbedRollouts",
     "Plan",
     "Planner",
     "PlanningModel",
     "RandomPlanner",
+    "Reward",
     "RewardFunction",
     "SectarPlanner",
+    "StepOutcome",
 ]

@@ -9,70 +9,52 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning.additions.perturbed_rollouts import RETURN_WEIGHT, sequential_halving
-from cavin_pyro.planning.additions.touchdown import ObservedPoints
+from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.cavin import EffectSpace
 from cavin_pyro.planning.checks import NoFiniteCandidateError, check_positive, check_scenes
 from cavin_pyro.planning.protocol import (
-    DynamicsModel,
-    FlatModel,
+    EffectActionModel,
     ModelRequirements,
+    MotionModel,
     Plan,
     PlanningModel,
     RewardFunction,
+    Scene,
     SearchSpace,
     SegmentRollout,
-    SingleLatentModel,
+    TransitionModel,
 )
-from cavin_pyro.planning.returns import best_of, prefer
-from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states
+from cavin_pyro.planning.returns import best_of
+from cavin_pyro.planning.rollout import actions_of, predict_states
 from cavin_pyro.planning.sampling import noise_each, sample_codes
-from cavin_pyro.planning.searching import SearchingPlanner, chunked, summary
+from cavin_pyro.planning.searching import SearchingPlanner, summary
 
 
 class PushSearch(SearchingPlanner):
     """The common part of CVAE-MPC and MPC, everything but the source of pushes.
 
     space: generates the pushes of a segment, and predicts their states with f. stride_limits: metres per push, as
-    published 0.01 and 0.15; None in the paper. For the other options see `CavinPlanner`.
+    published 0.01 and 0.15; None in the paper. For the other options see `SearchingPlanner`.
 
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
-
-    Our additions, as in `CavinPlanner`: `robustness`, `touchdown_distance` and `guidance`. There is
-    no subgoal, so perturbed rollouts only estimate how often the executed segment fails. The chosen sequence has the
-    highest return minus `failure_cost / RETURN_WEIGHT` times the fraction of failed rollouts. By default this is 200
-    times the fraction, because a failure earns -100 instead of the +100 at the goal. So the score of a sequence with
-    predicted success is about its expected return. Sequences that reach the goal rank first: the rollouts of others may
-    have stopped early, so their returns are not comparable, and pushes that do nothing never fail.
     """
 
     has_codes: ClassVar[bool] = False  # the space searches motion codes
     strides = "pushes"
 
-    def __init__(self, space: SearchSpace, model: DynamicsModel, reward: RewardFunction, **options: Any) -> None:
+    def __init__(self, space: SearchSpace, model: TransitionModel, **options: Any) -> None:
         """`options`: of `SearchingPlanner`."""
-        super().__init__(model, reward, **options)
+        super().__init__(model, **options)
         self.space = space
 
-    @chunked
-    @torch.inference_mode()
-    def plan(
-        self,
-        state: State,
-        generators: Sequence[torch.Generator],
-        observed: ObservedPoints | None = None,
-    ) -> Plan:
-        """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`. There are no effect codes and no subgoals."""
-        candidates = self.search_by_reward(self.space, state, generators)
+    def plan_scene(self, scene: Scene) -> Plan:
+        """Plan for observed scenes `scene.state: [B]`. There are no effect codes and no subgoals."""
+        candidates = self.search_by_reward(self.space, scene)
         # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
-        scores, pushes = torch.where(finite, candidates.returns, -torch.inf), candidates.at(0, actions_of)
-        scores = self.prefer_free(scores, pushes, observed)
-        best = best_of(scores, "returns of push sequences")
-        if self.robustness is not None:
-            scores = prefer(scores, candidates.score_state.succeeded)
-            what = state, None, scores, pushes, -RETURN_WEIGHT * scores, generators
-            best = sequential_halving(self.robustness, self.model, self.reward, *what, backend=self.backend)
+        scores = torch.where(finite, candidates.returns, -torch.inf)
+        choice = Choice(scene, self.model, candidates, lambda: candidates.at(0, actions_of))
+        best = best_of(self.added("rank", scores, choice), "returns of push sequences")
         chosen = candidates.take(best.unsqueeze(-1))
         actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
         no_codes = codes.new_empty(len(codes), 0, 0)
@@ -81,7 +63,7 @@ class PushSearch(SearchingPlanner):
             planned_actions=actions,
             effect_codes=no_codes,
             motion_codes=codes if self.has_codes else no_codes,
-            subgoals=state.map(lambda field: field[:, None][:, :0]),
+            subgoals=scene.state.map(lambda field: field[:, None][:, :0]),
             predicted_centers=path,
             **summary(candidates, best),
         )
@@ -90,7 +72,7 @@ class PushSearch(SearchingPlanner):
 class FlatMotionSpace(NamedTuple):
     """Motion codes, the pushes that g generates from them alone, and the states that f predicts."""
 
-    model: FlatModel
+    model: MotionModel
 
     @property
     def dimension(self) -> int:
@@ -116,15 +98,15 @@ class CvaeMpcPlanner(PushSearch):
     requires = ModelRequirements("flat", ("motion_prior", "actions", "next_state"), excluded=("effect_prior",))
     has_codes = True
 
-    def __init__(self, model: FlatModel, reward: RewardFunction, **options: Any) -> None:
+    def __init__(self, model: MotionModel, **options: Any) -> None:
         """`options` are those of `PushSearch`."""
-        super().__init__(FlatMotionSpace(model), model, reward, **options)
+        super().__init__(FlatMotionSpace(model), model, **options)
 
 
 class PushSpace(NamedTuple):
     """Raw pushes, T a segment, uniform over the action space, and the states that f predicts step by step."""
 
-    model: DynamicsModel
+    model: TransitionModel
 
     @property
     def dimension(self) -> int:
@@ -150,25 +132,18 @@ class MpcPlanner(PushSearch):
 
     requires = ModelRequirements("dynamics", ("next_state",))
 
-    def __init__(self, model: DynamicsModel, reward: RewardFunction, **options: Any) -> None:
+    def __init__(self, model: TransitionModel, **options: Any) -> None:
         """`options` are those of `PushSearch`."""
-        super().__init__(PushSpace(model), model, reward, **options)
+        super().__init__(PushSpace(model), model, **options)
 
 
 class SectarPlanner(SearchingPlanner):
     """SeCTAR: effect codes ranked by reward, as in `CavinPlanner`; g generates the pushes from the chosen code alone.
 
-    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). Without our additions, f
-    only predicts the states after the pushes, for pictures.
+    There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). f only predicts the states
+    after the pushes, for pictures and additions. An effect has one motion here, so additions rank effect plans.
 
-    Our additions, as in `CavinPlanner`: `robustness`, `touchdown_distance` and `guidance`. An effect
-    has one motion here, so perturbed rollouts compare effect plans: of those that reach the goal, the
-    `robustness.candidates` with the highest return. Their cost is the distance of the pushes' outcome to the plan's own
-    first subgoal and `failure_cost` for failures, as in `CavinPlanner`, minus `RETURN_WEIGHT` times the return. Without
-    the return, the pushes that move least would win, because they end closest to their own subgoals. For the same
-    reason, where no plan reaches the goal, the one with the highest return is chosen, as without this addition.
-
-    model: p(c | s), h, g without motion codes, f. For the options see `CavinPlanner`. Raises ValueError for counts
+    model: p(c | s), h, g without motion codes, f. For the options see `SearchingPlanner`. Raises ValueError for counts
     below 1, a horizon that T does not divide, and unknown names.
     """
 
@@ -176,31 +151,27 @@ class SectarPlanner(SearchingPlanner):
         "single_latent", ("effect_prior", "subgoal", "actions", "next_state"), excluded=("motion_prior",)
     )
 
-    def __init__(self, model: SingleLatentModel, reward: RewardFunction, *positional: Any, **options: Any) -> None:
+    def __init__(self, model: EffectActionModel, **options: Any) -> None:
         """`options` are those of `SearchingPlanner`."""
-        super().__init__(model, reward, *positional, **options)
+        super().__init__(model, **options)
         self.space, self._actions = EffectSpace(model), model.actions
 
-    @chunked
-    @torch.inference_mode()
-    def plan(
-        self,
-        state: State,
-        generators: Sequence[torch.Generator],
-        observed: ObservedPoints | None = None,
-    ) -> Plan:
-        """Plan for observed scenes `state: [B]`; see `CavinPlanner.plan`."""
+    def plan_scene(self, scene: Scene) -> Plan:
+        """Plan for observed scenes `scene.state: [B]`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
-        effects = self.search_by_reward(self.space, state, generators)
-        here, returns = state.expand_plans(1), effects.returns
-        if observed is not None and self.touchdown_distance:
-            pushes = self._actions(here, effects.at(0, lambda segment: segment.rollout.code))
-            returns = self.prefer_free(returns, pushes, observed)
-        best = best_of(returns, "returns of effect plans")
-        if self.robustness is not None:
-            returns = torch.where(effects.score_state.succeeded, returns, -torch.inf)
-            robust = self._most_robust(effects, returns, generators)
-            best = torch.where(torch.isfinite(returns).any(-1), robust, best)
+        effects, here = self.search_by_reward(self.space, scene), scene.state.expand_plans(1)
+        choice = Choice(
+            scene,
+            self.model,
+            effects,
+            lambda: self._actions(here, effects.at(0, lambda segment: segment.rollout.code)),
+            subgoals=State(
+                effects.at(0, lambda segment: segment.rollout.states.centers),
+                effects.at(0, lambda segment: segment.rollout.states.features),
+                effects.plans.mask,
+            ),
+        )
+        best = best_of(self.added("rank", effects.returns, choice), "returns of effect plans")
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
         # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
@@ -220,26 +191,6 @@ class SectarPlanner(SearchingPlanner):
             predicted_centers=path[:, 0],
             **summary(effects, best),
         )
-
-    def _most_robust(self, effects: Candidates, returns: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-        """The effect plan whose first segment costs least on average, `[B]` int64; needs `robustness`.
-
-        returns: `[B, N]`, -inf for plans that are not to be chosen.
-        """
-        robustness, state = self.robustness, effects.problem.state
-        assert robustness is not None
-        best = returns.topk(min(robustness.candidates, effects.count), -1)
-        first = effects.take(best.indices)
-        actions = self._actions(state.expand_plans(1), first.at(0, lambda segment: segment.rollout.code))
-        scores = torch.where(torch.isfinite(actions).all(-1).all(-1), best.values, -torch.inf)
-        subgoals = State(
-            first.at(0, lambda segment: segment.rollout.states.centers),
-            first.at(0, lambda segment: segment.rollout.states.features),
-            first.plans.mask,
-        )
-        what = state, subgoals, scores, actions, -RETURN_WEIGHT * scores, generators
-        chosen = sequential_halving(robustness, self.model, self.reward, *what, backend=self.backend)
-        return best.indices.gather(1, chosen.unsqueeze(-1)).squeeze(1)
 
 
 class CascadeSpace(NamedTuple):
@@ -277,9 +228,9 @@ class CavinWithoutEffectsPlanner(PushSearch):
     requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "actions", "next_state"))
     has_codes = True
 
-    def __init__(self, model: PlanningModel, reward: RewardFunction, **options: Any) -> None:
+    def __init__(self, model: PlanningModel, **options: Any) -> None:
         """`options` are those of `PushSearch`."""
-        super().__init__(CascadeSpace(model), model, reward, **options)
+        super().__init__(CascadeSpace(model), model, **options)
 
 
 class RandomPlanner:
@@ -293,7 +244,14 @@ class RandomPlanner:
         self.segment_length = segment_length
 
     @torch.inference_mode()
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
+    def plan(
+        self,
+        state: State,
+        *,
+        generators: Sequence[torch.Generator],
+        reward: RewardFunction | None = None,
+        observed: Any = None,
+    ) -> Plan:
         """Sample `[B, T, 4]` pushes for the scenes `state: [B]`; without prediction or choice.
 
         Raises ValueError unless there is one generator per environment.

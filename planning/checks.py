@@ -50,6 +50,14 @@ def check_weight(name: str, value: float) -> None:
         raise ValueError(f"{name} must be zero or a positive number, not {value}")
 
 
+def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:
+    """The limits as a tuple. Raises ValueError unless they are two distances, in order and not negative."""
+    numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
+    if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
+        raise ValueError(f"{name} must be two distances in metres, low then high, not {limits}")
+    return limits[0], limits[1]
+
+
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Raise ValueError unless a value is one of the choices, which it names."""
     if value not in choices:

@@ -6,10 +6,11 @@ of horizon, M objects (padding included).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -17,8 +18,10 @@ from torch.distributions import Distribution
 
 from cavin_pyro.models.state import State
 
+ScoreStateKind = TypeVar("ScoreStateKind")
 
-class DynamicsModel(Protocol):
+
+class TransitionModel(Protocol):
     """The dynamics f alone (paper, equation 1), of which planners take the mean.
 
     Leading dimensions `[...]` of the arguments broadcast: planners pass states `[B, 1]` with codes or
@@ -42,7 +45,7 @@ class FixedShapes(Protocol):
         """Within it shapes follow from the shapes of arguments; results are the same up to rounding."""
 
 
-class EffectModel(DynamicsModel, Protocol):
+class EffectModel(TransitionModel, Protocol):
     """A model with effect codes: their prior, and the meta-dynamics h (paper, equation 2)."""
 
     @property
@@ -70,14 +73,14 @@ class PlanningModel(EffectModel, Protocol):
         """Mean of the action generator g(a | s, c, z): `[..., T, 4]` pushes; codes `[..., C]`, `[..., Z]`."""
 
 
-class SingleLatentModel(EffectModel, Protocol):
+class EffectActionModel(EffectModel, Protocol):
     """One code for the subgoal and the actions (SeCTAR): `model=single_latent`."""
 
     def actions(self, state: State, effect_code: Tensor) -> Tensor:
         """Mean of g(a | s, c): `[..., T, 4]` pushes."""
 
 
-class FlatModel(DynamicsModel, Protocol):
+class MotionModel(TransitionModel, Protocol):
     """Motion codes without effects (CVAE-MPC): `model=flat`."""
 
     @property
@@ -123,7 +126,7 @@ class Reparameterized(Protocol):
         """The sample `[..., D]` that `noise: [..., D]` determines."""
 
 
-class Outcome(Protocol):
+class StepOutcome(Protocol):
     """The outcome of one step, in any batch `[...]`. Success and failure both end the episode."""
 
     @property
@@ -139,60 +142,7 @@ class Outcome(Protocol):
         """`[...]` bool: a constraint is violated, or an object has left the workspace."""
 
 
-class RewardFunction(Protocol):
-    """R(s_{t+1}) of the paper (section 2); it also takes the state before, for rewards of progress."""
-
-    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, /) -> Outcome:
-        """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool.
-
-        Object 0 is the target.
-        """
-
-
-@runtime_checkable
-class BoundedReward(RewardFunction, Protocol):
-    """A reward function with an upper bound on returns, for early stopping."""
-
-    @property
-    def maximum_return(self) -> float:
-        """Upper bound on the cumulative reward of any sequence of steps."""
-
-
-@runtime_checkable
-class EpisodicReward(RewardFunction, Protocol):
-    """A reward function that changes from episode to episode."""
-
-    @property
-    def current(self) -> RewardFunction:
-        """The reward of this episode, a pure function of tensors."""
-
-
-@runtime_checkable
-class TargetedReward(RewardFunction, Protocol):
-    """A reward function that knows which objects its goal is about."""
-
-    @property
-    def about(self) -> str:
-        """`target`, which is object 0, or `all`."""
-
-
-def goal_objects(reward: RewardFunction) -> str | None:
-    """The objects that the goal is about: `target`, `all`, or None if the reward function does not say."""
-    return reward.about if isinstance(reward, TargetedReward) else None
-
-
-@runtime_checkable
-class PathReward(RewardFunction, Protocol):
-    """A reward function that can also evaluate whole paths, which reads every state once instead of twice."""
-
-    def along(self, states: Tensor, mask: Tensor, /) -> Outcome:
-        """Evaluate the T steps of paths `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` bool: fields `[..., T]`.
-
-        Equal to a call for each step.
-        """
-
-
-class DistanceToGoal(Protocol):
+class RemainingDistance(Protocol):
     """The remaining distance to the goal along allowed places, for guidance beyond the horizon."""
 
     def __call__(self, centers: Tensor, mask: Tensor, /) -> Tensor:
@@ -202,13 +152,66 @@ class DistanceToGoal(Protocol):
         """An upper bound on the metres left with the objects in `mask: [..., M]`: `[...]`."""
 
 
+class RewardFunction(Protocol):
+    """R(s_{t+1}) of the paper (section 2); it also takes the state before, for rewards of progress."""
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, /) -> StepOutcome:
+        """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool.
+
+        Object 0 is the target.
+        """
+
+
 @runtime_checkable
-class GuidingReward(RewardFunction, Protocol):
-    """A reward function that knows the remaining distance to the goal."""
+class Reward(RewardFunction, Protocol):
+    """A reward function with what planners can use besides; `as_reward` gives a plain function the defaults."""
 
     @property
-    def distance_to_goal(self) -> DistanceToGoal:
-        """The distance to the goal, the same object in every call."""
+    def about(self) -> str:
+        """The objects that the goal is about: `target`, which is object 0, or `all`; empty if unknown."""
+        return ""
+
+    @property
+    def maximum_return(self) -> float:
+        """Upper bound on the cumulative reward of any sequence of steps, for early stopping."""
+        return math.inf
+
+    def along(self, states: Tensor, mask: Tensor, /) -> StepOutcome:
+        """Evaluate the T steps of paths `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` bool: fields `[..., T]`.
+
+        Equal to a call for each step; it may read every state once instead of twice.
+        """
+        previous, centers = states[..., :-1, :, :], states[..., 1:, :, :]
+        return self(previous, centers, mask.unsqueeze(-2).expand(centers.shape[:-1]))
+
+    def distance_to_goal(self) -> RemainingDistance | None:
+        """The remaining distance to the goal, the same object in every call; None if unknown."""
+        return None
+
+
+@dataclass(frozen=True)
+class FunctionReward(Reward):
+    """A plain function as a `Reward`."""
+
+    function: RewardFunction
+
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
+        """See `RewardFunction`."""
+        return self.function(previous, centers, mask)
+
+
+def as_reward(function: RewardFunction) -> Reward:
+    """A reward function itself, or with the defaults of `Reward` if it has no more than its call."""
+    return function if isinstance(function, Reward) else FunctionReward(function)
+
+
+class Scene(NamedTuple):
+    """What one plan is made for: B environments."""
+
+    state: State  # [B], observed
+    reward: Reward
+    generators: Sequence[torch.Generator]  # one per environment
+    observed: Any = None  # what else the world shows, for additions: a named tuple of tensors [B, ...]
 
 
 class SegmentRollout(NamedTuple):
@@ -254,7 +257,10 @@ class ScoreState(Protocol):
 
 
 class Objective(Protocol):
-    """Scores candidates. A named tuple or a frozen dataclass, so that a backend can compile it."""
+    """Scores candidates. A named tuple or a frozen dataclass, so that a backend can compile it.
+
+    The state of an objective that wraps another one has the other's state as its field `inner`: see `unwrap`.
+    """
 
     def start(self, plans: State) -> Any:
         """`ScoreState` of candidates without a segment, `plans: [B, n]`."""
@@ -264,6 +270,27 @@ class Objective(Protocol):
 
     def early_stopped(self, score_state: Any) -> Tensor:
         """`[B]` bool: no active candidate can still reach a higher return than the best terminated one."""
+
+
+def unwrap(score_state: Any, kind: type[ScoreStateKind]) -> ScoreStateKind:
+    """The state of that kind, in itself or in the ones that it wraps.
+
+    Raises TypeError if there is none.
+    """
+    while not isinstance(score_state, kind):
+        if not hasattr(score_state, "inner"):
+            raise TypeError(f"no {kind.__name__} in this score state: {type(score_state).__name__} wraps no other one")
+        score_state = score_state.inner
+    return score_state
+
+
+def replace_within(
+    score_state: Any, kind: type[ScoreStateKind], function: Callable[[ScoreStateKind], ScoreStateKind]
+) -> Any:
+    """The same state with `function(it)` in place of the one of that kind, in it or in the ones that it wraps."""
+    if isinstance(score_state, kind):
+        return function(score_state)
+    return score_state._replace(inner=replace_within(score_state.inner, kind, function))
 
 
 class Evidence(NamedTuple):
@@ -308,18 +335,13 @@ class Plan(NamedTuple):
 
 
 class Planner(Protocol):
-    """Turns observed states into pushes."""
+    """Turns observed states into actions."""
 
     @property
     def segment_length(self) -> int:
         """T, the number of pushes in a plan's `actions`."""
 
-    def plan(self, state: State, generators: Sequence[torch.Generator]) -> Plan:
-        """Plan for the scenes `state: [B]`, each with its own generator."""
-
-
-@runtime_checkable
-class ObservingPlanner(Planner, Protocol):
-    """A planner whose method `plan` also takes what the camera sees: `ObservedPoints`."""
-
-    touchdown_distance: float
+    def plan(
+        self, state: State, *, reward: RewardFunction, generators: Sequence[torch.Generator], observed: Any = None
+    ) -> Plan:
+        """Plan for the scenes `state: [B]`, each with its own generator; `observed` as in `Scene`."""

@@ -1,11 +1,10 @@
-"""Returns of predicted trajectories, and the choice among candidates by them (paper, section 3.2; Algorithm 1, line 7).
+"""Returns and tracking costs of predicted trajectories, and the choice among candidates by them.
 
-Pure functions of tensors.
+Paper, section 3.2; Algorithm 1, lines 6, 7 and 10. Pure functions of tensors.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,11 +14,11 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.checks import NoFiniteCandidateError
-from cavin_pyro.planning.protocol import BoundedReward, Outcome, PathReward, RewardFunction, SegmentRollout
+from cavin_pyro.planning.protocol import Reward, SegmentRollout, StepOutcome
 
 REWARD_AT = ("path", "subgoals")
 STRIDE_PENALTY = -100.0  # of a step, as for a violation (published code)
-AUTO, END, FIRST_PUSH = "auto", "end", "first_push"  # where motions are compared with a subgoal
+END, FIRST_PUSH = "end", "first_push"  # where motions are compared with a subgoal
 
 
 class Progress(NamedTuple):
@@ -29,11 +28,6 @@ class Progress(NamedTuple):
     succeeded: Tensor  # [...] bool
     failed: Tensor  # [...] bool, never together with `succeeded`
     segments: Tensor  # [...] int64: segments entered while active
-
-    @property
-    def earned(self) -> Tensor:
-        """`[...]` cumulative reward, which is all that plans are ranked by without guidance."""
-        return self.returns
 
     @property
     def active(self) -> Tensor:
@@ -62,7 +56,7 @@ def interpolate(start: Tensor, end: Tensor, steps: int) -> Tensor:
     return torch.lerp(start.unsqueeze(-3), end.unsqueeze(-3), fraction[:, None, None])
 
 
-def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: Tensor, mask: Tensor) -> Progress:
+def advance(progress: Progress, reward: Reward, start: Tensor, centers: Tensor, mask: Tensor) -> Progress:
     """Add the rewards of one segment up to and including the step that ends a plan.
 
     `progress`: fields `[...]`; `start: [..., M, 3]` metres, the state before the segment;
@@ -72,7 +66,7 @@ def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: 
     comparison holds for NaN, so "no object is in the region" would be a success.
     """
     states = torch.cat([start.unsqueeze(-3), centers], dim=-3)  # [..., T + 1, M, 3]
-    outcome = judge(reward, states, mask)
+    outcome = reward.along(states, mask)
     # A sum is finite only if all of its terms are.
     real = centers.where(mask[..., None, :, None], 0.0)
     finite = torch.isfinite(outcome.reward + real.sum((-2, -1)))
@@ -88,16 +82,8 @@ def advance(progress: Progress, reward: RewardFunction, start: Tensor, centers: 
     return Progress(progress.returns + gained, succeeded, failed, progress.segments + progress.active)
 
 
-def judge(reward: RewardFunction, states: Tensor, mask: Tensor) -> Outcome:
-    """The reward of every step of paths: `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` -> fields `[..., T]`."""
-    if isinstance(reward, PathReward):
-        return reward.along(states, mask)
-    previous, centers = states[..., :-1, :, :], states[..., 1:, :, :]
-    return reward(previous, centers, mask.unsqueeze(-2).expand(centers.shape[:-1]))
-
-
-class StepOutcome(NamedTuple):
-    """The `Outcome` of steps in any batch `[...]`."""
+class LimitedStep(NamedTuple):
+    """The `StepOutcome` of steps with `StrideLimits`, in any batch `[...]`."""
 
     reward: Tensor
     success: Tensor
@@ -110,16 +96,10 @@ class CumulativeReward:
 
     reward: the task's. at: `path` evaluates every step of a segment, interpolated ones too (paper); `subgoals` only
     its end, as one step (published code).
-
-    Raises ValueError for an unknown `at`.
     """
 
-    reward: RewardFunction
+    reward: Reward
     at: str = "path"
-
-    def __post_init__(self) -> None:
-        if self.at not in REWARD_AT:
-            raise ValueError(f"unknown reward_at '{self.at}': choose {' or '.join(REWARD_AT)}")
 
     def start(self, plans: State) -> Progress:
         """Progress of candidates without a segment, `plans: [B, n]`."""
@@ -133,42 +113,32 @@ class CumulativeReward:
     def early_stopped(self, score_state: Progress) -> Tensor:
         """`[B]` bool: no active candidate can still reach a higher return than the best terminated one.
 
-        Always false, unless the reward function is a `cavin_pyro.planning.protocol.BoundedReward`.
+        Always false, unless the reward says what `maximum_return` is.
         """
         ended = torch.where(score_state.active, -torch.inf, score_state.returns).amax(-1)
-        possible = torch.where(
-            score_state.active, score_state.returns + maximum_return_of(self.reward), -torch.inf
-        ).amax(-1)
+        most = score_state.returns + self.reward.maximum_return
+        possible = torch.where(score_state.active, most, -torch.inf).amax(-1)
         return ended > possible
 
 
 @dataclass(frozen=True)
-class StrideLimits:
+class StrideLimits(Reward):
     """A reward function that ends plans whose strides are implausible (published code; not in the paper).
 
     A stride fails if every object moves less than `shortest`, or any farther than `longest` metres; its reward is
     then -100. `of`: `segments` (published: 0.1 m and 0.3 m from subgoal to subgoal) or `pushes` (0.01 m and 0.15 m).
-
-    Raises ValueError unless the limits are two, in order, not negative.
     """
 
-    reward: RewardFunction
+    reward: Reward
     limits: Sequence[float]  # shortest and longest, in metres
     of: str
-
-    def __post_init__(self) -> None:
-        limits = self.limits
-        numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
-        if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
-            raise ValueError(f"stride_limits must be two distances in metres, low then high, not {limits}")
-        object.__setattr__(self, "limits", tuple(limits))
 
     @property
     def maximum_return(self) -> float:
         """Upper bound on any return, as without limits, which only lower returns."""
-        return maximum_return_of(self.reward)
+        return self.reward.maximum_return
 
-    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> Outcome:
+    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
         """Evaluate the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
         outcome = self.reward(previous, centers, mask)
         if self.of == "pushes":
@@ -178,7 +148,7 @@ class StrideLimits:
             outside = torch.zeros_like(outcome.failure)
             outside[..., 0] = whole  # from its first step on: no reward counts in a segment that fails
         outside = outside & ~outcome.failure
-        return StepOutcome(
+        return LimitedStep(
             torch.where(outside, STRIDE_PENALTY, outcome.reward),
             outcome.success & ~outside,
             outcome.failure | outside,
@@ -189,11 +159,6 @@ class StrideLimits:
         strides = (after - before).norm(dim=-1)
         short = ((strides < shortest) | ~mask).all(-1)
         return short | ((strides > longest) & mask).any(-1)
-
-
-def maximum_return_of(reward: RewardFunction) -> float:
-    """Upper bound on any return; infinite if unknown."""
-    return reward.maximum_return if isinstance(reward, BoundedReward) else math.inf
 
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
@@ -229,6 +194,65 @@ class SubgoalDistance(NamedTuple):
         """
         compared = end if self.at == END else end._replace(centers=path[..., 0, :, :])
         return squared_distance(compared, subgoal, feature_weight=self.feature_weight)
+
+
+def select_segment(values: Tensor, number: int | Tensor) -> Tensor:
+    """One segment `[B, 1, ...]` of `values: [B, K, ...]`; a tensor `number` is not read on the host."""
+    return values.index_select(1, torch.as_tensor(number, device=values.device).reshape(1))
+
+
+class TrackingState(NamedTuple):
+    """The tracking cost of motion candidates so far; fields `[B, n]`."""
+
+    cost: Tensor  # square metres, summed over the segments
+    executed_cost: Tensor  # of the first segment, which is executed
+    finite: Tensor  # bool: all actions are finite
+
+    @property
+    def returns(self) -> Tensor:
+        """`[B, n]` minus the cost."""
+        return torch.where(self.finite & torch.isfinite(self.cost), -self.cost, -torch.inf)
+
+    @property
+    def failed(self) -> Tensor:
+        """`[B, n]` bool: none, because Algorithm 1 replaces no motions."""
+        return torch.zeros_like(self.finite)
+
+    @property
+    def active(self) -> Tensor:
+        """`[B, n]` bool: all, because line 9 predicts whole sequences."""
+        return torch.ones_like(self.finite)
+
+
+class TrackingCost(NamedTuple):
+    """Line 10: squared distance of the predicted states to the chosen subgoals, segment by segment.
+
+    Segments after the end of the chosen effect plan have no subgoal and do not count.
+    """
+
+    subgoals: State  # [B, K, M, .]
+    segments: Tensor  # [B] int64, 1..K: segments until the effect plan ends
+    distance: SubgoalDistance
+
+    def start(self, plans: State) -> TrackingState:
+        """The state of candidates without a segment, `plans: [B, n]`."""
+        nothing = plans.centers.new_zeros(plans.batch_shape)
+        return TrackingState(nothing, nothing, torch.ones_like(nothing, dtype=torch.bool))
+
+    def advance(self, state: TrackingState, segment: int, before: State, rollout: SegmentRollout) -> TrackingState:
+        """The state after one more segment from `before: [B, n]`."""
+        counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
+        subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
+        distance = self.distance(rollout.states, rollout.path, subgoal)
+        cost = state.cost + torch.where(counts, distance, 0.0)
+        executed = torch.as_tensor(segment == 0, device=counts.device)
+        assert rollout.actions is not None
+        finite = state.finite & (torch.isfinite(rollout.actions).all(-1).all(-1) | ~counts)
+        return TrackingState(cost, torch.where(executed, cost, state.executed_cost), finite)
+
+    def early_stopped(self, state: TrackingState) -> Tensor:
+        """`[B]` bool: none, because no sequence ends before the others."""
+        return torch.zeros_like(state.finite[:, 0])
 
 
 def prefer(scores: Tensor, preferred: Tensor) -> Tensor:

@@ -14,8 +14,42 @@ from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.backends import Backend, eager
 from cavin_pyro.planning.checks import OptimizerError
-from cavin_pyro.planning.protocol import DynamicsModel, Evidence, Objective, SearchSpace, SegmentRollout
+from cavin_pyro.planning.protocol import Evidence, Objective, SearchSpace, SegmentRollout, TransitionModel, unwrap
+from cavin_pyro.planning.returns import Progress
 from cavin_pyro.planning.sampling import noise_each, uniform_each
+
+
+class Focus(NamedTuple):
+    """The objects that a plan is about, m of M."""
+
+    indices: Tensor | None = None  # [B, m] int64, ascending; None for all objects
+
+    def of(self, state: State) -> State:
+        """These objects alone: `[B, ...]` of M objects -> `[B, ...]` of m."""
+        if self.indices is None:
+            return state
+        indices = _along(self.indices, state)
+        return State(
+            state.centers.take_along_dim(indices, -2),
+            state.features.take_along_dim(indices, -2),
+            state.mask.take_along_dim(indices.squeeze(-1), -1),
+        )
+
+    def among(self, others: State, these: State) -> State:
+        """States `these: [B, n]` of m objects, with all `others: [B]` of M where they are: `[B, n]` of M."""
+        if self.indices is None:
+            return these
+        indices, everything = _along(self.indices, these), others.expand_plans(these.batch_shape[-1])
+        return State(
+            everything.centers.scatter(-2, indices.expand_as(these.centers), these.centers),
+            everything.features.scatter(-2, indices.expand_as(these.features), these.features),
+            everything.mask,
+        )
+
+
+def _along(indices: Tensor, state: State) -> Tensor:
+    """`indices: [B, m]` of objects, to index the fields of `state: [B, ...]`: `[B, 1 ..., m, 1]`."""
+    return indices.reshape(len(indices), *(1,) * (len(state.batch_shape) - 1), -1, 1)
 
 
 class SegmentRecord(NamedTuple):
@@ -26,18 +60,13 @@ class SegmentRecord(NamedTuple):
     score_state: Any  # after the segment
 
 
-def select_segment(values: Tensor, number: int | Tensor) -> Tensor:
-    """One segment `[B, 1, ...]` of `values: [B, K, ...]`; a tensor `number` is not read on the host."""
-    return values.index_select(1, torch.as_tensor(number, device=values.device).reshape(1))
-
-
 def actions_of(segment: SegmentRecord) -> Tensor:
     """The actions `[B, R, T, 4]` of a segment, for a search space that has them."""
     assert segment.rollout.actions is not None
     return segment.rollout.actions
 
 
-def predict_states(model: DynamicsModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
+def predict_states(model: TransitionModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
     """T `pushes: [B, n, T, 4]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]` and the path `[B, n, T, M, 3]`.
 
     Step by step; the path is in metres.
@@ -251,6 +280,11 @@ class Candidates:
         return self.score_state.returns
 
     @property
+    def progress(self) -> Progress:
+        """Their cumulative reward, fields `[B, n]`, of a search by reward."""
+        return unwrap(self.score_state, Progress)
+
+    @property
     def codes(self) -> Tensor:
         """`[B, n, k, D]` effect or motion codes, or the concatenated pushes of each segment."""
         return self.history(lambda segment: segment.rollout.code)
@@ -312,8 +346,20 @@ class Candidates:
         problem, before, number = self.problem, self.plans, len(self.segments)
         # In the first segment all candidates start from one state, which the model reads once.
         here = before if self.segments else problem.state.expand_plans(1)
-        what = problem.space, problem.objective, number, here, before, self.score_state, noise, uniforms, early_stopped
-        after = extend_segment(*what, problem.generators) if noise is None else problem.backend(extend_segment, *what)
+        run, generators = (eager, problem.generators) if noise is None else (problem.backend, ())
+        after = run(
+            extend_segment,
+            problem.space,
+            problem.objective,
+            number,
+            here,
+            before,
+            self.score_state,
+            noise,
+            uniforms,
+            early_stopped,
+            generators,
+        )
         segments = (*self.segments, SegmentRecord(noise, after.rollout, after.score_state))
         ancestors = None if last else after.ancestors
         plans, score_state = after.plans, after.next_score_state

@@ -31,7 +31,8 @@ EXAMPLES = {
 }
 EPISODES = (
     "planner planner/optimizer layout reward objects maximum_steps seed checkpoint device output pushes_per_plan "
-    "margin planner.samples planner.horizon planner.compile env.objects env.camera env.segmentation env.assets"
+    "margin planner.samples planner.horizon planner.add planner.compile env.objects env.camera "
+    "env.segmentation env.assets"
 )
 USUAL = {  # options that a user of the field changes, which --help lists; --help=all lists every one
     "collect": "env/ranges transitions output seed steps policy checkpoint minimum_objects maximum_objects repair "
@@ -46,7 +47,7 @@ USUAL = {  # options that a user of the field changes, which --help lists; --hel
     "env.segmentation env.assets sizes.guide.samples sizes.predictive.replicates sizes.subgoals.scenes",
     "calibrate": "checkpoint data output device seed parts steps batch_size learning_rate windows samples",
     "plan": f"{EPISODES} task tiles.goal video viewer save_goal",
-    "evaluate": f"{EPISODES} task episodes compare shard merge workers",
+    "evaluate": f"{EPISODES} task episodes compare shard workers",
     "demo": f"{EPISODES} tasks",
     "reproduce": "scale methods planners tasks objects rewards episodes bottom_episodes models output device workers "
     "shard table",
@@ -152,7 +153,8 @@ def _text(value: Any) -> str:
 
 
 def _entry(option: str, meaning: str) -> list[str]:
-    return textwrap.wrap(
+    *long, option = re.findall(rf".{{1,{WIDTH - 4}}}(?:,|$)", option) if len(option) > WIDTH - 4 else [option]
+    return [f"  {part}" for part in long] + textwrap.wrap(
         meaning,
         WIDTH,
         initial_indent=f"  {option}".ljust(INDENT - 1) + " ",

@@ -20,7 +20,7 @@ from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.policy import Intent
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.planning.additions.touchdown import TOUCHDOWN_DISTANCE, prefer_free
+from cavin_pyro.planning.additions.touchdown import Touchdown
 from cavin_pyro.planning.returns import best_of, squared_distance
 from cavin_pyro.planning.rollout import predict_states
 from cavin_pyro.planning.sampling import sample_each
@@ -70,9 +70,8 @@ class ModelPushingPolicy:
         motion_code = sample_each(model.motion_prior, [plans, codes], [self._random])
         pushes = model.actions(here, effect_code=codes, motion_code=motion_code)
         ends, _ = predict_states(model, here, pushes)
-        scores = prefer_free(
-            -squared_distance(ends, subgoal), pushes[:, :, 0], observed_points(seen), TOUCHDOWN_DISTANCE
-        )
+        scores = -squared_distance(ends, subgoal)
+        scores = Touchdown().leave_out(scores, pushes[:, :, 0], observed_points(seen))
         best = int(best_of(scores, "distances of motions to the subgoal"))
         moves = (subgoal.centers - here.centers)[0, 0, :, :2] * state.mask[0, :, None]
         target = int(moves.norm(dim=-1).argmax())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,16 @@ from cavin_pyro.config.world import object_ranges, part_of, task_of
 from cavin_pyro.envs.layouts import GENERATED
 from cavin_pyro.envs.objects.sampling import NoRoomError
 from cavin_pyro.envs.pushing import PushingEnv
-from cavin_pyro.envs.tasks import GeneratedLayouts, Task
+from cavin_pyro.envs.tasks import GeneratedLayouts, Task, TaskReward
 from cavin_pyro.envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
-from cavin_pyro.evaluation.episode_reward import EpisodeReward
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Planner
+from cavin_pyro.planning.additions import ADDITIONS, Addition
 from cavin_pyro.planning.backends import GRAPHS
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
 from cavin_pyro.planning.optimizers import Shooting
-from cavin_pyro.planning.protocol import RewardFunction
-from cavin_pyro.planning.returns import AUTO, END
 from cavin_pyro.planning.searching import SearchingPlanner
 from cavin_pyro.storage.checkpoint import load
 
@@ -50,6 +49,7 @@ class EpisodeRunner:
     env: PushingEnv
     planner: Planner
     geometry: Geometry
+    reward: Callable[[Task], TaskReward]
     pushes_per_plan: int | None  # as in `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
     push_decimals: int | None = PUSH_DECIMALS  # as in `cavin_pyro.evaluation.rollout.rollout`
@@ -70,6 +70,7 @@ class EpisodeRunner:
         usual = {
             "pushes_per_plan": self.pushes_per_plan,
             "push_decimals": self.push_decimals,
+            "reward": self.reward,
             "device": self.device,
         }
         options = usual | options
@@ -154,7 +155,7 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
         )
 
 
-def make_planner(config: DictConfig, reward: RewardFunction, device: torch.device) -> tuple[Planner, Geometry]:
+def make_planner(config: DictConfig, device: torch.device) -> tuple[Planner, Geometry]:
     """Build the planner with the checkpoint's model, and the geometric features of the checkpoint.
 
     Args:
@@ -175,12 +176,10 @@ def make_planner(config: DictConfig, reward: RewardFunction, device: torch.devic
     _check_planner(options, model, checkpoint.path)
     if options.get("compile") is True and device.type == "cuda":
         options["compile"] = GRAPHS
-    if options.get("tracking_at") == AUTO and config.pushes_per_plan != 1:
-        options["tracking_at"] = END  # the first push alone counts only where it alone is executed
     torch.manual_seed(config.seed)
-    optimizers = _optimizers(options)
+    optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
     with user_input("planner"):
-        return construct(options, model=model, reward=reward, **optimizers), geometry
+        return construct(options, model=model, additions=additions, **optimizers), geometry
 
 
 @user_input("planner", "checkpoint", "task", "tiles", "env", "layout", "generated", "pushes_per_plan")
@@ -197,8 +196,8 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     env = make_environment(config, render=render)
     try:
         with user_input():
-            reward = EpisodeReward(env, reward=config.reward, margin=config.margin, device=device)
-        planner, geometry = make_planner(config, reward, device)
+            reward = episode_rewards(env.tasks, reward=config.reward, margin=config.margin, device=device)
+        planner, geometry = make_planner(config, device)
         if config.pushes_per_plan is not None:
             check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
@@ -209,7 +208,44 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(env, planner, geometry, config.pushes_per_plan, device, config.get("push_decimals"))
+    return EpisodeRunner(env, planner, geometry, reward, config.pushes_per_plan, device, config.get("push_decimals"))
+
+
+def episode_rewards(tasks: Sequence[Task], **options: Any) -> Callable[[Task], TaskReward]:
+    """The reward of a task: one object for each of `tasks`, so that what it computes once serves all episodes.
+
+    Raises:
+        ValueError: as `TaskReward` does, of which `options` are.
+    """
+    known = {id(task): (task, TaskReward(task, **options)) for task in tasks}  # with its task, so that its id stays
+
+    def reward(task: Task) -> TaskReward:
+        return known[id(task)][1] if id(task) in known else TaskReward(task, **options)
+
+    return reward
+
+
+def _additions(options: dict[str, Any], *, one_push: bool) -> list[Addition]:
+    """Take the additions out of a planner's options, and build them.
+
+    `planner.add` adds more, of which one replaces another of its class, and `planner.drop` leaves some out.
+
+    Raises:
+        UserError: one that is unknown or cannot be built.
+    """
+    listed, more, dropped = (list(options.pop(name, None) or []) for name in ("additions", "add", "drop"))
+    unknown = [str(name) for name in (*listed, *more, *dropped) if isinstance(name, str) and name not in ADDITIONS]
+    if unknown:
+        raise UserError(f"unknown addition '{unknown[0]}': choose from {', '.join(ADDITIONS)}, or give a _target_")
+    made: dict[type, Addition] = {}
+    for entry in (*listed, *more):
+        with user_input("planner"):
+            addition = ADDITIONS[entry]() if isinstance(entry, str) else construct(entry)
+        made[type(addition)] = addition
+    for name in dropped:
+        if made.pop(ADDITIONS[name], None) is None:
+            raise UserError(f"planner.drop=[{name}]: this planner has no such addition")
+    return [addition for addition in made.values() if one_push or not getattr(addition, "for_one_push", False)]
 
 
 def _optimizers(options: dict[str, Any]) -> dict[str, Any]:

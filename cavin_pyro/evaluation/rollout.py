@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.envs.pushing import ObservationDict, PushingEnv
 from cavin_pyro.envs.randomness import planner_seed
+from cavin_pyro.envs.tasks import Task, TaskReward
 from cavin_pyro.envs.workspace import PUSH_DECIMALS, executed_push
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Plan, Planner
-from cavin_pyro.planning.protocol import ObservingPlanner
+from cavin_pyro.planning.protocol import Reward
 from cavin_pyro.planning.records import apply
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
@@ -142,6 +143,7 @@ def rollout(
     geometry: Geometry,
     *,
     seed: int,
+    reward: Callable[[Task], Reward] = TaskReward,
     pushes_per_plan: int | None = None,
     push_decimals: int | None = PUSH_DECIMALS,
     photograph: bool = False,
@@ -152,8 +154,9 @@ def rollout(
 
     Args:
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
+        reward: by which plans are made, from the episode's task; by default sparse and without a margin.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
-            planner that tracks the first push (`tracking_at`) is for 1.
+            planner with the addition `first_push` is for 1.
         push_decimals: to which planned pushes are rounded (`executed_push`), so that an episode does not
             depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
@@ -169,14 +172,16 @@ def rollout(
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.scene.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
     observation, _ = env.reset(seed=seed)
+    task_reward = reward(env.task)
     for callback in callbacks:
         callback.on_observation(observation)
     ended = False
     while not ended:
         began = time.perf_counter()
         state = observed_state(observation, geometry, device)
-        observed = {"observed": observed_points(observation, device)} if isinstance(planner, ObservingPlanner) else {}
-        plan = apply(planner.plan(state, [generator], **observed), lambda field: field.cpu())
+        points = observed_points(observation, device)
+        plan = planner.plan(state, reward=task_reward, generators=[generator], observed=points)
+        plan = apply(plan, lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),
             centers=observation["centers"],
@@ -192,12 +197,12 @@ def rollout(
         actions = plan.actions[0].numpy()
         for number, action in enumerate(actions[:pushes_per_plan]):
             action = executed_push(action, push_decimals)
-            observation, reward, terminated, truncated, info = env.step(action)
+            observation, earned, terminated, truncated, info = env.step(action)
             last = number == len(actions) - 1
             transition = Transition(
                 step=info["steps"],
                 action=action,
-                reward=float(reward),
+                reward=float(earned),
                 centers=observation["centers"],
                 subgoal_distance=_subgoal_distance(record, observation["centers"]) if last else float("nan"),
                 strict_reward=info["strict"]["reward"],

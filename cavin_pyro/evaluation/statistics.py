@@ -93,6 +93,6 @@ def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
 
 def _advice(config: DictConfig) -> str:
     others = "" if config.reward == "dense" else " or reward=dense"
-    guided = config.planner.get("guidance", "none") != "none"
-    what = "a longer one" if guided else "planner.guidance=layout, a longer one"
+    guided = "guidance" in [*(config.planner.get("additions") or ()), *(config.planner.get("add") or ())]
+    what = "a longer one" if guided else "planner.add=[guidance], a longer one"
     return f"the goal may lie beyond planner.horizon={config.planner.horizon} pushes; try {what}{others}"

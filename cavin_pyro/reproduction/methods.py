@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 # The paper's way of planning, for the baselines as `planner=paper` has it for CAVIN.
 WITHOUT_ADDITIONS = (
-    "planner.early_stopping=false",
-    "planner.robustness=null",
-    "planner.touchdown_distance=0.0",
+    "planner.additions=[]",
     "pushes_per_plan=null",
     "push_decimals=null",
     "margin=0",

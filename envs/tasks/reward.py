@@ -155,9 +155,12 @@ class TaskReward:
         """The objects that the goal is about: the `target` (object 0), or `all`."""
         return self.task.about
 
-    @cached_property
     def distance_to_goal(self) -> DistanceToGoal:
         """The remaining distance to the goal, for planners, with the margin. Computing it takes about 0.1 s, once."""
+        return self._distance_to_goal
+
+    @cached_property
+    def _distance_to_goal(self) -> DistanceToGoal:
         return DistanceToGoal(self)
 
     @property

@@ -127,7 +127,7 @@ class Task(ABC):
         name: by default the name of the class in lower case.
         markings: how pictures show the layout; later ones lie on top of earlier ones.
         about: the objects that the goal is about: the `target` (object 0), or `all`. Pictures show their subgoals,
-            guidance follows their way, and for `all` the planner tracks the first push (`planner.tracking_at`).
+            guidance follows their way, and for `all` the planner may track the first push.
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
         goal_is_shared: whether one place is as good for each object as for another; else guidance follows `potential`.
         goal_varies: whether `of_episode` returns another task in every episode, which planners must not compile.

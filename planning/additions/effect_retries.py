@@ -7,14 +7,17 @@ again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
-from cavin_pyro.planning.protocol import Plan
+from cavin_pyro.planning.additions.addition import Addition
+from cavin_pyro.planning.checks import check_positive
+from cavin_pyro.planning.protocol import Plan, Scene
 from cavin_pyro.planning.returns import best_of
 from cavin_pyro.planning.rollout import Candidates
 
@@ -23,40 +26,40 @@ EFFECT = 0.02  # metres; an effect that moves an object farther needs a motion t
 SIMILAR = 0.5  # cosine of the angle between the moves of two effects, all objects together
 
 
-def try_other_effects(
-    retries: int,
-    motions_for: Callable[[Candidates, Tensor], Plan],
-    chosen: Tensor,
-    near: State,
-    effects: Candidates,
-    state: State,
-    generators: Sequence[torch.Generator],
-) -> Plan:
-    """The plans for the effects `chosen: [B]` int64, or for other effects where these move nothing.
+@dataclass(frozen=True)
+class EffectRetries(Addition):
+    """Tries another effect, up to `retries` times, where no motion moves anything.
 
-    Args:
-        retries: how often another effect is tried. motions_for: lines 8 to 11 for effect plans by number, `[B]`; it
-            advances the `generators`, one per environment.
-        state: `[B]`. near: `[B]`, the same of the objects that `effects: [B, N]` are about. The search for the best of
-            these may have stopped early; the others are then rolled out to their ends.
+    The search for the best effect may have stopped early; the other ones are then rolled out to their ends. Raises
+    ValueError for a number below 1.
     """
-    plan, scores = motions_for(effects, chosen), effects.returns
-    for number in range(retries):
-        after = plan.predicted_centers[:, plan.actions.shape[1] - 1]
-        stuck = is_unmoved(state, plan.subgoals.centers[:, 0], after)
-        if not stuck.any():
-            break
-        if number == 0:
-            effects = effects.rolled_out()
-            scores = effects.returns
-        scores = leave_out_similar(scores, first_moves(near, effects), chosen, stuck)
-        chosen = best_of(scores, "returns of effect plans")
-        before = [generator.get_state() for generator in generators]
-        plan = records.where(stuck, motions_for(effects, chosen), plan)
-        for generator, own, tried in zip(generators, before, stuck.tolist(), strict=True):
-            if not tried:  # an environment's plan depends on its own arguments only
-                generator.set_state(own)
-    return plan
+
+    retries: int = 3
+
+    def __post_init__(self) -> None:
+        check_positive("retries", self.retries)
+
+    def revise(
+        self, plan: Plan, *, scene: Scene, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
+    ) -> Plan:
+        """See `Addition`."""
+        scores = effects.returns
+        for number in range(self.retries):
+            after = plan.predicted_centers[:, plan.actions.shape[1] - 1]
+            stuck = is_unmoved(scene.state, plan.subgoals.centers[:, 0], after)
+            if not stuck.any():
+                break
+            if number == 0:
+                effects = effects.rolled_out()
+                scores = effects.returns
+            scores = leave_out_similar(scores, first_moves(effects), chosen, stuck)
+            chosen = best_of(scores, "returns of effect plans")
+            before = [generator.get_state() for generator in scene.generators]
+            plan = records.where(stuck, plan_motions(effects, chosen), plan)
+            for generator, own, tried in zip(scene.generators, before, stuck.tolist(), strict=True):
+                if not tried:  # an environment's plan depends on its own arguments only
+                    generator.set_state(own)
+        return plan
 
 
 def is_unmoved(state: State, subgoals: Tensor, predicted: Tensor) -> Tensor:
@@ -68,8 +71,9 @@ def is_unmoved(state: State, subgoals: Tensor, predicted: Tensor) -> Tensor:
     return (_farthest(state, predicted) < STILL) & (_farthest(state, subgoals) >= EFFECT)
 
 
-def first_moves(state: State, effects: Candidates) -> Tensor:
-    """How the first effect of `effects: [B, N]` moves each object of `state: [B]`: `[B, N, M, 2]` metres."""
+def first_moves(effects: Candidates) -> Tensor:
+    """How the first effect of `effects: [B, N]` moves each object that they are about: `[B, N, m, 2]` metres."""
+    state = effects.problem.state
     ends = effects.at(0, lambda record: record.rollout.states.centers)
     moves = (ends - state.centers.unsqueeze(1))[..., :2]
     return torch.where(state.mask[:, None, :, None], moves, 0.0)

@@ -19,90 +19,92 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning.protocol import DistanceToGoal, GuidingReward, Objective, RewardFunction, SegmentRollout
-from cavin_pyro.planning.returns import CumulativeReward, Progress
-from cavin_pyro.planning.rollout import select_segment
+from cavin_pyro.planning.additions.addition import Addition, ChosenEffect
+from cavin_pyro.planning.protocol import Objective, RemainingDistance, Scene, SegmentRollout, replace_within, unwrap
+from cavin_pyro.planning.returns import Progress, TrackingState, select_segment
 
-GUIDANCE = ("none", "layout")
 CONTINUES = 0.9  # after each segment; 1 values the last state alone
 PUSHES_PER_METRE = 20.0  # turns metres into returns, whose unit is a push: one moves an object by about 0.05 m
+
+
+@dataclass(frozen=True)
+class Guidance(Addition):
+    """Prefers, among plans that miss the goal, those that leave the shortest way to it along allowed places.
+
+    Plans raise ValueError for a reward that does not know the remaining distance to the goal.
+    """
+
+    def wrap_objective(self, objective: Objective, scene: Scene, effect: ChosenEffect | None) -> Objective:
+        """See `Addition`."""
+        distance = scene.reward.distance_to_goal()
+        if distance is None:
+            raise ValueError("the addition guidance needs a reward with a `distance_to_goal`: leave it out")
+        if effect is None:
+            return GuidedReturn(objective, distance)
+        return GuidedTracking(objective, distance, effect.subgoals, effect.segments, ~effect.succeeded)
 
 
 class GuidedProgress(NamedTuple):
     """The cumulative reward of candidates so far, and the value of their states; fields `[B, n]`."""
 
-    progress: Progress
+    inner: Any  # without guidance
     value: Tensor  # at most 0; in pushes
     passed: Tensor  # the part of the value that later segments do not change
 
     @property
     def returns(self) -> Tensor:
         """Cumulative reward so far plus the value."""
-        return self.progress.returns + self.value
-
-    @property
-    def earned(self) -> Tensor:
-        """Cumulative reward alone."""
-        return self.progress.returns
-
-    @property
-    def succeeded(self) -> Tensor:
-        """bool: see `Progress`."""
-        return self.progress.succeeded
+        return self.inner.returns + self.value
 
     @property
     def failed(self) -> Tensor:
-        """bool: see `Progress`."""
-        return self.progress.failed
-
-    @property
-    def segments(self) -> Tensor:
-        """int64: see `Progress`."""
-        return self.progress.segments
+        """bool: as without guidance."""
+        return self.inner.failed
 
     @property
     def active(self) -> Tensor:
-        """bool: neither succeeded nor failed."""
-        return self.progress.active
+        """bool: as without guidance."""
+        return self.inner.active
 
 
 @dataclass(frozen=True)
 class GuidedReturn:
     """Cumulative reward plus the value of the states that a plan leads to: the objective at line 7."""
 
-    objective: CumulativeReward
-    distance_to_goal: DistanceToGoal
+    objective: Objective
+    distance_to_goal: RemainingDistance
 
     def start(self, plans: State) -> GuidedProgress:
         """Progress of candidates without a segment, `plans: [B, n]`."""
         potential = self.potential(plans.centers, plans.mask)
         return self.valued(self.objective.start(plans), potential, torch.zeros_like(potential), plans.mask)
 
-    def advance(
-        self, score_state: GuidedProgress, segment: int, before: State, rollout: SegmentRollout
-    ) -> GuidedProgress:
+    def advance(self, state: GuidedProgress, segment: int, before: State, rollout: SegmentRollout) -> GuidedProgress:
         """Progress after one more segment from `before: [B, n]`."""
-        progress = self.objective.advance(score_state.progress, segment, before, rollout)
+        inner = self.objective.advance(state.inner, segment, before, rollout)
         potential = self.potential(rollout.states.centers, before.mask)
         arrives = CONTINUES**segment  # the probability that the plan comes so far
-        passed = score_state.passed + (1.0 - CONTINUES) * arrives * potential
-        return self.valued(progress, passed + CONTINUES * arrives * potential, passed, before.mask)
+        passed = state.passed + (1.0 - CONTINUES) * arrives * potential
+        return self.valued(inner, passed + CONTINUES * arrives * potential, passed, before.mask)
 
     def potential(self, centers: Tensor, mask: Tensor) -> Tensor:
         """Minus the distance to the goal, in pushes: `[B, n]`."""
         return -PUSHES_PER_METRE * self.distance_to_goal(centers, mask)
 
-    def valued(self, progress: Progress, value: Tensor, passed: Tensor, mask: Tensor) -> GuidedProgress:
+    def valued(self, inner: Any, value: Tensor, passed: Tensor, mask: Tensor) -> GuidedProgress:
         """The state of plans with that value, if they have not ended."""
+        progress = unwrap(inner, Progress)
         lowest = -PUSHES_PER_METRE * self.distance_to_goal.longest(mask)
         value = torch.where(progress.failed, lowest, torch.where(progress.succeeded, 0.0, value))
-        return GuidedProgress(progress, value, passed)
+        return GuidedProgress(inner, value, passed)
 
-    def early_stopped(self, score_state: GuidedProgress) -> Tensor:
+    def early_stopped(self, state: GuidedProgress) -> Tensor:
         """`[B]` bool: as without guidance, but ended plans count with their value; active ones can lose theirs."""
-        progress = score_state.progress
-        ended = torch.where(progress.active, progress.returns, score_state.returns)
-        return self.objective.early_stopped(progress._replace(returns=ended))
+
+        def with_value(progress: Progress) -> Progress:
+            return progress._replace(returns=torch.where(progress.active, progress.returns, state.returns))
+
+        return self.objective.early_stopped(replace_within(state.inner, Progress, with_value))
 
 
 class GuidedTracking(NamedTuple):
@@ -112,8 +114,10 @@ class GuidedTracking(NamedTuple):
     plans that miss the goal are guided; the motions of a plan that reaches it are ranked as without guidance.
     """
 
-    objective: Any  # `cavin_pyro.planning.cavin.TrackingCost`
-    distance_to_goal: DistanceToGoal
+    objective: Objective
+    distance_to_goal: RemainingDistance
+    subgoals: State  # [B, K, M, .]
+    segments: Tensor  # [B] int64: segments until the effect plan ends
     guided: Tensor  # [B] bool: the chosen effect plan misses the goal
 
     def start(self, plans: State) -> Any:
@@ -122,43 +126,14 @@ class GuidedTracking(NamedTuple):
 
     def advance(self, state: Any, segment: int, before: State, rollout: SegmentRollout) -> Any:
         """The state after one more segment from `before: [B, n]`."""
-        tracking = self.objective.advance(state, segment, before, rollout)
-        counts = (self.guided & (segment < self.objective.segments)).unsqueeze(-1)  # [B, 1]
-        subgoal = self.objective.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
+        after = self.objective.advance(state, segment, before, rollout)
+        counts = (self.guided & (segment < self.segments)).unsqueeze(-1)  # [B, 1]
+        subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
         left = self.distance_to_goal(rollout.states.centers, before.mask)
         behind = left - self.distance_to_goal(subgoal.centers, subgoal.mask)
-        return tracking._replace(cost=tracking.cost + torch.where(counts, behind.clamp(min=0.0).square(), 0.0))
+        cost = torch.where(counts, behind.clamp(min=0.0).square(), 0.0)
+        return replace_within(after, TrackingState, lambda tracking: tracking._replace(cost=tracking.cost + cost))
 
     def early_stopped(self, state: Any) -> Tensor:
         """As without guidance."""
         return self.objective.early_stopped(state)
-
-
-def check_guidance(guidance: str) -> None:
-    """Raise ValueError for an unknown `guidance`."""
-    if guidance not in GUIDANCE:
-        raise ValueError(f"unknown guidance '{guidance}': choose {' or '.join(GUIDANCE)}")
-
-
-def distance_to_goal_of(guidance: str, reward: RewardFunction) -> DistanceToGoal | None:
-    """The distance to the goal in this episode; None without guidance.
-
-    Raises ValueError if the reward function knows none.
-    """
-    if guidance == "none":
-        return None
-    if not isinstance(reward, GuidingReward):
-        raise ValueError(
-            f"guidance='{guidance}' needs a reward function with a `distance_to_goal`: choose guidance='none'"
-        )
-    return reward.distance_to_goal
-
-
-def guided_return(objective: CumulativeReward, distance_to_goal: DistanceToGoal | None) -> Objective:
-    """The objective of effect codes and pushes, guided if there is a distance to the goal."""
-    return objective if distance_to_goal is None else GuidedReturn(objective, distance_to_goal)
-
-
-def guided_tracking(cost: Objective, distance_to_goal: DistanceToGoal | None, succeeded: Tensor) -> Objective:
-    """The tracking cost of motions, guided if a distance is given; `succeeded: [B]` bool, the effect plan's."""
-    return cost if distance_to_goal is None else GuidedTracking(cost, distance_to_goal, ~succeeded)

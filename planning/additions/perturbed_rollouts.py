@@ -10,27 +10,32 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records, returns
-from cavin_pyro.planning.backends import Backend, eager
+from cavin_pyro.planning.additions.addition import Addition, Choice
 from cavin_pyro.planning.checks import check_positive, check_weight
-from cavin_pyro.planning.protocol import DynamicsModel, RewardFunction
-from cavin_pyro.planning.returns import SubgoalDistance
-from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states
+from cavin_pyro.planning.protocol import Reward, TransitionModel, unwrap
+from cavin_pyro.planning.returns import SubgoalDistance, TrackingState, prefer
+from cavin_pyro.planning.rollout import predict_states
 from cavin_pyro.planning.sampling import noise_each
 
 # Square metres per unit of return, where returns and distances add up. The default cost of a failure, 0.3 square
 # metres, is then worth 200: a failure earns -100 instead of the +100 at the goal.
 RETURN_WEIGHT = 0.0015
-ENDS = SubgoalDistance()
 
 
 @dataclass(frozen=True)
-class PerturbedRollouts:
+class PerturbedRollouts(Addition):
     """Ranks the best motions by rollouts whose pushes start at perturbed places.
 
     The best of a thousand motions often exploits an error of f: a push just meets the object according to f, and just
     misses it on the table. A perturbed start reveals such pushes.
 
-    The defaults are those of the baselines; `cavin_pyro.planning.cavin.FEW_CANDIDATES` are those of `planner=cavin`.
+    The baselines' presets have more candidates: there, motions of one plan are not for one effect.
+
+    Without a tracking cost, in the baselines, the score of a plan is its return minus `failure_cost / RETURN_WEIGHT`
+    times the fraction of failed rollouts, by default 200 times: about the expected return of a plan with predicted
+    success. Plans that reach the goal rank first, since the rollouts of others may have stopped early and pushes that
+    do nothing never fail. Where plans have subgoals of their own, those that miss the goal are ranked by return alone:
+    the pushes that move least would end closest to their own subgoals.
 
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best
     candidates, one in `reduction_factor`, continue with `reduction_factor` times as many rollouts each.
@@ -51,10 +56,10 @@ class PerturbedRollouts:
     Raises ValueError for counts below 1, and for a noise or a cost that is negative or not finite.
     """
 
-    candidates: int = 256
+    candidates: int = 64
     rollouts: int = 2
-    rounds: int = 3
-    reduction_factor: int = 4
+    rounds: int = 2
+    reduction_factor: int = 8
     start_noise: float = 0.03
     failure_cost: float = 0.3
 
@@ -66,47 +71,52 @@ class PerturbedRollouts:
         check_weight("start_noise", self.start_noise)
         check_weight("failure_cost", self.failure_cost)
 
-
-def most_robust(
-    robustness: PerturbedRollouts,
-    motions: Candidates,
-    scores: Tensor,
-    later_cost: Tensor,
-    model: DynamicsModel,
-    reward: RewardFunction,
-    subgoals: State,
-    distance: SubgoalDistance,
-) -> Tensor:
-    """The motion candidate with the lowest cost on average, `[B]` int64; see `sequential_halving`.
-
-    Rollouts end where their distance to the subgoal counts: after T pushes, or after the first.
-    """
-    problem, goal = motions.problem, subgoals.step(slice(0, 1))
-    actions = motions.at(0, lambda segment: actions_of(segment)[..., : distance.pushes(model.segment_length), :])
-    what = problem.state, goal, scores, actions, later_cost, problem.generators
-    return sequential_halving(robustness, model, reward, *what, distance=distance, backend=problem.backend)
+    def rank(self, scores: Tensor, choice: Choice) -> Tensor:
+        """See `Addition`: all but the best on average are left out."""
+        goal, actions = choice.subgoals, choice.first_actions()
+        ranked = scores
+        if choice.effect is not None:
+            tracking = unwrap(choice.candidates.score_state, TrackingState)
+            goal, later = choice.effect.subgoals.step(slice(0, 1)), tracking.cost - tracking.executed_cost
+            later = later + torch.where(torch.isfinite(scores), tracking.returns - scores, 0.0)  # by other additions
+        else:
+            reached = choice.candidates.progress.succeeded
+            if goal is None:
+                ranked = prefer(scores, reached)
+            else:
+                finite = torch.isfinite(actions).all(-1).all(-1)
+                ranked = torch.where(reached & finite, scores, -torch.inf)
+            later = -RETURN_WEIGHT * ranked
+        best = sequential_halving(
+            self,
+            choice,
+            scores=ranked,
+            goal=goal,
+            actions=actions[..., : choice.distance.pushes(choice.model.segment_length), :],
+            later=later,
+        )
+        chosen = torch.zeros_like(scores, dtype=torch.bool).scatter(1, best.unsqueeze(-1), True)
+        chosen = chosen | ~torch.isfinite(ranked).any(-1, keepdim=True)
+        return torch.where(chosen, scores, -torch.inf)
 
 
 def sequential_halving(
     robustness: PerturbedRollouts,
-    model: DynamicsModel,
-    reward: RewardFunction,
-    state: State,
-    goal: State | None,
+    choice: Choice,
+    *,
     scores: Tensor,
+    goal: State | None,
     actions: Tensor,
     later: Tensor,
-    generators: Sequence[torch.Generator],
-    *,
-    distance: SubgoalDistance = ENDS,
-    backend: Backend = eager,
 ) -> Tensor:
-    """The motion with the lowest cost on average, `[B]` int64.
+    """The candidate with the lowest cost on average, `[B]` int64; it advances the generators.
 
-    state: `[B]`, where all motions begin. goal: the first subgoal, `[B, 1]` of all motions or `[B, N]` of each; None
-    without subgoals, where failures alone count. scores: `[B, N]`, the higher the better. actions: `[B, N, n, 4]`, the
-    pushes to roll out, of the segment that will be executed. later: `[B, N]` square metres, the cost of the segments
-    after it, and of guidance. distance: to the subgoal. A motion whose score or whose cost is not finite loses.
+    Args:
+        scores: `[B, N]`, the higher the better; one whose score or whose cost is not finite loses.
+        goal: the first subgoal, `[B, 1]` of all or `[B, N]` of each; None where failures alone count.
+        actions: `[B, N, n, A]`, to roll out, of the segment that will be executed. Rollouts end where their distance
+            to the subgoal counts: after T pushes, or after the first.
+        later: `[B, N]` square metres, the cost of the segments after it, and of guidance.
     """
     best = scores.topk(min(robustness.candidates, scores.shape[-1]), -1)
     indices, count, done = best.indices, robustness.rollouts, 0
@@ -121,15 +131,10 @@ def sequential_halving(
             count = robustness.reduction_factor * count
         costs, failed = perturbed_rollouts(
             robustness,
-            model,
-            reward,
-            state,
-            goal if goal is None or goal.batch_shape[-1] == 1 else records.take(goal, indices),
-            actions.take_along_dim(indices[..., None, None], dim=1),
-            count,
-            generators,
-            distance=distance,
-            backend=backend,
+            choice,
+            goal=goal if goal is None or goal.batch_shape[-1] == 1 else records.take(goal, indices),
+            actions=actions.take_along_dim(indices[..., None, None], dim=1),
+            count=count,
         )
         cost = (costs + robustness.failure_cost * failed).sum(-1)
         cost = cost + count * later.gather(1, indices)
@@ -139,29 +144,21 @@ def sequential_halving(
 
 
 def perturbed_rollouts(
-    robustness: PerturbedRollouts,
-    model: DynamicsModel,
-    reward: RewardFunction,
-    state: State,
-    goal: State | None,
-    actions: Tensor,
-    count: int,
-    generators: Sequence[torch.Generator],
-    *,
-    distance: SubgoalDistance = ENDS,
-    backend: Backend = eager,
+    robustness: PerturbedRollouts, choice: Choice, *, goal: State | None, actions: Tensor, count: int
 ) -> tuple[Tensor, Tensor]:
-    """Rollouts of `actions: [B, R, T, 4]` by f from `state: [B]`, each perturbed `count` times.
+    """Rollouts of `actions: [B, R, n, A]` by f from the scenes' states, each perturbed `count` times.
 
-    Returns the square metres to the `goal: [B, 1]` or `[B, R]`, by `distance` (0 without a goal), and whether a rollout
-    fails, `[B, R, count]` each.
+    Returns the square metres to the `goal: [B, 1]` or `[B, R]` (0 without a goal), and whether a rollout fails,
+    `[B, R, count]` each.
     """
+    scene, backend = choice.scene, choice.candidates.problem.backend
     if goal is not None and goal.batch_shape[-1] > 1:
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
-    pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, T, 4]
-    noise = _antithetic_noise((count, pushes.shape[-2], 2), generators, pushes.device)
+    pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, n, A]
+    noise = _antithetic_noise((count, pushes.shape[-2], 2), scene.generators, pushes.device)
     pushes[..., :2] += robustness.start_noise * noise.repeat(1, actions.shape[1], 1, 1)  # the same for every motion
-    costs, failed = backend(_rollout_costs, model, reward, state, goal, pushes.clamp(-1.0, 1.0), distance)
+    pushes = pushes.clamp(-1.0, 1.0)
+    costs, failed = backend(_rollout_costs, choice.model, scene.reward, scene.state, goal, pushes, choice.distance)
     return costs.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
 
 
@@ -173,8 +170,8 @@ def _antithetic_noise(shape: Sequence[int], generators: Sequence[torch.Generator
 
 
 def _rollout_costs(
-    model: DynamicsModel,
-    reward: RewardFunction,
+    model: TransitionModel,
+    reward: Reward,
     state: State,
     goal: State | None,
     pushes: Tensor,

@@ -6,14 +6,42 @@ feature only, and the search exploits its errors. The observed points show where
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from cavin_pyro.planning.additions.addition import Addition, Choice
+from cavin_pyro.planning.checks import check_weight
 from cavin_pyro.planning.returns import prefer
 
-TOUCHDOWN_DISTANCE = 0.015  # metres between a push's start and a point on which it would touch down
+
+@dataclass(frozen=True)
+class Touchdown(Addition):
+    """Leaves out candidates whose first push starts nearer than `distance` metres to a point that the camera sees.
+
+    As far as the caller gives such points, `observed: ObservedPoints`. If no candidate would be left, all stay. The
+    baselines' searches may have stopped early, so the scores of their other candidates are partial.
+
+    Raises ValueError for a distance that is negative or not finite.
+    """
+
+    distance: float = 0.015
+
+    def __post_init__(self) -> None:
+        check_weight("distance", self.distance)
+
+    def rank(self, scores: Tensor, choice: Choice) -> Tensor:
+        """See `Addition`."""
+        observed = choice.scene.observed
+        if not isinstance(observed, ObservedPoints) or observed.points.shape[1] == 0:
+            return scores
+        return self.leave_out(scores, choice.first_actions()[..., 0, :], observed)
+
+    def leave_out(self, scores: Tensor, pushes: Tensor, observed: ObservedPoints) -> Tensor:
+        """Scores `[B, N]` without candidates whose first push, of `pushes: [B, N, 4]`, touches down on a point."""
+        return prefer(scores, ~observed.blocked(pushes, self.distance))
 
 
 class ObservedPoints(NamedTuple):
@@ -30,15 +58,3 @@ class ObservedPoints(NamedTuple):
         # Not by matrix products, in which an infinite point makes all distances NaN.
         apart = torch.cdist(starts, self.points, compute_mode="donot_use_mm_for_euclid_dist")
         return apart.amin(-1) < distance
-
-
-def prefer_free(scores: Tensor, pushes: Tensor, observed: ObservedPoints | None, distance: float) -> Tensor:
-    """Scores `[B, N]` that leave out candidates whose first push would touch down on an object.
-
-    pushes: `[B, N, 4]`, the first of each candidate. observed: None where nothing is known. distance: metres between
-    the push's start and a point; 0 leaves out none. If none would be left, the scores stay as they are. The
-    baselines' searches may have stopped early, so the scores of their other candidates are partial.
-    """
-    if observed is None or not distance or observed.points.shape[1] == 0:
-        return scores
-    return prefer(scores, ~observed.blocked(pushes, distance))

@@ -288,7 +288,7 @@ def crossing(region: list[Tile], goal: Tile) -> TaskReward:
 def left(reward: TaskReward, *places: tuple[float, float]) -> float:
     """Metres from the centres of objects in the middle of these tiles, or between them."""
     centers = torch.tensor([[*tile_center(place), 0.03] for place in places], dtype=torch.float32)
-    return float(reward.distance_to_goal(centers, torch.ones(len(places), dtype=torch.bool)))
+    return float(reward.distance_to_goal()(centers, torch.ones(len(places), dtype=torch.bool)))
 
 
 def test_the_distance_follows_a_bridge_round_its_bend() -> None:
@@ -314,7 +314,7 @@ def test_to_clear_is_the_distance_out_of_the_region_of_all_objects_together() ->
         assert left(reward, (2, 3)) == pytest.approx(out, abs=SPACING)
         assert left(reward, (2, 3), (2, 2), (0, 0)) == pytest.approx(out + TILE_SIDE / 2 + margin, abs=2 * SPACING)
     centers = torch.tensor([[*tile_center((2, 3)), 0.03]] * 2)
-    assert reward.distance_to_goal(centers, torch.tensor([True, False])) == pytest.approx(
+    assert reward.distance_to_goal()(centers, torch.tensor([True, False])) == pytest.approx(
         out, abs=SPACING
     )  # without padding
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning import CavinPlanner, searching
-from cavin_pyro.planning.protocol import PlanningModel, RewardFunction, SegmentRollout
+from cavin_pyro.planning import searching
+from cavin_pyro.planning.protocol import Reward, SegmentRollout
 from cavin_pyro.planning.sampling import noise_each
 
 REACH = 0.15  # metres per segment and axis, the most that an effect of `PointMass` moves an object of gain 1
@@ -47,6 +47,13 @@ class PointMass:
 
     def next_state(self, state: State, action: Tensor) -> State:
         return move(state, 0.1 * action[..., 2:])
+
+
+class Single(PointMass):
+    """One code for effects and pushes, which do what h says."""
+
+    def actions(self, state: State, effect_code: Tensor) -> Tensor:  # type: ignore[override]
+        return super().actions(state, effect_code, torch.zeros_like(effect_code))
 
 
 class Flat:
@@ -129,8 +136,10 @@ class StepOutcome(NamedTuple):
     failure: Tensor
 
 
-class GoalDisc:
+class GoalDisc(Reward):
     """The target must reach a disc, and no real object may enter the half-plane y < `forbidden_below`."""
+
+    about, maximum_return = "", torch.inf  # attributes, so that a test may say something else
 
     def __init__(
         self,
@@ -138,9 +147,10 @@ class GoalDisc:
         radius: float = 0.05,
         forbidden_below: float = -torch.inf,
         dense: bool = False,
+        about: str = "",
     ) -> None:
         self.goal, self.radius, self.forbidden_below, self.dense = goal, radius, forbidden_below, dense
-        self.maximum_return = torch.inf if dense else 99.0
+        self.maximum_return, self.about = torch.inf if dense else 99.0, about
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
         success = self.distance(centers) <= self.radius
@@ -154,7 +164,7 @@ class GoalDisc:
         return (centers[..., 0, :2] - torch.tensor(self.goal, dtype=centers.dtype)).norm(dim=-1)
 
 
-class Hill:
+class Hill(Reward):
     """Every step earns minus the squared distance of the target to a place; nothing ends."""
 
     def __init__(self, top: tuple[float, float]) -> None:
@@ -166,7 +176,7 @@ class Hill:
         return StepOutcome(-distance, never, never)
 
 
-class Line:
+class Line(Reward):
     """The target, on a line, succeeds from x = 1 on and fails up to x = -0.5."""
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
@@ -194,6 +204,11 @@ def scenes(positions: Sequence[Sequence[tuple[float, float]]], gains: Sequence[f
     return State(centers, features, torch.ones(planar.shape[:-1], dtype=torch.bool))
 
 
+def line(centers: Tensor) -> list[float]:
+    """The x of the target in all states `[..., M, 3]`, in order."""
+    return centers[..., 0, 0].flatten().tolist()
+
+
 def tensors(record: Any) -> list[Tensor]:
     """All tensors of a plan or another record of records, in order."""
     if isinstance(record, tuple):
@@ -211,20 +226,6 @@ def generators(*seeds: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
-def plain(
-    model: PlanningModel,
-    reward: RewardFunction,
-    samples: int = 1024,
-    horizon: int = 30,
-    motion_horizon: str = "full_horizon",
-    **options: object,
-) -> CavinPlanner:
-    """Algorithm 1 that avoids failures, with those of our additions that the options name."""
-    without: dict[str, Any] = {"robustness": None, "early_stopping": False, "effect_retries": 0}
-    without["motion_samples"] = samples
-    return CavinPlanner(model, reward, samples, horizon, motion_horizon, **{**without, **options})
-
-
 @pytest.fixture(autouse=True)
 def environments_in_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plan all environments of a test in one chunk, so that what is computed for several at once is tested."""
@@ -233,6 +234,6 @@ def environments_in_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def toy() -> SimpleNamespace:
-    worlds: list[Callable] = [PointMass, Flat, Tabled, Placed, GoalDisc, Hill, Line, StepOutcome]
-    names = [*worlds, plain, move, scenes, generators]
+    worlds: list[Callable] = [PointMass, Single, Flat, Tabled, Placed, GoalDisc, Hill, Line, StepOutcome]
+    names = [*worlds, move, scenes, generators]
     return SimpleNamespace(**{name.__name__: name for name in names}, REACH=REACH)

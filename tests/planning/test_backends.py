@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.backends import Compiled, make_backend
 from cavin_pyro.planning.rollout import extend_segment
 
@@ -34,10 +35,11 @@ def test_compiled_plans_agree_with_eager_plans(toy: SimpleNamespace) -> None:
     before = Distribution._validate_args
     try:
         reward, state = toy.GoalDisc(goal=(0.25, 0.05), forbidden_below=0.0), toy.scenes([[(0.0, 0.02)]])
+        additions = ["early_stopping", "failure_avoidance"]
         eager, compiled = (
-            toy.plain(toy.PointMass(), reward, 64, 6, early_stopping=True, compile=compile) for compile in (False, True)
+            CavinPlanner(toy.PointMass(), 64, 6, additions=additions, compile=compile) for compile in (False, True)
         )
-        one, other = (planner.plan(state, toy.generators(1)) for planner in (eager, compiled))
+        one, other = (planner.plan(state, reward=reward, generators=toy.generators(1)) for planner in (eager, compiled))
         torch.testing.assert_close(one.candidate_returns, other.candidate_returns)
         torch.testing.assert_close(one.actions, other.actions)
     finally:

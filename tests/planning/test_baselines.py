@@ -5,7 +5,7 @@ For the numbers see test_cavin_replay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,34 +15,33 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import (
+    CavinPlanner,
     CavinWithoutEffectsPlanner,
     CvaeMpcPlanner,
     MpcPlanner,
-    PerturbedRollouts,
     Plan,
     RandomPlanner,
     SectarPlanner,
 )
+from cavin_pyro.planning.additions import PerturbedRollouts
 from cavin_pyro.planning.optimizers import Shooting
-from cavin_pyro.planning.searching import SearchingPlanner
+from tests.planning.conftest import line
 
 EFFECTS = [[-0.75, 0.5, -2.0], [0.5, 0.25, 1.0]]
 RETURNS = [-2.0 - 1.0 + 99.0, -4.0, -2.0 + 99.0]
-WITHOUT_REPLACEMENT = [-102.0, -4.0, -101.0]
-NO_REPLACEMENT: dict[str, Any] = {"optimizer": Shooting(replacement=False)}
-PLAIN: dict[str, Any] = {"early_stopping": False, "robustness": None}  # the paper's
+PRESET = "early_stopping", PerturbedRollouts(256, rounds=3, reduction_factor=4)  # additions of their presets
 
 
-def sectar_plan(toy: SimpleNamespace, effects: Sequence[Sequence[float]], **options: Any) -> Plan:
+def sectar_plan(toy: SimpleNamespace, effects: Sequence[Sequence[float]]) -> Plan:
     class Single(toy.Tabled):  # type: ignore[name-defined]
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
             return super().actions(state, effect_code, 0.125 * torch.eye(16)[0].expand_as(effect_code))
 
-    planner = SectarPlanner(Single(effects, []), toy.Line(), samples=3, horizon=4, **PLAIN, **options)
-    return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+    planner = SectarPlanner(Single(effects, []), samples=3, horizon=4)
+    return planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
 
 
-def cvae_mpc_plan(toy: SimpleNamespace, motions: Sequence[Sequence[float]], **options: Any) -> Plan:
+def cvae_mpc_plan(toy: SimpleNamespace, motions: Sequence[Sequence[float]]) -> Plan:
     class Flat(toy.Tabled):  # type: ignore[name-defined]
         def motion_prior(self, state: State) -> Any:
             return super().motion_prior(state, state.centers)
@@ -50,12 +49,8 @@ def cvae_mpc_plan(toy: SimpleNamespace, motions: Sequence[Sequence[float]], **op
         def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
             return super().actions(state, torch.zeros_like(motion_code), motion_code)
 
-    planner = CvaeMpcPlanner(Flat([], motions), toy.Line(), samples=3, horizon=4, **PLAIN, **options)
-    return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
-
-
-def line(centers: Tensor) -> list[float]:
-    return centers[..., 0, 0].flatten().tolist()
+    planner = CvaeMpcPlanner(Flat([], motions), samples=3, horizon=4)
+    return planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
 
 
 def test_sectar_executes_what_g_makes_of_the_best_effect_code(toy: SimpleNamespace) -> None:
@@ -73,9 +68,9 @@ def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> Non
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
             return torch.full((1, 1, 2, 4), torch.nan)
 
-    planner = SectarPlanner(Broken(EFFECTS, []), toy.Line(), samples=3, horizon=4, early_stopping=False)
+    planner = SectarPlanner(Broken(EFFECTS, []), samples=3, horizon=4, additions=[PerturbedRollouts()])
     with pytest.raises(ValueError, match="^environment 0: the pushes of the chosen effect are not finite"):
-        planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+        planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
 
 
 def test_cvae_mpc_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
@@ -94,8 +89,8 @@ def test_cvae_mpc_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
 
 def test_mpc_agrees_with_brute_force(toy: SimpleNamespace) -> None:
     model, reward, start = toy.PointMass(), toy.GoalDisc((0.3, 0.05), forbidden_below=-0.05, dense=True), (0.0, 0.0)
-    planner = MpcPlanner(model, reward, samples=50, horizon=6, **PLAIN, **NO_REPLACEMENT)
-    plan = planner.plan(toy.scenes([[start]]), toy.generators(4))
+    planner = MpcPlanner(model, samples=50, horizon=6, optimizer=Shooting(replacement=False))
+    plan = planner.plan(toy.scenes([[start]]), reward=reward, generators=toy.generators(4))
     source = toy.generators(4)[0]
     draws = [torch.randn(50, 12, generator=source) for _ in range(2)]  # a segment at a time
     normal = torch.distributions.Normal(0.0, 1.0)
@@ -117,11 +112,11 @@ def test_mpc_agrees_with_brute_force(toy: SimpleNamespace) -> None:
 
 def test_mpc_replaces_the_dead_and_repeats_with_its_seed(toy: SimpleNamespace) -> None:
     reward = toy.GoalDisc((9.0, 9.0), forbidden_below=0.0)
-    planner = MpcPlanner(toy.PointMass(), reward, samples=64, horizon=12)
+    planner = MpcPlanner(toy.PointMass(), samples=64, horizon=12, additions=PRESET)
     state = toy.scenes([[(0.0, 0.02)], [(0.1, 0.3)]])
-    plan, again = (planner.plan(state, toy.generators(1, 2)) for _ in range(2))
+    plan, again = (planner.plan(state, reward=reward, generators=toy.generators(1, 2)) for _ in range(2))
     assert torch.equal(plan.planned_actions, again.planned_actions)
-    alone = planner.plan(state.scene(slice(1, 2)), toy.generators(2))
+    alone = planner.plan(state.scene(slice(1, 2)), reward=reward, generators=toy.generators(2))
     assert torch.equal(plan.candidate_returns[1], alone.candidate_returns[0])
     firsts = plan.candidate_centers[0, :, 0, 0]
     assert (firsts[:, 1] >= 0).all()
@@ -131,87 +126,63 @@ def test_mpc_replaces_the_dead_and_repeats_with_its_seed(toy: SimpleNamespace) -
 ALL = PerturbedRollouts(candidates=64, rollouts=4)
 
 
-def single(toy: SimpleNamespace) -> type:
-    class Single(toy.PointMass):  # type: ignore[name-defined]
-        """One code for effects and pushes, which do what h says."""
-
-        def actions(self, state: State, effect_code: Tensor) -> Tensor:
-            return super().actions(state, effect_code, torch.zeros_like(effect_code))
-
-    return Single
+def planner_of(toy: SimpleNamespace, kind: type, *additions: object, horizon: int = 6) -> Any:
+    model = {SectarPlanner: toy.Single, CvaeMpcPlanner: toy.Flat}.get(kind, toy.PointMass)
+    return kind(model(), samples=64, horizon=horizon, additions=additions)
 
 
-def sectar(toy: SimpleNamespace, reward: object, **options: Any) -> SectarPlanner:
-    return SectarPlanner(single(toy)(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
+each_kind = pytest.mark.parametrize("kind", [SectarPlanner, CvaeMpcPlanner, MpcPlanner, CavinWithoutEffectsPlanner])
 
 
-def cvae_mpc(toy: SimpleNamespace, reward: object, **options: Any) -> CvaeMpcPlanner:
-    return CvaeMpcPlanner(toy.Flat(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
-
-
-def mpc(toy: SimpleNamespace, reward: object, **options: Any) -> MpcPlanner:
-    return MpcPlanner(toy.PointMass(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
-
-
-def without_effects(toy: SimpleNamespace, reward: object, **options: Any) -> CavinWithoutEffectsPlanner:
-    return CavinWithoutEffectsPlanner(toy.PointMass(), reward, samples=64, **{"horizon": 6, **options})  # type: ignore[arg-type]
-
-
-FACTORIES: list[Callable[..., SearchingPlanner]] = [sectar, cvae_mpc, mpc, without_effects]
-
-
-@pytest.mark.parametrize("make", FACTORIES)
-def test_without_additions_the_first_of_the_highest_returns_wins(make: Callable, toy: SimpleNamespace) -> None:
-    state = toy.scenes([[(0.0, 0.0)], [(0.1, 0.0)]])
-    plan = make(toy, toy.GoalDisc((0.25, 0.0), dense=True), **PLAIN).plan(state, toy.generators(1, 2))
+@each_kind
+def test_without_additions_the_first_of_the_highest_returns_wins(kind: type, toy: SimpleNamespace) -> None:
+    state, reward = toy.scenes([[(0.0, 0.0)], [(0.1, 0.0)]]), toy.GoalDisc((0.25, 0.0), dense=True)
+    plan = planner_of(toy, kind).plan(state, reward=reward, generators=toy.generators(1, 2))
     best = plan.candidate_returns.argmax(-1)
     assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
     ends = plan.candidate_centers[[0, 1], best]
-    found = plan.subgoals.centers if make is sectar else plan.predicted_centers[:, [2, 5]]
+    found = plan.subgoals.centers if kind is SectarPlanner else plan.predicted_centers[:, [2, 5]]
     torch.testing.assert_close(found, ends)
 
 
-@pytest.mark.parametrize("make", FACTORIES)
-def test_a_plan_with_additions_does_not_depend_on_its_neighbours(make: Callable, toy: SimpleNamespace) -> None:
-    planner = make(toy, toy.GoalDisc((0.25, 0.0), forbidden_below=-0.05))
-    assert planner.robustness == PerturbedRollouts()
+@each_kind
+def test_a_plan_with_additions_does_not_depend_on_its_neighbours(kind: type, toy: SimpleNamespace) -> None:
+    planner, reward = planner_of(toy, kind, *PRESET), toy.GoalDisc((0.25, 0.0), forbidden_below=-0.05)
     state = toy.scenes([[(0.0, 0.0)], [(0.1, 0.0)]])
-    both, alone = (
-        planner.plan(state, toy.generators(1, 2)),
-        planner.plan(state.scene(slice(1, 2)), toy.generators(2)),
-    )
+    both = planner.plan(state, reward=reward, generators=toy.generators(1, 2))
+    alone = planner.plan(state.scene(slice(1, 2)), reward=reward, generators=toy.generators(2))
     torch.testing.assert_close(both.planned_actions[1], alone.planned_actions[0])
 
 
-@pytest.mark.parametrize("make", FACTORIES)
-def test_the_first_segment_stays_farther_from_forbidden_places(make: Callable, toy: SimpleNamespace) -> None:
+@each_kind
+def test_the_first_segment_stays_farther_from_forbidden_places(kind: type, toy: SimpleNamespace) -> None:
     # Where a push starts moves objects as its motion does, and starts are perturbed by 0.2, 2 cm.
     reward, state = toy.GoalDisc((0.2, 0.0), radius=0.1, forbidden_below=-0.01), toy.scenes([[(0.0, 0.0)]] * 8)
     perturbed = PerturbedRollouts(candidates=64, rollouts=8, start_noise=0.2)
     noise = 0.2 * torch.randn(500, 8, 3, 2, generator=toy.generators(0)[0])
     shares = []
-    for robustness in (None, perturbed):
-        planner = make(toy, reward, **{**PLAIN, "robustness": robustness})
+    for additions in ([], [perturbed]):
+        planner = planner_of(toy, kind, *additions)
         planner.model.next_state = lambda state, action: toy.move(state, 0.1 * (action[..., 2:] + action[..., :2]))
-        pushes = planner.plan(state, toy.generators(*range(8))).actions
+        pushes = planner.plan(state, reward=reward, generators=toy.generators(*range(8))).actions
         starts = (pushes[..., :2] + noise).clamp(-1.0, 1.0)
         path = 0.1 * (starts + pushes[..., 2:]).cumsum(-2)
         shares.append((path[..., 1] < -0.01).any(-1).float().mean())
     assert shares[1] < 0.8 * shares[0]
 
 
-@pytest.mark.parametrize("make", FACTORIES)
-def test_where_nothing_fails_the_highest_return_wins(make: Callable, toy: SimpleNamespace) -> None:
+@each_kind
+def test_where_nothing_fails_the_highest_return_wins(kind: type, toy: SimpleNamespace) -> None:
     # Not the pushes that do least: they never fail, and come closest to their own subgoals.
     state, reward = toy.scenes([[(0.0, 0.0)]] * 8), toy.GoalDisc((0.25, 0.0), radius=0.15)
     reward.maximum_return = torch.inf  # no rollout stops early
-    plan = make(toy, reward, horizon=15).plan(state, toy.generators(*range(8)))
+    plan = planner_of(toy, kind, *PRESET, horizon=15).plan(state, reward=reward, generators=toy.generators(*range(8)))
     assert plan.expected_success.all() and len(plan.candidate_returns.unique()) > 4
     assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
 
 
 def test_sectar_prefers_effects_that_its_pushes_reach(toy: SimpleNamespace) -> None:
-    class Imprecise(single(toy)):  # type: ignore[misc]
+    class Imprecise(toy.Single):  # type: ignore[misc]
         """Effects with a positive second code end 5 cm farther than their pushes."""
 
         def subgoal(self, state: State, effect_code: Tensor) -> State:
@@ -221,16 +192,16 @@ def test_sectar_prefers_effects_that_its_pushes_reach(toy: SimpleNamespace) -> N
 
     reward, state = toy.GoalDisc((0.1, 0.0), radius=0.2), toy.scenes([[(-0.15, 0.0)]] * 8)
     signs = []
-    for robustness in (None, ALL):
-        planner = SectarPlanner(Imprecise(), reward, samples=64, horizon=6, **{**PLAIN, "robustness": robustness})
-        signs.append((planner.plan(state, toy.generators(*range(8))).effect_codes[:, 0, 1] > 0).sum())
+    for additions in ([], [ALL]):
+        planner = SectarPlanner(Imprecise(), samples=64, horizon=6, additions=additions)
+        plan = planner.plan(state, reward=reward, generators=toy.generators(*range(8)))
+        signs.append((plan.effect_codes[:, 0, 1] > 0).sum())
     assert signs[0] > 0 and signs[1] == 0
 
 
-@pytest.mark.parametrize("make", [cvae_mpc, sectar])
-def test_pushes_that_are_not_finite_never_win(make: Callable, toy: SimpleNamespace) -> None:
-    reward = toy.GoalDisc((0.2, 0.0), radius=0.15)
-    planner = make(toy, reward, **{**PLAIN, "robustness": ALL})
+@pytest.mark.parametrize("kind", [CvaeMpcPlanner, SectarPlanner])
+def test_pushes_that_are_not_finite_never_win(kind: type, toy: SimpleNamespace) -> None:
+    planner, reward = planner_of(toy, kind, ALL), toy.GoalDisc((0.2, 0.0), radius=0.15)
     whole, model = planner.model.actions, planner.model
 
     def broken(state: State, *codes: Tensor, **named: Tensor) -> Tensor:
@@ -238,17 +209,17 @@ def test_pushes_that_are_not_finite_never_win(make: Callable, toy: SimpleNamespa
         return whole(state, *codes, **named).masked_fill((code[..., 1] > 0)[..., None, None], torch.nan)
 
     model.actions, model.next_state = broken, lambda state, action: toy.move(state, 0.1 * action[..., 2:].nan_to_num())
-    if make is sectar:
+    if kind is SectarPlanner:
         planner._actions = broken
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), toy.generators(*range(4)))
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), reward=reward, generators=toy.generators(*range(4)))
     assert plan.actions.isfinite().all()
 
 
 def test_codes_are_sampled_as_the_cascade_generates_them(toy: SimpleNamespace) -> None:
     # Two segments of three samples: a row of each table per segment, and T = 2 pushes by c / 2 + z.
     effects, motions = [[-0.5, 0.5, -2.0], [0.25, 0.5, 0.0]], [[0.0, 0.125, 0.0], [0.0, 0.25, 0.0]]
-    planner = CavinWithoutEffectsPlanner(toy.Tabled(effects, motions), toy.Line(), samples=3, horizon=4, **PLAIN)
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+    planner = CavinWithoutEffectsPlanner(toy.Tabled(effects, motions), samples=3, horizon=4)
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
     # The second one goes to 0.75, where a copy of it takes the first one's place, and succeeds with its third push.
     assert plan.candidate_returns[0, 1] == -2.0 + 99.0 == plan.expected_return
     assert plan.motion_codes[0, :, [0, 16]].tolist() == [[0.5, 0.125], [0.5, 0.25]]
@@ -267,20 +238,20 @@ def test_one_motion_is_the_one_that_is_drawn(horizon: str, toy: SimpleNamespace)
             asked.append(motion_code)
             return super().actions(state, effect_code, motion_code)
 
-    state, reward = toy.scenes([[(0.0, 0.0)]]), toy.GoalDisc((0.3, 0.0))
-    planner = toy.plain(Counting(), reward, samples=64, horizon=6, motion_horizon=horizon, motion_samples=1)
-    plan = planner.plan(state, toy.generators(1))
-    assert [code.shape for code in asked] == [(1, 1, 16)] * (2 if horizon == "full_horizon" else 1)
-    assert torch.equal(plan.motion_codes[:, :1], asked[0])
-    many = toy.plain(toy.PointMass(), reward, samples=64, horizon=6, motion_horizon=horizon).plan(
-        state, toy.generators(1)
+    one, many = (
+        CavinPlanner(model, 64, 6, horizon, motion_share=share).plan(
+            toy.scenes([[(0.0, 0.0)]]), reward=toy.GoalDisc((0.3, 0.0)), generators=toy.generators(1)
+        )
+        for model, share in ((Counting(), 1 / 64), (toy.PointMass(), 1.0))
     )
-    assert torch.equal(plan.effect_codes, many.effect_codes)
+    assert [code.shape for code in asked] == [(1, 1, 16)] * (2 if horizon == "full_horizon" else 1)
+    assert torch.equal(one.motion_codes[:, :1], asked[0])
+    assert torch.equal(one.effect_codes, many.effect_codes)
 
 
 def test_pushes_are_uniform_in_the_normalised_box(toy: SimpleNamespace) -> None:
     state = toy.scenes([[(0.0, 0.0)]])
-    actions = RandomPlanner(segment_length=20000).plan(state, toy.generators(0)).actions[0]
+    actions = RandomPlanner(segment_length=20000).plan(state, generators=toy.generators(0)).actions[0]
     assert actions.abs().max() <= 1.0
     for quantile in (0.1, 0.5, 0.9):
         torch.testing.assert_close(
@@ -290,7 +261,7 @@ def test_pushes_are_uniform_in_the_normalised_box(toy: SimpleNamespace) -> None:
 
 def test_pushes_depend_on_the_environments_own_generator_only(toy: SimpleNamespace) -> None:
     planner = RandomPlanner()
-    together = planner.plan(toy.scenes([[(0.0, 0.0)]] * 2), toy.generators(3, 4))
-    alone = planner.plan(toy.scenes([[(0.7, 0.7)]]), toy.generators(4))
+    together = planner.plan(toy.scenes([[(0.0, 0.0)]] * 2), generators=toy.generators(3, 4))
+    alone = planner.plan(toy.scenes([[(0.7, 0.7)]]), generators=toy.generators(4))
     assert torch.equal(together.actions[1], alone.actions[0])
     assert not torch.equal(together.actions[0], together.actions[1])

@@ -10,21 +10,28 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning import Plan, RewardFunction
+from cavin_pyro.planning import CavinPlanner, Plan, Reward
+from cavin_pyro.planning.additions import ADDITIONS
 from cavin_pyro.planning.checks import NoFiniteCandidateError, check_scenes
 from tests.planning.conftest import same, tensors
 
 START = (0.0, 0.02)  # metres; close above the forbidden half-plane y < 0 of `near_the_edge`
 
 
-def near_the_edge(toy: SimpleNamespace) -> RewardFunction:
+def near_the_edge(toy: SimpleNamespace) -> Reward:
     return toy.GoalDisc(goal=(0.25, 0.05), radius=0.05, forbidden_below=0.0)
+
+
+def plan_with_additions(toy: SimpleNamespace, state: State, generators: list[torch.Generator]) -> Plan:
+    """With all but guidance, for which the reward knows no distance."""
+    planner = CavinPlanner(toy.PointMass(), samples=64, horizon=12, additions=sorted(ADDITIONS.keys() - {"guidance"}))
+    return planner.plan(state, reward=near_the_edge(toy), generators=generators)
 
 
 def test_dense_reward_leads_to_the_known_optimum(toy: SimpleNamespace) -> None:
     # A goal too far to reach, straight ahead: the best is to go 0.15 m its way in each of two segments.
-    planner = toy.plain(toy.PointMass(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=4096, horizon=6)
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), toy.generators(0, 1, 2, 3))
+    planner, reward = CavinPlanner(toy.PointMass(), samples=4096, horizon=6), toy.GoalDisc((10.0, 0.0), dense=True)
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), reward=reward, generators=toy.generators(0, 1, 2, 3))
     progress = plan.expected_return + 6  # without the costs of six steps
     assert (progress <= 0.3).all()
     assert (progress >= 0.28).all()
@@ -36,11 +43,11 @@ def test_replanning_in_closed_loop_reaches_the_goal_and_never_the_forbidden_part
     toy: SimpleNamespace, motion_horizon: str
 ) -> None:
     model, reward = toy.PointMass(), near_the_edge(toy)
-    planner = toy.plain(model, reward, samples=512, horizon=12, motion_horizon=motion_horizon)
+    planner = CavinPlanner(model, 512, 12, motion_horizon, additions=["failure_avoidance"])
     state, generators = toy.scenes([[START]] * 8), toy.generators(*range(8))
     reached = torch.zeros(8, dtype=torch.bool)
     for _ in range(3):
-        for push in planner.plan(state, generators).actions.unbind(1):
+        for push in planner.plan(state, reward=reward, generators=generators).actions.unbind(1):
             state = model.next_state(state, push)
             outcome = reward(state.centers, state.centers, state.mask)
             reached = reached | outcome.success
@@ -49,25 +56,42 @@ def test_replanning_in_closed_loop_reaches_the_goal_and_never_the_forbidden_part
 
 
 def test_tracking_at_the_first_push_prefers_motions_that_go_far_at_once(toy: SimpleNamespace) -> None:
-    state = toy.scenes([[START]] * 4)
+    state, reward = toy.scenes([[START]] * 4), near_the_edge(toy)
 
-    def left(tracking_at: str) -> torch.Tensor:
-        planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=1024, horizon=3, tracking_at=tracking_at)
-        plan = planner.plan(state, toy.generators(0, 1, 2, 3))
-        return (plan.predicted_centers - plan.subgoals.centers).norm(dim=-1).squeeze(-1)  # [B, T]
+    def left(*additions: str, horizon: int = 3) -> Tensor:
+        planner = CavinPlanner(toy.PointMass(), horizon=horizon, additions=additions)
+        plan = planner.plan(state, reward=reward, generators=toy.generators(0, 1, 2, 3))
+        return (plan.predicted_centers[:, :3] - plan.subgoals.centers[:, :1]).norm(dim=-1).squeeze(-1)  # [B, T]
 
-    end, first_push = left("end"), left("first_push")
+    assert torch.equal(left(), left("first_push"))  # the goal is not about all objects
+    reward.about = "all"
+    assert torch.equal(left(horizon=6), left("first_push", horizon=6))  # motions of two segments
+    end, first_push = left(), left("first_push")
     assert (first_push[:, 0] < end[:, 0]).all()
     assert (first_push[:, 2] >= end[:, 2]).all()  # and pays for it at the end
+
+
+def test_a_search_that_stops_early_predicts_nothing_after_the_goal(toy: SimpleNamespace) -> None:
+    predicted = []
+
+    class Counting(toy.PointMass):  # type: ignore[name-defined]
+        def subgoal(self, state: State, effect_code: Tensor) -> State:
+            predicted.append(additions)
+            return super().subgoal(state, effect_code)
+
+    for additions in ([], ["early_stopping"]):  # in a segment, of ten
+        planner, state = CavinPlanner(Counting(), additions=additions), toy.scenes([[(0.2, 0.0)]])
+        assert planner.plan(state, reward=near_the_edge(toy), generators=toy.generators(0)).segments == 1
+    assert predicted == 10 * [[]] + [["early_stopping"]]
 
 
 def test_codes_traced_back_through_copies_replay_to_the_recorded_subgoals(toy: SimpleNamespace) -> None:
     # At the edge of the forbidden half-plane half of the plans die at once, so that chosen plans go through
     # copies. A goal out of reach keeps the active ones going.
     model, reward = toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=0.0)
-    planner = toy.plain(model, reward, samples=64, horizon=15)
+    planner = CavinPlanner(model, samples=64, horizon=15)
     start = toy.scenes([[(0.0, 0.0), (0.1, 0.5)]] * 16, gains=(1.0, 0.5))
-    plan = planner.plan(start, toy.generators(*range(16)))
+    plan = planner.plan(start, reward=reward, generators=toy.generators(*range(16)))
     shared = plan.candidate_centers[:, :, 0, 0] == plan.subgoals.centers[:, :1, 0]
     assert (shared.all(-1).sum(-1) > 1).any()  # chosen plans with siblings: there were copies
     assert (plan.segments == 5).any()
@@ -80,32 +104,29 @@ def test_codes_traced_back_through_copies_replay_to_the_recorded_subgoals(toy: S
 
 
 def test_no_randomness_is_shared_between_environments(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     state = toy.scenes([[START], [(0.0, 0.5)], [(0.2, 0.0)]])  # some plans die, none die, it is (almost) done
     generators = toy.generators(7, 8, 9)
-    together = planner.plan(state, generators)
+    together = plan_with_additions(toy, state, generators)
     for index, seed in enumerate((7, 8, 9)):
         source = toy.generators(seed)
-        alone = planner.plan(state.scene(slice(index, index + 1)), source)
+        alone = plan_with_additions(toy, state.scene(slice(index, index + 1)), source)
         assert_same_plans(together, alone, index)
         assert torch.equal(source[0].get_state(), generators[index].get_state())
 
 
 def test_the_same_seed_gives_the_same_plan_and_another_seed_another(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     state, before = toy.scenes([[START]]), torch.get_rng_state()
-    first, again, other = (planner.plan(state, toy.generators(seed)) for seed in (1, 1, 2))
+    first, again, other = (plan_with_additions(toy, state, toy.generators(seed)) for seed in (1, 1, 2))
     assert_same_plans(first, again, 0)
     assert not torch.equal(first.actions, other.actions)
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_padding_leaves_plans_alone(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     bare = toy.scenes([[START, (0.4, 0.3)]], gains=(1.0, 0.5))
     padded = toy.scenes([[START, (0.4, 0.3), (-5.0, -5.0), (0.0, float("nan"))]], gains=(1.0, 0.5, 7.0, 1.0))
     padded.mask[:, 2:] = False
-    plain, with_padding = (planner.plan(state, toy.generators(0)) for state in (bare, padded))
+    plain, with_padding = (plan_with_additions(toy, state, toy.generators(0)) for state in (bare, padded))
     assert torch.equal(plain.planned_actions, with_padding.planned_actions)
     assert torch.equal(plain.candidate_returns, with_padding.candidate_returns)
     assert torch.equal(plain.subgoals.centers, with_padding.subgoals.centers[:, :, :2])
@@ -113,11 +134,10 @@ def test_padding_leaves_plans_alone(toy: SimpleNamespace) -> None:
 
 
 def test_the_order_of_obstacles_leaves_plans_alone(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=64, horizon=12)
     places, gains, order = [START, (0.4, 0.3), (0.1, 0.06)], [1.0, 0.5, 0.25], [0, 2, 1]
-    one = planner.plan(toy.scenes([places], gains), toy.generators(0))
+    one = plan_with_additions(toy, toy.scenes([places], gains), toy.generators(0))
     shuffled = toy.scenes([[places[i] for i in order]], [gains[i] for i in order])
-    two = planner.plan(shuffled, toy.generators(0))
+    two = plan_with_additions(toy, shuffled, toy.generators(0))
     torch.testing.assert_close(one.planned_actions, two.planned_actions)
     torch.testing.assert_close(one.subgoals.centers[:, :, order], two.subgoals.centers)
 
@@ -125,8 +145,8 @@ def test_the_order_of_obstacles_leaves_plans_alone(toy: SimpleNamespace) -> None
 def test_a_plan_has_the_shapes_that_it_promises(toy: SimpleNamespace) -> None:
     state = toy.scenes([[START, (0.4, 0.3)]] * 3, gains=(1.0, 0.5))
     for motion_horizon, segments in (("full_horizon", 4), ("first_segment", 1)):
-        planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=8, horizon=12, motion_horizon=motion_horizon)
-        plan = planner.plan(state, toy.generators(0, 1, 2))
+        planner = CavinPlanner(toy.PointMass(), samples=8, horizon=12, motion_horizon=motion_horizon)
+        plan = planner.plan(state, reward=near_the_edge(toy), generators=toy.generators(0, 1, 2))
         assert plan.actions.shape == (3, 3, 4)
         assert plan.planned_actions.shape == (3, 3 * segments, 4)
         assert plan.effect_codes.shape == (3, 4, 16)
@@ -146,8 +166,8 @@ def test_subgoals_that_are_not_finite_never_win(toy: SimpleNamespace) -> None:
             return subgoal._replace(centers=torch.where(broken, torch.nan, subgoal.centers))
 
     # The goal lies where only broken subgoals lead, and no comparison with NaN counts as a failure.
-    planner = toy.plain(Breaking(), toy.GoalDisc(goal=(10.0, 0.0), dense=True), samples=64, horizon=6)
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+    planner, reward = CavinPlanner(Breaking(), samples=64, horizon=6), toy.GoalDisc(goal=(10.0, 0.0), dense=True)
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=reward, generators=toy.generators(0))
     assert plan.expected_return.isfinite().all()
     assert (plan.effect_codes[..., 0] <= 0).all()
     assert (plan.candidate_returns == -torch.inf).any()
@@ -155,10 +175,9 @@ def test_subgoals_that_are_not_finite_never_win(toy: SimpleNamespace) -> None:
 
 
 def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
-    planner = toy.plain(toy.PointMass(), near_the_edge(toy), samples=8, horizon=3)
-    state = toy.scenes([[START], [(0.0, float("nan"))]])
+    planner, state = CavinPlanner(toy.PointMass(), 8, 3), toy.scenes([[START], [(0.0, float("nan"))]])
     with pytest.raises(ValueError, match=r"^environment 1: none of the 8 returns of effect plans is finite; .*$"):
-        planner.plan(state, toy.generators(0, 1))
+        planner.plan(state, reward=near_the_edge(toy), generators=toy.generators(0, 1))
 
 
 @pytest.mark.parametrize(
@@ -167,10 +186,7 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
         ({"horizon": 31}, "horizon=31 is not divisible by the model's segment length T=3: choose 30 or 33"),
         ({"samples": 0}, "samples must be at least 1, not 0"),
         ({"motion_horizon": "last"}, "unknown motion_horizon 'last': choose full_horizon or first_segment"),
-        ({"tracking_at": "start"}, "unknown tracking_at 'start': choose auto, end or first_push"),
-        ({"motion_samples": 0}, "motion_samples must be at least 1, not 0"),
-        ({"nearest_objects": 0}, "nearest_objects must be at least 1, not 0"),
-        ({"effect_retries": -1}, "effect_retries must be 0 or more, not -1"),
+        ({"motion_share": 0}, "motion_share must be above 0 and at most 1, not 0"),
         ({"reward_at": "end"}, "unknown reward_at 'end': choose path or subgoals"),
         ({"compile": "fast"}, "compile must be true, false or cuda_graphs, not fast"),
         ({"feature_weight": float("nan")}, "feature_weight must be zero or a positive number, not nan"),
@@ -178,7 +194,7 @@ def test_a_state_that_is_not_finite_is_named(toy: SimpleNamespace) -> None:
 )
 def test_bad_options_are_one_clear_line(toy: SimpleNamespace, options: dict, message: str) -> None:
     with pytest.raises(ValueError) as error:
-        toy.plain(toy.PointMass(), near_the_edge(toy), **options)
+        CavinPlanner(toy.PointMass(), **options)
     assert str(error.value) == message
 
 

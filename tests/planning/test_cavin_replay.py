@@ -9,10 +9,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 from torch import Tensor
 
-from cavin_pyro.planning import Plan
+from cavin_pyro.planning import Addition, CavinPlanner, Plan
+from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.optimizers import Shooting
+from tests.planning.conftest import line
 
 # Segment 1, from x = 0: plan 0 dies at its second step (-0.75), plan 1 gets to 0.5, plan 2 dies at its first
 # step (-1.0). So plans 0 and 2 become copies of plan 1, and segment 2 starts at x = 0.5 for all: plan 0
@@ -28,12 +31,14 @@ MOTIONS = [[0.25, 0.125, 0.0], [-0.25, 0.0, 0.5]]
 
 
 def replay(toy: SimpleNamespace, effects: list, motions: list, **options: Any) -> Plan:
-    planner = toy.plain(toy.Tabled(effects, motions), toy.Line(), samples=3, horizon=4, **options)
-    return planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(0))
+    planner = CavinPlanner(toy.Tabled(effects, motions), samples=3, horizon=4, **options)
+    return planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
 
 
-def line(centers: Tensor) -> list[float]:
-    return centers[..., 0, 0].flatten().tolist()
+def avoiding(toy: SimpleNamespace, effects: list, motions: list) -> list[float]:
+    """The first motion code that is chosen with failure avoidance, and without."""
+    plans = [replay(toy, effects, motions, additions=one) for one in (["failure_avoidance"], [])]
+    return [plan.motion_codes[0, 0, 0].item() for plan in plans]
 
 
 def test_effect_level_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
@@ -102,7 +107,7 @@ def test_a_successful_plan_is_neither_replaced_nor_moved_on_from(toy: SimpleName
     effects = [[1.0, 0.5, -2.0], [-3.0, 0.25, 0.25]]
     # Only segment 1 has anything to aim at: sequence 1 comes closest, and may fail in segment 2.
     motions = [[0.5, -0.0625, 0.25], [0.0, -9.0, 0.0]]
-    plan = replay(toy, effects, motions)
+    plan = replay(toy, effects, motions, additions=["failure_avoidance"])
     assert plan.candidate_returns.tolist() == [[-1.0 + 99.0, -4.0, -4.0]]
     assert plan.expected_return.tolist() == [98.0]
     assert plan.segments.tolist() == [1]
@@ -120,32 +125,40 @@ def test_where_every_plan_has_died_the_best_of_the_dead_is_chosen(toy: SimpleNam
     assert not plan.expected_success.any()
 
 
-def test_predicted_failures_lose_by_default(toy: SimpleNamespace) -> None:
+def test_predicted_failures_lose(toy: SimpleNamespace) -> None:
     # The chosen subgoal is -0.25; sequence 0 ends at -0.5 (a failure), sequence 2 at 0.25, farther away.
     effects, motions = [[-0.25] * 3, [0.0] * 3], [[-0.125, -0.5, 0.25], [0.0] * 3]
-    assert replay(toy, effects, motions).motion_codes[0, 0, 0] == 0.25
-    assert replay(toy, effects, motions, avoid_failures=False).motion_codes[0, 0, 0] == -0.125
+    assert avoiding(toy, effects, motions) == [0.25, -0.125]
 
 
 def test_predicted_failures_lose_in_later_segments_too(toy: SimpleNamespace) -> None:
     # Subgoals -0.25 and -0.25. Sequence 0 hits the first and fails in segment 2; 1 and 2 keep off, 1 closer.
     effects, motions = [[-0.25] * 3, [0.0] * 3], [[0.0, 0.25, 0.375], [-0.125, 0.0, 0.0]]
-    assert replay(toy, effects, motions).motion_codes[0, 0, 0] == 0.25
-    assert replay(toy, effects, motions, avoid_failures=False).motion_codes[0, 0, 0] == 0.0
+    assert avoiding(toy, effects, motions) == [0.25, 0.0]
 
 
 def test_where_all_fail_those_that_fail_later_than_the_executed_segment_win(toy: SimpleNamespace) -> None:
     # Subgoals -0.25 and -0.25. Sequence 0 fails at once and comes back; 1 and 2 fail in segment 2, 1 closer.
     effects = [[-0.25] * 3, [0.0] * 3]
     motions = [[-0.125, 0.125, 0.25], [0.125, -0.375, -0.75]]
-    assert replay(toy, effects, motions).motion_codes[0, 0, 0] == 0.125
-    assert replay(toy, effects, motions, avoid_failures=False).motion_codes[0, 0, 0] == -0.125
+    assert avoiding(toy, effects, motions) == [0.125, -0.125]
 
 
+def test_what_another_addition_leaves_out_stays_out_where_all_motions_fail(toy: SimpleNamespace) -> None:
+    class NotTheFirst(Addition):
+        def rank(self, scores: Tensor, choice: Choice) -> Tensor:
+            return scores.where(torch.arange(3) > 0, -torch.inf)
+
+    additions = [NotTheFirst(), "failure_avoidance"]
+    plan = replay(toy, [[-0.25] * 3, [0.0] * 3], [[-0.375, -0.5, -0.75], [0.0] * 3], additions=additions)
+    assert plan.motion_codes[0, 0, 0] == -0.5
+
+
+@pytest.mark.parametrize("additions", [[], ["failure_avoidance"]])
 @pytest.mark.parametrize("motion_horizon", ["full_horizon", "first_segment"])
-def test_motions_that_are_not_finite_never_win(toy: SimpleNamespace, motion_horizon: str) -> None:
+def test_motions_that_are_not_finite_never_win(toy: SimpleNamespace, motion_horizon: str, additions: list) -> None:
     motions = [[float("nan"), 0.25, float("inf")], [0.0, 0.0, 0.0]]
-    plan = replay(toy, EFFECTS, motions, motion_horizon=motion_horizon)
+    plan = replay(toy, EFFECTS, motions, motion_horizon=motion_horizon, additions=additions)
     assert plan.motion_codes[0, 0, 0] == 0.25
     assert plan.planned_actions.isfinite().all()
 

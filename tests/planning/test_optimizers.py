@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.planning import MpcPlanner
+from cavin_pyro.planning import CavinPlanner, MpcPlanner
 from cavin_pyro.planning.optimizers import OPTIMIZERS, make_optimizer, search
 from cavin_pyro.planning.optimizers.cross_entropy import coloured
 from cavin_pyro.planning.returns import CumulativeReward
@@ -99,8 +99,8 @@ def test_pushes_respect_their_bounds_whatever_the_returns(
             judged = super().__call__(previous, centers, mask)
             return judged._replace(reward=scale * judged.reward)
 
-    planner = MpcPlanner(toy.PointMass(), Scaled((9.0, 9.0), dense=True), samples=64, horizon=6, optimizer=name)
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(seed))
+    planner, reward = MpcPlanner(toy.PointMass(), samples=64, horizon=6, optimizer=name), Scaled((9.0, 9.0), dense=True)
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=reward, generators=toy.generators(seed))
     assert plan.planned_actions.abs().max() <= 1.0
 
 
@@ -108,8 +108,8 @@ def test_pushes_respect_their_bounds_whatever_the_returns(
 def test_an_optimizer_works_at_both_levels(toy: SimpleNamespace, name: str) -> None:
     # A goal too far to reach, straight ahead: the best is 0.15 m in each of four segments; motions follow.
     reward = toy.GoalDisc(goal=(10.0, 0.0), dense=True)
-    planner = toy.plain(toy.PointMass(), reward, samples=512, horizon=12, optimizer=name)
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), toy.generators(0, 1, 2, 3))
+    planner = CavinPlanner(toy.PointMass(), samples=512, horizon=12, optimizer=name, additions=["failure_avoidance"])
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), reward=reward, generators=toy.generators(0, 1, 2, 3))
     progress = plan.expected_return + 12
     assert (progress <= 0.6).all()
     assert (progress >= 0.5).all()

@@ -15,7 +15,7 @@ from cavin_pyro.models.priors.flow import FlowPrior
 from cavin_pyro.models.priors.mixture import ObjectMixturePrior
 from cavin_pyro.models.priors.standard import StandardPrior
 from cavin_pyro.models.state import State
-from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning import CavinPlanner, Plan
 from cavin_pyro.planning.sampling import noise_each, reparameterize, reparameterize_each, sample_each
 
 each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior, ObjectMixturePrior])
@@ -41,17 +41,19 @@ def scenes(toy: SimpleNamespace) -> State:
     return toy.scenes([[(0.5, 0.1), (0.7, -0.1)], [(0.4, -0.2), (0.6, 0.3)]], [1.0, 1.0])
 
 
-def planner(toy: SimpleNamespace, kind: type, horizon: str = "first_segment") -> CavinPlanner:
-    reward = toy.GoalDisc((0.8, 0.0))
-    return toy.plain(model_with(kind), reward, samples=32, horizon=9, motion_horizon=horizon)
+def plan_with(
+    toy: SimpleNamespace, model: CascadedModel, state: State, *seeds: int, horizon: str = "first_segment"
+) -> Plan:
+    planner = CavinPlanner(model, samples=32, horizon=9, motion_horizon=horizon)
+    return planner.plan(state, reward=toy.GoalDisc((0.8, 0.0)), generators=toy.generators(*seeds))
 
 
 @each_prior
 @pytest.mark.parametrize("horizon", ["first_segment", "full_horizon"])
 def test_a_plan_comes_out_and_again_from_the_same_seed(kind: type, horizon: str, toy: SimpleNamespace) -> None:
-    planners = [planner(toy, kind, horizon) for _ in range(2)]
+    models = [model_with(kind) for _ in range(2)]
     global_state = torch.get_rng_state()
-    plans = [one.plan(scenes(toy), toy.generators(3, 4)) for one in planners]
+    plans = [plan_with(toy, one, scenes(toy), 3, 4, horizon=horizon) for one in models]
     assert torch.equal(torch.get_rng_state(), global_state)
     assert plans[0].actions.shape == (2, 3, 4)
     assert plans[0].effect_codes.shape == (2, 3, 5)
@@ -70,8 +72,8 @@ def test_noise_stands_for_the_code_that_the_prior_draws_with_it(kind: type, toy:
 
 @each_prior
 def test_an_environment_does_not_see_the_others(kind: type, toy: SimpleNamespace) -> None:
-    both = planner(toy, kind).plan(scenes(toy), toy.generators(3, 4))
-    alone = planner(toy, kind).plan(scenes(toy).scene(slice(1, 2)), toy.generators(4))
+    both = plan_with(toy, model_with(kind), scenes(toy), 3, 4)
+    alone = plan_with(toy, model_with(kind), scenes(toy).scene(slice(1, 2)), 4)
     assert torch.allclose(both.candidate_returns[1], alone.candidate_returns[0], atol=1e-5)
     assert torch.allclose(both.actions[1], alone.actions[0], atol=1e-5)
 
@@ -79,14 +81,14 @@ def test_an_environment_does_not_see_the_others(kind: type, toy: SimpleNamespace
 @pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior, ObjectMixturePrior])
 def test_what_the_prior_has_learned_is_what_is_considered(kind: type, toy: SimpleNamespace) -> None:
     """A prior trained on codes near 2 proposes codes near 2."""
-    plan = planner(toy, kind)
-    prior, state = plan.model.prior_of_effects, scenes(toy).scene(slice(0, 1)).expand((64,))
+    model = model_with(kind)
+    prior, state = model.prior_of_effects, scenes(toy).scene(slice(0, 1)).expand((64,))
     optimizer = torch.optim.Adam(prior.parameters(), 3e-2)
     for _ in range(100):
         optimizer.zero_grad()
         (-prior(state).log_prob(2 + 0.1 * torch.randn(64, 5))).mean().backward()
         optimizer.step()
-    first = plan.plan(scenes(toy), toy.generators(3, 4)).effect_codes[0, 0]
+    first = plan_with(toy, model, scenes(toy), 3, 4).effect_codes[0, 0]
     assert (first - 2).abs().max() < 1
 
 

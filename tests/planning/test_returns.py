@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.planning import returns
-from cavin_pyro.planning.protocol import Outcome
+from cavin_pyro.planning import CavinPlanner, RewardFunction, StepOutcome, returns
+from cavin_pyro.planning.protocol import as_reward
 from cavin_pyro.planning.returns import StrideLimits
 
 POSITIONS = st.floats(-2.0, 2.0, width=32)
@@ -32,29 +32,26 @@ def test_interpolation_is_linear_and_hits_the_subgoal(start: list, end: list, st
     torch.testing.assert_close(moves, ((last - first) / steps).expand_as(moves), rtol=0, atol=2e-6)
 
 
-def walk(toy: SimpleNamespace, *positions: float) -> torch.Tensor:
-    """States [T, M = 1, 3] of one object on a line."""
-    return torch.tensor([[[x, 0.0, 0.0]] for x in positions])
-
-
-def advance(toy: SimpleNamespace, *segments: torch.Tensor, mask: bool = True) -> returns.Progress:
+def advance(reward: RewardFunction, *segments: list[float]) -> returns.Progress:
+    """Progress of one object that goes along x, segment by segment."""
     before = torch.zeros(1, 3)
     progress = returns.start(before)
-    for path in segments:
-        progress = returns.advance(progress, toy.Line(), before, path, torch.tensor([mask]))
+    for positions in segments:
+        path = torch.tensor([[[x, 0.0, 0.0]] for x in positions])
+        progress = returns.advance(progress, as_reward(reward), before, path, torch.tensor([True]))
         before = path[-1]
     return progress
 
 
 def test_every_step_of_an_active_plan_counts(toy: SimpleNamespace) -> None:
-    progress = advance(toy, walk(toy, 0.1, 0.2, 0.3), walk(toy, 0.4, 0.5, 0.6))
+    progress = advance(toy.Line(), [0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
     assert progress.returns == -6.0
     assert progress.active
     assert progress.segments == 2
 
 
 def test_rewards_after_a_success_do_not_count(toy: SimpleNamespace) -> None:
-    ended = advance(toy, walk(toy, 0.5, 1.0, 1.5), walk(toy, -1.0, -1.0, -1.0))
+    ended = advance(toy.Line(), [0.5, 1.0, 1.5], [-1.0, -1.0, -1.0])
     assert ended.returns == -1.0 + 99.0
     assert ended.succeeded
     assert not ended.failed
@@ -62,7 +59,7 @@ def test_rewards_after_a_success_do_not_count(toy: SimpleNamespace) -> None:
 
 
 def test_rewards_after_a_failure_do_not_count(toy: SimpleNamespace) -> None:
-    ended = advance(toy, walk(toy, -0.2, -0.4, -0.6), walk(toy, 1.0, 1.0, 1.0))
+    ended = advance(toy.Line(), [-0.2, -0.4, -0.6], [1.0, 1.0, 1.0])
     assert ended.returns == -2.0 - 101.0
     assert ended.failed
     assert not ended.succeeded
@@ -70,44 +67,39 @@ def test_rewards_after_a_failure_do_not_count(toy: SimpleNamespace) -> None:
 
 
 def test_a_step_that_succeeds_and_fails_is_a_failure(toy: SimpleNamespace) -> None:
-    def contradictory(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+    def contradictory(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> StepOutcome:
         both = torch.ones(centers.shape[:-2], dtype=torch.bool)
         return toy.StepOutcome(torch.zeros(both.shape), both, both)
 
-    path = walk(toy, 0.0)
-    ended = returns.advance(returns.start(path[0]), contradictory, path[0], path, torch.ones(1, dtype=torch.bool))
+    ended = advance(contradictory, [0.0])
     assert ended.failed
     assert not ended.succeeded
 
 
 def test_the_reward_sees_each_step_with_the_state_before_it(toy: SimpleNamespace) -> None:
-    def distance_moved(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+    def distance_moved(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> StepOutcome:
         moved = (centers - previous)[..., 0, 0]
         seen.append(moved)
         never = torch.zeros(moved.shape, dtype=torch.bool)
         return toy.StepOutcome(moved, never, never)
 
     seen: list[torch.Tensor] = []
-    path = walk(toy, 0.5, 0.75, 2.0)
-    mask = torch.ones(1, dtype=torch.bool)
-    progress = returns.advance(returns.start(path[0]), distance_moved, torch.zeros(1, 3), path, mask)
+    progress = advance(distance_moved, [0.5, 0.75, 2.0])
     assert seen[0].tolist() == [0.5, 0.25, 1.25]
     assert progress.returns == 2.0
 
 
 def test_a_plan_that_leaves_the_numbers_fails_whatever_the_reward_says(toy: SimpleNamespace) -> None:
-    def cheerful(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+    def cheerful(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> StepOutcome:
         always = torch.ones(centers.shape[:-2], dtype=torch.bool)
         return toy.StepOutcome(torch.full(always.shape, 99.0), always, ~always)
 
-    def endless(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> Outcome:
+    def endless(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> StepOutcome:
         never = torch.zeros(centers.shape[:-2], dtype=torch.bool)
         return toy.StepOutcome(torch.full(never.shape, torch.inf), never, never)
 
-    mask = torch.ones(1, dtype=torch.bool)
     for reward, position in ((cheerful, torch.nan), (cheerful, torch.inf), (endless, 0.0)):
-        path = walk(toy, position)
-        lost = returns.advance(returns.start(path[0]), reward, torch.zeros(1, 3), path, mask)
+        lost = advance(reward, [position])
         assert lost.returns == -torch.inf
         assert lost.failed
         assert not lost.succeeded
@@ -145,7 +137,7 @@ def test_strides_of_pushes(toy: SimpleNamespace) -> None:
 @pytest.mark.parametrize("limits", [[0.3], [0.3, 0.1], [-0.1, 0.3], 3, ["a", "b"]])
 def test_bad_limits_are_one_clear_line(toy: SimpleNamespace, limits: object) -> None:
     with pytest.raises(ValueError, match="^stride_limits must be two distances in metres, low then high, not "):
-        StrideLimits(toy.Line(), limits, of="segments")  # type: ignore[arg-type]
+        CavinPlanner(toy.PointMass(), stride_limits=limits)  # type: ignore[arg-type]
 
 
 NAN, INF = torch.nan, torch.inf

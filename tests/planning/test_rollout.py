@@ -107,9 +107,7 @@ def test_what_an_environment_finds_does_not_depend_on_when_others_stop_early(toy
             assert torch.equal(alone.history(read), both.history(read)[own])
 
 
-def test_without_an_upper_bound_no_search_stops_before_all_candidates_have_terminated(
-    toy: SimpleNamespace,
-) -> None:
+def test_without_an_upper_bound_no_search_stops_before_all_candidates_have_terminated(toy: SimpleNamespace) -> None:
     noise = places((0, 1))
     problem = search(toy, dense=False)
     problem.objective.reward.maximum_return = torch.inf  # type: ignore[attr-defined]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.models.state import State
+from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.optimizers import SequentialMonteCarlo, search
 from cavin_pyro.planning.optimizers.sequential_monte_carlo import active_returns
 from cavin_pyro.planning.protocol import Evidence, SegmentRollout
@@ -101,12 +102,12 @@ def test_where_no_return_is_finite_z_is_zero(toy: SimpleNamespace) -> None:
 def test_relabelled_environments_and_obstacles_have_the_same_evidence(toy: SimpleNamespace) -> None:
     reward = toy.GoalDisc((0.3, 0.1), forbidden_below=-0.2)
     optimizer = SequentialMonteCarlo(temperature=30.0)
-    planner = toy.plain(toy.PointMass(), reward, samples=100, horizon=9, optimizer=optimizer)
+    planner = CavinPlanner(toy.PointMass(), samples=100, horizon=9, optimizer=optimizer)
     places = [[(0.0, 0.0), (0.1, -0.15), (0.5, 0.2)], [(0.1, 0.1), (0.2, 0.0), (0.4, -0.1)]]
 
     def evidence(order: list[int], environments: list[int]) -> Evidence:
         scenes = toy.scenes([[places[number][one] for one in order] for number in environments], [1.0] * 3)
-        plan = planner.plan(scenes, toy.generators(*environments))
+        plan = planner.plan(scenes, reward=reward, generators=toy.generators(*environments))
         assert plan.evidence is not None
         return plan.evidence
 
@@ -171,9 +172,8 @@ def test_successful_particles_stay_and_failed_ones_stay_where_all_have_failed(to
     )
     some = Candidates(candidates.problem, candidates.plans, score_state)
     assert active_returns(some).tolist() == [[-torch.inf, -2.0, -torch.inf]]
-    none = Candidates(
-        candidates.problem, candidates.plans, score_state._replace(failed=torch.ones(1, 3, dtype=torch.bool))
-    )
+    all_failed = score_state._replace(failed=torch.ones(1, 3, dtype=torch.bool))
+    none = Candidates(candidates.problem, candidates.plans, all_failed)
     assert active_returns(none).tolist() == [[-1.0, -2.0, -torch.inf]]
 
 

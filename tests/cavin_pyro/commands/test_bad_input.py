@@ -32,7 +32,7 @@ BAD = [  # (command, options added to the good ones, what the line must say)
         "planner.optimizer=cem planner.optimizer.iterations=0",
         "planner.optimizer.iterations=0: iterations must be at least",
     ),
-    ("plan", "planner.robustness.rollouts=0", "rollouts must be"),
+    ("plan", "planner.drop=[guidance]", "no such addition"),
     ("plan", "+planner.unknown=1", "planner.unknown=1: cavin_pyro.planning.CavinPlanner cannot be built: "),
     ("plan", "planner._target_=my_lab.Mine", "planner._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
     ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine: my_lab.Mine cannot be built: "),

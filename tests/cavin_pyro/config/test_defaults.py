@@ -23,12 +23,8 @@ from cavin_pyro.planning import CavinPlanner
 
 PAPER = {  # Algorithm 1 as it is printed
     "planner.motion_horizon": "full_horizon",
-    "planner.early_stopping": False,
-    "planner.avoid_failures": False,
-    "planner.robustness": None,
-    "planner.touchdown_distance": 0.0,
-    "planner.tracking_at": "end",
-    "planner.nearest_objects": None,
+    "planner.additions": [],
+    "planner.motion_share": 1.0,
     "planner.optimizer._target_": "cavin_pyro.planning.optimizers.Shooting",
     "pushes_per_plan": None,
     "push_decimals": None,
@@ -43,11 +39,12 @@ def plain(config: Any) -> dict[str, Any]:
     return {str(name): value for name, value in found.items()}
 
 
-def test_a_planner_without_options_is_that_of_the_command(small: SimpleNamespace) -> None:
-    model, reward = build_model(small.config()), object()
-    section = plain(compose("evaluate").planner)  # `plan` alone loads native code by itself
-    del section["model_free"], section["default_checkpoint"]
-    ours, theirs = CavinPlanner(model, reward), construct(section, model=model, reward=reward)
+def test_a_planner_without_options_is_that_of_the_paper(small: SimpleNamespace) -> None:
+    model = build_model(small.config())
+    section = plain(compose("evaluate", "planner=paper").planner)
+    for name in ("model_free", "default_checkpoint", "add", "drop"):
+        del section[name]
+    ours, theirs = CavinPlanner(model), construct(section, model=model)
     assert {**vars(ours), "optimizer": None} == {**vars(theirs), "optimizer": None}
     assert vars(ours.optimizer) == vars(theirs.optimizer)
 

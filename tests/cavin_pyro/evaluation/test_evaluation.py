@@ -39,8 +39,8 @@ def env() -> Any:
 class Still(RandomPlanner):
     """Random pushes shorter than a millimetre at the edge of the reachable box, which move nothing."""
 
-    def plan(self, state: Any, generators: Any) -> Plan:
-        plan = super().plan(state, generators)
+    def plan(self, state: Any, **given: Any) -> Plan:
+        plan = super().plan(state, **given)
         return plan._replace(actions=plan.actions * 1e-3 + torch.tensor([-0.99, -0.99, 0.0, 0.0]))
 
 
@@ -49,8 +49,8 @@ class Rounding(RandomPlanner):
 
     error = 0.0
 
-    def plan(self, state: Any, generators: Any) -> Plan:
-        plan = super().plan(state, generators)
+    def plan(self, state: Any, **given: Any) -> Plan:
+        plan = super().plan(state, **given)
         return plan._replace(actions=plan.actions.round(decimals=2) + self.error)
 
 
@@ -173,8 +173,8 @@ def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: Pushin
     class Wishful(RandomPlanner):
         """Wants every object 30 cm above where it is, and does nothing about it."""
 
-        def plan(self, state: Any, generators: Any) -> Plan:
-            plan = super().plan(state, generators)
+        def plan(self, state: Any, **given: Any) -> Plan:
+            plan = super().plan(state, **given)
             there = state.map(lambda field: field[:, None].clone())
             there.centers[..., 2] += 0.3
             return plan._replace(
@@ -209,7 +209,7 @@ def test_an_evaluation_runs_only_what_is_missing(configure: Any, tmp_path: Path)
 
 def parts(runner: EpisodeRunner) -> SimpleNamespace:
     runner.env.close()
-    return SimpleNamespace(**vars(runner), task=runner.task)
+    return SimpleNamespace(**{**vars(runner), "task": runner.task, "reward": runner.reward(runner.task)})
 
 
 def test_options_reach_the_parts(configure: Any) -> None:
@@ -217,8 +217,8 @@ def test_options_reach_the_parts(configure: Any) -> None:
     assert isinstance(runner.planner, CavinPlanner)
     assert (runner.planner.samples, runner.planner.segments) == (8, 2)
     assert runner.task.name == "insertion"
-    assert runner.planner.reward.dense and runner.env.reward.dense
-    assert (runner.planner.reward.margin, runner.env.reward.margin) == (0.02, 0.0)
+    assert runner.reward.dense and runner.env.reward.dense
+    assert (runner.reward.margin, runner.env.reward.margin) == (0.02, 0.0)
     assert (runner.env.maximum_steps, runner.env.objects) == (7, 2)
     assert not any(parameter.requires_grad for parameter in runner.planner.model.parameters())
     runner = parts(make_runner(configure("planner=random", "env.ranges.names=[mug]", "env.ranges.scale=[1,1]")))
@@ -232,7 +232,7 @@ def test_tiles_on_the_command_line_replace_those_of_the_layout(configure: Any) -
     assert tuple(moved.goal) == ((1, 1), (1, 2)) != tuple(plain.goal)
     assert moved.region == plain.region
     runner = parts(make_runner(configure(*fast("tiles.goal=[[1,1],[1,2]]"))))
-    assert runner.planner.reward.task == runner.env.task == moved
+    assert runner.reward.task == runner.env.task == moved
 
 
 def test_a_checkpoint_runs_with_more_objects_than_it_was_trained_with_and_says_so(

@@ -17,6 +17,7 @@ from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, rollout
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning.additions import FirstPush
 from cavin_pyro.planning.optimizers import OPTIMIZERS
 from cavin_pyro.storage.checkpoint import save
 from cavin_pyro.visualization.plan import draw_plan
@@ -68,22 +69,13 @@ def make_small_runner(checkpoints: dict[str, Path]) -> Callable[..., EpisodeRunn
     return make
 
 
-@pytest.mark.parametrize(
-    ("task", "pushes", "tracked"),
-    [
-        ("clearing", "1", "first_push"),
-        ("clearing", "2", "end"),
-        ("clearing", "null", "end"),
-        ("rearrange", "1", "first_push"),
-        ("crossing", "1", "end"),
-    ],
-)
+@pytest.mark.parametrize(("pushes", "tracked"), [("1", True), ("2", False), ("null", False)])
 def test_the_first_push_is_tracked_where_it_alone_is_executed(
-    task: str, pushes: str, tracked: str, make_small_runner: Callable[..., EpisodeRunner]
+    pushes: str, tracked: bool, make_small_runner: Callable[..., EpisodeRunner]
 ) -> None:
-    runner = make_small_runner("cavin", "cascaded", f"task={task}", f"pushes_per_plan={pushes}")
+    runner = make_small_runner("cavin", "cascaded", f"pushes_per_plan={pushes}")
     assert isinstance(runner.planner, CavinPlanner)
-    assert runner.planner.distance.at == tracked
+    assert (FirstPush() in runner.planner.additions) is tracked
     runner.env.close()
 
 
@@ -96,7 +88,7 @@ def test_every_planner_plans_with_every_optimizer(
     planner: str, optimizer: str, make_small_runner: Callable[..., EpisodeRunner], tmp_path: Path
 ) -> None:
     parts = make_small_runner(planner, FITTING[planner], f"planner.optimizer={optimizer}")
-    episode = rollout(parts.env, parts.planner, parts.geometry, seed=1)
+    episode = rollout(parts.env, parts.planner, parts.geometry, reward=parts.reward, seed=1)
     assert episode.outcome in OUTCOMES
     plan = episode.plan_records[0].plan
     assert plan.actions.shape == (1, 3, 4)
@@ -113,11 +105,11 @@ def test_every_planner_plans_with_every_optimizer(
         ("cavin", "planner.stride_limits=[0.1,0.3]"),
         ("cavin", "planner.optimizer.replacement=false"),
         ("cavin", "planner.motion_optimizer=cem"),
-        ("cavin", "planner.early_stopping=false"),
-        ("cavin", "planner.motion_samples=1"),
+        ("cavin", "planner.drop=[early_stopping]"),
+        ("cavin", "planner.motion_share=0.02"),
         # perturbed rollouts are made of plans that reach the goal: here some do
-        ("cavin_without_effects task=clearing planner.horizon=30 objects=1", "planner.robustness=null"),
-        ("cvae_mpc task=clearing planner.horizon=30", "planner.robustness=null"),
+        ("cavin_without_effects task=clearing planner.horizon=30 objects=1", "planner.drop=[perturbed_rollouts]"),
+        ("cvae_mpc task=clearing planner.horizon=30", "planner.drop=[perturbed_rollouts]"),
         pytest.param(
             "cavin",
             "matmul_precision=bfloat16",
@@ -132,7 +124,9 @@ def test_options_take_effect(planner: str, option: str) -> None:
         name, *own = planner.split()
         overrides = [f"planner={name}", *SMALL, "planner.samples=64", *own, *further, "output=unused"]
         parts = make_runner(compose("evaluate", *overrides))  # the shipped checkpoint knows something
-        plans.append(rollout(parts.env, parts.planner, parts.geometry, seed=1).plan_records[0].plan)
+        plans.append(
+            rollout(parts.env, parts.planner, parts.geometry, reward=parts.reward, seed=1).plan_records[0].plan
+        )
         parts.env.close()
     returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
     assert not (torch.equal(*returns) and torch.equal(*actions))

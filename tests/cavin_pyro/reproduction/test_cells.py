@@ -59,7 +59,7 @@ def test_every_command_line_of_a_stage_is_accepted(method: str) -> None:
     size, home = SIZES["smoke"], Path("home")
     for stage in (*preparation(size, home, [method], workers=1, device="cpu"), training(size, home, method, 0)):
         config = compose(stage.command, *stage.options, f"output={stage.folder}")
-    assert config.model._target_.startswith("models.") and config.seed == 0
+    assert config.model._target_.startswith("cavin_pyro.models.") and config.seed == 0
     for planner in METHODS[method].planners.values():
         composed = compose("evaluate", *SHARED, *planner, *size.planning, "output=-")
         assert composed.env.segmentation == "clusters" and composed.criterion == "published"

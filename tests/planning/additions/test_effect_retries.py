@@ -3,46 +3,45 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning import CavinPlanner
+from cavin_pyro.planning import CavinPlanner, Plan
+from cavin_pyro.planning.additions import EffectRetries
 from cavin_pyro.planning.additions.effect_retries import is_unmoved, leave_out_similar
+from tests.planning.conftest import PointMass
 
 GOAL = (0.5, 0.0)
 
 
-def walled(toy: SimpleNamespace) -> object:
-    """A point mass whose f knows of a wall: objects with x > 0 go no farther in x; h does not know it."""
+class Walled(PointMass):
+    """f knows of a wall: objects with x > 0 go no farther in x; h does not know it."""
 
-    class Walled(toy.PointMass):  # type: ignore[misc, name-defined]
-        def next_state(self, state: State, action: Tensor) -> State:
-            at_wall = (state.centers[..., :1, 0] > 0).unsqueeze(-1)
-            ahead = (action[..., 2] > 0).unsqueeze(-1).unsqueeze(-1)
-            after = super().next_state(state, action)
-            return after._replace(centers=torch.where(at_wall & ahead, state.centers, after.centers))
-
-    return Walled(noise=0.0)
+    def next_state(self, state: State, action: Tensor) -> State:
+        at_wall = (state.centers[..., :1, 0] > 0).unsqueeze(-1)
+        ahead = (action[..., 2] > 0).unsqueeze(-1).unsqueeze(-1)
+        after = super().next_state(state, action)
+        return after._replace(centers=torch.where(at_wall & ahead, state.centers, after.centers))
 
 
-def planner(
-    toy: SimpleNamespace, retries: int, *, reward: object = None, samples: int = 64, horizon: int = 6, **options: object
-) -> CavinPlanner:
-    reward = reward or toy.GoalDisc(goal=GOAL, dense=True)
-    return toy.plain(walled(toy), reward, samples, horizon, "first_segment", effect_retries=retries, **options)
+def planner(*additions: Any, samples: int = 64, horizon: int = 6) -> CavinPlanner:
+    additions = "failure_avoidance", *additions
+    return CavinPlanner(Walled(noise=0.0), samples, horizon, "first_segment", additions=additions)
 
 
-def moved(plan: object, state: State) -> Tensor:
-    away = plan.predicted_centers[:, 2] - state.centers  # type: ignore[attr-defined]
+def moved(plan: Plan, state: State) -> Tensor:
+    away = plan.predicted_centers[:, 2] - state.centers
     return away[..., :2].norm(dim=-1).amax(-1)
 
 
 def test_where_nothing_moves_another_effect_is_tried(toy: SimpleNamespace) -> None:
-    state = toy.scenes([[(0.01, 0.0)]])
-    stuck, tried = (planner(toy, retries).plan(state, toy.generators(3)) for retries in (0, 3))
+    state, reward = toy.scenes([[(0.01, 0.0)]]), toy.GoalDisc(goal=GOAL, dense=True)
+    planners = planner(), planner(EffectRetries(3))
+    stuck, tried = (one.plan(state, reward=reward, generators=toy.generators(3)) for one in planners)
     assert moved(stuck, state) == 0.0
     assert moved(tried, state) > 0.02
     first, other = ((plan.subgoals.centers[:, 0] - state.centers)[0, 0, :2] for plan in (stuck, tried))
@@ -55,21 +54,21 @@ def test_the_other_effect_reaches_the_goal_though_the_search_has_stopped_at_the_
     # One segment through the wall reaches the goal, and ends the search under a sparse reward; a way round takes more.
     reward = toy.GoalDisc(goal=(0.12, 0.0))
     for seed in range(5):
-        own = planner(toy, 3, reward=reward, samples=256, horizon=12, early_stopping=True)
-        tried = own.plan(state, toy.generators(seed))
+        own = planner("early_stopping", EffectRetries(3), samples=256, horizon=12)
+        tried = own.plan(state, reward=reward, generators=toy.generators(seed))
         assert moved(tried, state) > 0.02
         assert tried.expected_success.item() and tried.segments.item() > 1
 
 
-@pytest.mark.parametrize("early_stopping", [False, True])
-def test_a_plan_does_not_depend_on_whether_its_neighbours_are_stuck(toy: SimpleNamespace, early_stopping: bool) -> None:
+@pytest.mark.parametrize("more", [[], ["early_stopping"]])
+def test_a_plan_does_not_depend_on_whether_its_neighbours_are_stuck(toy: SimpleNamespace, more: list[str]) -> None:
     places = [[(0.01, 0.0)], [(-0.4, 0.0)], [(0.01, 0.2)]]
-    one = planner(toy, 3, early_stopping=early_stopping)
+    one, reward = planner(EffectRetries(3), *more), toy.GoalDisc(goal=GOAL, dense=True)
     together = toy.generators(3, 4, 5)
-    plans = one.plan(toy.scenes(places), together)
+    plans = one.plan(toy.scenes(places), reward=reward, generators=together)
     for number, place in enumerate(places):
         alone = toy.generators(3 + number)
-        plan = one.plan(toy.scenes([place]), alone)
+        plan = one.plan(toy.scenes([place]), reward=reward, generators=alone)
         assert torch.equal(plan.actions[0], plans.actions[number])
         assert torch.equal(plan.subgoals.centers[0], plans.subgoals.centers[number])
         assert torch.equal(alone[0].get_state(), together[number].get_state())

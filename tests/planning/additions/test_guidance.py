@@ -15,9 +15,9 @@ from cavin_pyro.envs.workspace import tile_center
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner, CvaeMpcPlanner
 from cavin_pyro.planning.additions.guidance import GuidedReturn, GuidedTracking
-from cavin_pyro.planning.cavin import TrackingState
-from cavin_pyro.planning.protocol import SegmentRollout
-from cavin_pyro.planning.returns import CumulativeReward, Progress
+from cavin_pyro.planning.protocol import Reward, SegmentRollout
+from cavin_pyro.planning.returns import CumulativeReward, Progress, TrackingState
+from tests.planning.conftest import GoalDisc
 
 ARM = [[1, column] for column in range(1, 6)]
 U = [*ARM, [2, 5], *[[3, column] for column in range(5, 0, -1)]]  # eleven tiles from (1, 1) round to (3, 1)
@@ -29,9 +29,9 @@ def bridge(**options: Any) -> TaskReward:
 
 
 class StraightDistance:
-    """The straight distance of the target to the middle of a disc, at most 2 metres."""
+    """The straight distance of the target to a disc, at most 2 metres."""
 
-    def __init__(self, disc: Any) -> None:
+    def __init__(self, disc: GoalDisc) -> None:
         self.disc = disc
 
     def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
@@ -41,51 +41,50 @@ class StraightDistance:
         return torch.full_like(mask[..., 0], 2, dtype=torch.float32)
 
 
-def guided_disc(toy: SimpleNamespace, **options: Any) -> Any:
-    disc = toy.GoalDisc(**options)
-    disc.distance_to_goal = StraightDistance(disc)
-    return disc
+class GuidedDisc(GoalDisc):
+    def distance_to_goal(self) -> StraightDistance:
+        return StraightDistance(self)
 
 
-def episode(planner: CavinPlanner, model: Any, state: State, plans: int) -> list[Tensor]:
+def episode(planner: CavinPlanner, reward: Reward, state: State, plans: int) -> list[Tensor]:
     """Centres of the target [2] after each of so many first pushes, executed as f predicts them."""
     sources, seen = [torch.Generator().manual_seed(1)], []
     for _ in range(plans):
-        state = model.next_state(state, planner.plan(state, sources).actions[:, 0])
+        plan = planner.plan(state, reward=reward, generators=sources)
+        state = planner.model.next_state(state, plan.actions[:, 0])
         seen.append(state.centers[0, 0, :2])
     return seen
 
 
 def test_a_goal_round_a_bend_beyond_the_horizon_is_found_with_guidance_and_not_without(toy: SimpleNamespace) -> None:
-    reward, model = bridge(margin=0.02), toy.PointMass(noise=0.005)
-    arrived = {}
-    for guidance in ("none", "layout"):
-        planner = toy.plain(model, reward, 256, 12, guidance=guidance)
-        start = toy.scenes([[tile_center((1, 1))]])
-        assert not planner.plan(start, toy.generators(0)).expected_success.any()  # 1.1 metres, at most 0.6 in a plan
-        targets = torch.stack(episode(planner, model, start, 60))
-        arrived[guidance] = bool(reward.task.goal.contains(targets).any())
-        if guidance == "layout":
+    reward, start, arrived = bridge(margin=0.02), toy.scenes([[tile_center((1, 1))]]), []
+    for guidance in ([], ["guidance"]):
+        additions = ["failure_avoidance", *guidance]
+        planner = CavinPlanner(toy.PointMass(noise=0.005), samples=256, horizon=12, additions=additions)
+        plan = planner.plan(start, reward=reward, generators=toy.generators(0))
+        assert not plan.expected_success.any()  # 1.1 metres, at most 0.6 in a plan
+        targets = torch.stack(episode(planner, reward, start, 60))
+        arrived.append(bool(reward.task.goal.contains(targets).any()))
+        if guidance:
             on_bridge = reward.task.region.contains(targets)
             first = int(reward.task.goal.contains(targets).int().argmax())
             assert on_bridge[: first + 1].all()
-    assert arrived == {"none": False, "layout": True}
+    assert arrived == [False, True]
 
 
 def test_the_baselines_are_guided_too(toy: SimpleNamespace) -> None:
-    reward = guided_disc(toy, goal=(2.0, 0.0))
-    moved = {}
-    for guidance in ("none", "layout"):
-        planner = CvaeMpcPlanner(toy.Flat(), reward, samples=256, horizon=6, robustness=None, guidance=guidance)
-        plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), toy.generators(3))
-        moved[guidance] = float(plan.predicted_centers[0, -1, 0, 0])
+    reward, moved = GuidedDisc(goal=(2.0, 0.0)), []
+    for guidance in ([], ["guidance"]):
+        planner = CvaeMpcPlanner(toy.Flat(), samples=256, horizon=6, additions=["early_stopping", *guidance])
+        plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=reward, generators=toy.generators(3))
+        moved.append(float(plan.predicted_centers[0, -1, 0, 0]))
         assert plan.expected_return == -6.0  # the cumulative reward, without the value that guides
-    assert moved["layout"] > max(0.25, moved["none"])
+    assert moved[1] > max(0.25, moved[0])
 
 
 def test_complete_plans_keep_their_order_and_their_lead_and_failed_ones_gain_on_nobody(toy: SimpleNamespace) -> None:
-    disc = guided_disc(toy, goal=(0.0, 0.0))
-    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal)
+    disc = GuidedDisc(goal=(0.0, 0.0))
+    objective = GuidedReturn(CumulativeReward(disc), disc.distance_to_goal())
     torch.manual_seed(0)
     plans = toy.scenes([[(x, y)] for x, y in torch.empty(300, 2).uniform_(-1.2, 1.2).tolist()])
     ends = torch.arange(300) % 3  # succeeded, failed, active
@@ -100,15 +99,12 @@ def test_complete_plans_keep_their_order_and_their_lead_and_failed_ones_gain_on_
     assert torch.equal(returns[failed].argsort(), earned[failed].argsort())
     # Every failed plan loses at least as much as any other plan.
     assert ((earned - returns)[failed].min() >= (earned - returns)[active].max()).all()
-    left = disc.distance_to_goal(plans.centers, plans.mask)[active]
+    left = disc.distance_to_goal()(plans.centers, plans.mask)[active]
     assert returns[active].argmax() == left.argmin() and returns[active].argmin() == left.argmax()
 
 
 class Tracked:
     """A tracking cost of 0."""
-
-    def __init__(self, subgoals: State) -> None:
-        self.subgoals, self.segments = subgoals, torch.tensor([1, 1, 0])
 
     def start(self, plans: State) -> Any:
         return None
@@ -119,19 +115,19 @@ class Tracked:
 
 
 def test_motions_that_fall_behind_their_subgoal_cost_more_and_those_beyond_it_do_not(toy: SimpleNamespace) -> None:
-    disc = guided_disc(toy, goal=(1.0, 0.0))
+    disc = GuidedDisc(goal=(1.0, 0.0))
     subgoals = toy.scenes([[(0.5, 0.0)]] * 3).map(lambda field: field.unsqueeze(1))
     reached = toy.scenes([[(0.4, 0.0)], [(0.5, 0.0)], [(0.6, 0.0)]] * 3).map(lambda field: field.unflatten(0, (3, 3)))
     rollout = SegmentRollout(torch.zeros(3, 3, 1), None, reached, reached.centers.unsqueeze(2))
     # Guided; its plan reaches the goal; its plan has ended before this segment.
-    cost: Any = GuidedTracking(Tracked(subgoals), disc.distance_to_goal, torch.tensor([True, False, True]))
+    segments, guided = torch.tensor([1, 1, 0]), torch.tensor([True, False, True])
+    cost = GuidedTracking(Tracked(), disc.distance_to_goal(), subgoals, segments, guided)  # type: ignore[arg-type]
     after = cost.advance(cost.start(reached), 0, reached, rollout)
     torch.testing.assert_close(after.cost, torch.tensor([[0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3]))
     assert not after.executed_cost.any()
 
 
 def test_what_cannot_guide_is_refused_in_one_line(toy: SimpleNamespace) -> None:
-    with pytest.raises(ValueError, match=r"^unknown guidance 'roadmap': choose none or layout$"):
-        CavinPlanner(toy.PointMass(), toy.Line(), guidance="roadmap")
-    with pytest.raises(ValueError, match=r"^guidance='layout' needs a reward function with a `distance_to_goal`"):
-        CavinPlanner(toy.PointMass(), toy.Line(), guidance="layout")
+    planner = CavinPlanner(toy.PointMass(), additions=["guidance"])
+    with pytest.raises(ValueError, match=r"^the addition guidance needs a reward with a `distance_to_goal`"):
+        planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))

@@ -13,15 +13,11 @@ from cavin_pyro.envs.layouts import load_task
 from cavin_pyro.envs.tasks import TaskReward
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
-from cavin_pyro.planning.additions.nearest_objects import NearestObjects, nearest_objects
+from cavin_pyro.planning.additions import NearestObjects
+from cavin_pyro.planning.protocol import Reward, Scene
+from cavin_pyro.planning.rollout import Focus
 
 PLACES = [(0.0, 0.0), (0.9, 0.0), (0.1, 0.1), (0.8, 0.0), (0.2, 0.0), (0.0, 0.3)]  # metres; 0, 2, 4, 5 are nearest
-
-
-def about(reward: object, objects: str = "target") -> object:
-    """The same reward, which says what its goal is about."""
-    reward.about = objects  # type: ignore[attr-defined]
-    return reward
 
 
 def scene(*, real: int = 6) -> State:
@@ -31,25 +27,25 @@ def scene(*, real: int = 6) -> State:
     return State(torch.cat([planar, torch.zeros(1, 6, 1)], -1), features, mask)
 
 
-def target_reward(toy: SimpleNamespace, **options: object) -> object:
-    return about(toy.GoalDisc(goal=(0.2, 0.0), **options))
+def focus(reward: Reward, objects: int = 4, **options: int) -> Focus:
+    return NearestObjects(objects).focus(Focus(), Scene(scene(**options), reward, []))
 
 
 def test_the_target_comes_first_and_then_the_nearest_in_their_order(toy: SimpleNamespace) -> None:
-    near = nearest_objects(scene(), 4, target_reward(toy))
+    near = focus(toy.GoalDisc(goal=(0.2, 0.0), about="target"))
     assert near.indices.tolist() == [[0, 2, 4, 5]]
     assert near.of(scene()).features.flatten().tolist() == [0.0, 2.0, 4.0, 5.0]
 
 
 def test_padding_is_never_nearer_than_an_object(toy: SimpleNamespace) -> None:
-    near = nearest_objects(scene(real=4), 3, target_reward(toy))  # 4 and 5, which are padding, lie near
+    near = focus(toy.GoalDisc(goal=(0.2, 0.0), about="target"), 3, real=4)  # 4 and 5, which are padding, lie near
     assert near.indices.tolist() == [[0, 2, 3]]
 
 
 def test_all_objects_count_where_the_goal_is_about_them(toy: SimpleNamespace) -> None:
-    assert nearest_objects(scene(), 4, about(toy.GoalDisc(goal=(0.2, 0.0)), "all")).indices is None
-    assert nearest_objects(scene(), 4, toy.GoalDisc(goal=(0.2, 0.0))).indices is None  # it does not say
-    found = {name: nearest_objects(scene(), 4, TaskReward(load_task(name))) for name in ("clearing", "crossing")}
+    assert focus(toy.GoalDisc(goal=(0.2, 0.0), about="all")).indices is None
+    assert focus(toy.GoalDisc(goal=(0.2, 0.0))).indices is None  # it does not say
+    found = {name: focus(TaskReward(load_task(name))) for name in ("clearing", "crossing")}
     assert found["clearing"].indices is None
     assert found["crossing"].indices is not None
 
@@ -57,7 +53,7 @@ def test_all_objects_count_where_the_goal_is_about_them(toy: SimpleNamespace) ->
 @given(st.permutations(range(1, 6)), st.integers(1, 5))
 def test_objects_go_back_to_their_places(order: list[int], most: int) -> None:
     state, indices = scene(), torch.tensor([sorted([0, *order[:most]])])
-    near = NearestObjects(indices)
+    near = Focus(indices)
     part = near.of(state.expand_plans(2))
     moved = part._replace(centers=part.centers + 1.0)
     whole = near.among(state, moved)
@@ -88,8 +84,9 @@ class Watched:
 
 def test_h_and_g_read_the_nearest_and_f_reads_all(toy: SimpleNamespace) -> None:
     model = Watched(toy.PointMass())
-    planner = CavinPlanner(model, target_reward(toy), 32, 6, nearest_objects=4)  # type: ignore[arg-type]
-    plan = planner.plan(toy.scenes([PLACES]), toy.generators(0))
+    planner = CavinPlanner(model, 32, 6, additions=[NearestObjects(4)])  # type: ignore[arg-type]
+    reward = toy.GoalDisc(goal=(0.2, 0.0), about="target")
+    plan = planner.plan(toy.scenes([PLACES]), reward=reward, generators=toy.generators(0))
     assert model.read == {
         "effect_prior": {4},
         "subgoal": {4},
@@ -107,12 +104,11 @@ def test_h_and_g_read_the_nearest_and_f_reads_all(toy: SimpleNamespace) -> None:
 def test_an_object_that_is_left_out_still_counts_for_the_rules(toy: SimpleNamespace) -> None:
     # All objects move alike. Object 1, which is left out, may not go down by more than 4 mm.
     places = [(0.0, 0.3), (0.9, 0.004), *PLACES[2:]]
-    reward = about(toy.GoalDisc(goal=(0.1, 0.3), forbidden_below=0.0))
+    reward = toy.GoalDisc(goal=(0.1, 0.3), forbidden_below=0.0, about="target")
 
-    def lowest(**options: object) -> list[float]:
-        planner = toy.plain(toy.PointMass(), reward, samples=256, horizon=3, nearest_objects=4, **options)
-        plans = [planner.plan(toy.scenes([places]), toy.generators(seed)) for seed in range(8)]
-        return [plan.predicted_centers[0, :, 1, 1].min().item() for plan in plans]
+    def lowest(*additions: str) -> float:
+        planner = CavinPlanner(toy.PointMass(), 256, 3, additions=[NearestObjects(4), *additions])
+        plan = planner.plan(toy.scenes([places] * 8), reward=reward, generators=toy.generators(*range(8)))
+        return plan.predicted_centers[:, :, 1, 1].min().item()
 
-    assert min(lowest()) >= 0.0
-    assert min(lowest(avoid_failures=False)) < 0.0
+    assert lowest("failure_avoidance") >= 0.0 > lowest()

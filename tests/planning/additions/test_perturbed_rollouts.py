@@ -3,80 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, Normal
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning import PerturbedRollouts
+from cavin_pyro.planning import CavinPlanner, Reward
+from cavin_pyro.planning.additions import Choice, PerturbedRollouts
 from cavin_pyro.planning.additions.perturbed_rollouts import sequential_halving
+from cavin_pyro.planning.backends import eager
+from cavin_pyro.planning.protocol import Scene
+from tests.planning.conftest import GoalDisc, PointMass, generators, move, scenes
 
 SAMPLES = 64
 
 
-class Grazing:
-    """A push moves objects by its motion, but only if its start lies within `width` of zero (normalised).
+class Grazing(PointMass):
+    """A push moves objects by its motion in x, but only if its start lies within `width` of zero (normalised).
 
     h moves everything by 0.1 m in x. g has two motions, which the sign of z tells apart: a wide one that ends 1 cm
     short of the subgoal, and a narrow one that reaches it exactly.
     """
 
     segment_length = 1
-    effect_dimension = motion_dimension = 16
     narrow, wide = 0.001, 10.0
 
-    def effect_prior(self, state: State) -> Distribution:
-        return standard(state)
-
-    def motion_prior(self, state: State, effect_code: Tensor) -> Distribution:
-        return standard(state)
-
     def subgoal(self, state: State, effect_code: Tensor) -> State:
-        return moved(state, state.centers.new_full((*effect_code.shape[:-1], 1), 0.1))
+        return move(state, torch.tensor([0.1, 0.0]).expand(*effect_code.shape[:-1], 2))
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
         narrow = motion_code[..., :1] > 0
         distance = torch.where(narrow, 0.1, 0.09)
-        return torch.cat(
-            [torch.zeros_like(distance), narrow.to(distance), distance, narrow.to(distance)], -1
-        ).unsqueeze(-2)
+        push = [torch.zeros_like(distance), narrow.to(distance), distance, narrow.to(distance)]
+        return torch.cat(push, -1).unsqueeze(-2)
 
     def next_state(self, state: State, action: Tensor) -> State:
         width = torch.where(action[..., 3:] > 0, self.narrow, self.wide)
         meets = action[..., :1].abs() < width
-        return moved(state, torch.where(meets, action[..., 2:3], 0.0))
+        return move(state, torch.where(meets, action[..., 2:3], 0.0) * torch.tensor([1.0, 0.0]))
 
 
-def standard(state: State) -> Distribution:
-    zeros = state.centers.new_zeros((*state.centers.shape[:-2], 16))
-    return torch.distributions.Independent(Normal(zeros, 1.0), 1)
-
-
-def moved(state: State, distance: Tensor) -> State:
-    move = torch.cat([distance, torch.zeros_like(distance), torch.zeros_like(distance)], -1).unsqueeze(-2)
-    centers = state.centers + move
-    return State(centers, state.features.expand(*centers.shape[:-1], -1), state.mask.expand(centers.shape[:-1]))
-
-
-def scenes(count: int) -> State:
-    return State(torch.zeros(count, 2, 3), torch.zeros(count, 2, 4), torch.ones(count, 2, dtype=torch.bool))
+def two_objects(count: int) -> State:
+    return scenes([[(0.0, 0.0)] * 2] * count, gains=(1.0, 1.0))
 
 
 def chosen_motion(
-    toy: SimpleNamespace, robustness: PerturbedRollouts | None, model: Grazing | None = None, **options: object
+    toy: SimpleNamespace, *additions: PerturbedRollouts, model: Grazing | None = None, reward: Reward | None = None
 ) -> Tensor:
-    planner = toy.plain(
-        model or Grazing(), toy.GoalDisc(goal=(0.1, 0.0)), samples=SAMPLES, horizon=1, robustness=robustness, **options
-    )
-    return planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2]
+    planner = CavinPlanner(model or Grazing(), SAMPLES, 1, additions=["failure_avoidance", *additions])
+    reward = reward or toy.GoalDisc(goal=(0.1, 0.0))
+    return planner.plan(two_objects(1), reward=reward, generators=toy.generators(0)).actions[0, 0, 2]
 
 
 def test_without_it_the_best_motion_by_f_is_chosen(toy: SimpleNamespace) -> None:
-    assert chosen_motion(toy, None) == pytest.approx(0.1)
+    assert chosen_motion(toy) == pytest.approx(0.1)
 
 
 def test_a_motion_that_works_nearby_as_well_wins(toy: SimpleNamespace) -> None:
@@ -86,38 +70,35 @@ def test_a_motion_that_works_nearby_as_well_wins(toy: SimpleNamespace) -> None:
 
 def test_only_the_best_candidates_get_perturbed_rollouts(toy: SimpleNamespace) -> None:
     assert chosen_motion(toy, PerturbedRollouts(candidates=1)) == pytest.approx(0.1)
-    assert chosen_motion(toy, PerturbedRollouts(candidates=10 * SAMPLES)) == pytest.approx(
-        0.09
-    )  # there are no more than N
+    everything = PerturbedRollouts(candidates=10 * SAMPLES)  # there are no more than N
+    assert chosen_motion(toy, everything) == pytest.approx(0.09)
 
 
-def rollouts_of(options: PerturbedRollouts, model: Any, reward: Any, backend: Callable) -> None:
-    """Two scenes with eight motions each, all the same."""
-    state, actions = scenes(2), torch.zeros(2, 8, 3, 4)
-    goal, nothing = state.map(lambda field: field.unsqueeze(1)), torch.zeros(2, 8)
-    given = (
-        options,
-        model,
-        reward,
-        state,
-        goal,
-        nothing,
-        actions,
-        nothing,
-        [torch.Generator().manual_seed(s) for s in (0, 1)],
-    )
-    sequential_halving(*given, backend=backend)
+def halving(
+    robustness: PerturbedRollouts, state: State, below: float = -torch.inf, backend: Callable = eager, **tensors: Any
+) -> list[int]:
+    """The candidate of each scene that sequential halving chooses, with the f of a point mass."""
+    scene = Scene(state, GoalDisc((9.0, 9.0), forbidden_below=below), generators(*range(len(state.mask))))
+    candidates: Any = SimpleNamespace(problem=SimpleNamespace(backend=backend))
+    choice = Choice(scene, PointMass(), candidates, lambda: tensors["actions"])
+    return sequential_halving(robustness, choice, **tensors).tolist()
 
 
-def test_all_motions_of_a_round_get_the_same_noise_and_every_other_rollout_its_opposite(toy: SimpleNamespace) -> None:
+def goal_at(state: State) -> State:
+    """One goal of all candidates, where the scene is."""
+    return state.map(lambda field: field.unsqueeze(1))
+
+
+def test_all_motions_of_a_round_get_the_same_noise_and_every_other_rollout_its_opposite() -> None:
     noises: list[Tensor] = []
 
     def noting(function: Callable, *given: Any) -> Any:
         noises.append(given[4][..., :2])  # starts of the pushes, which were 0
         return function(*given)
 
-    options = PerturbedRollouts(candidates=8, rollouts=4, rounds=2, start_noise=0.01)
-    rollouts_of(options, toy.PointMass(), toy.GoalDisc(goal=(9.0, 9.0)), noting)
+    options = PerturbedRollouts(candidates=8, rollouts=4, rounds=2, reduction_factor=4, start_noise=0.01)
+    state, actions, nothing = two_objects(2), torch.zeros(2, 8, 3, 4), torch.zeros(2, 8)  # eight motions, all the same
+    halving(options, state, backend=noting, scores=nothing, goal=goal_at(state), actions=actions, later=nothing)
     assert len(noises) == 2
     for starts, count in zip(noises, (4, 16), strict=True):
         noise = starts.unflatten(1, (-1, count))  # [B, R, count, ...]
@@ -138,87 +119,51 @@ def test_a_predicted_failure_costs(toy: SimpleNamespace) -> None:
             return after._replace(centers=after.centers + beyond * torch.tensor([0.0, 1.0, 0.0]))
 
     reward = toy.GoalDisc(goal=(0.1, 0.0), forbidden_below=-1e-4)
-
-    def motion(cost: float) -> Tensor:
-        robustness = PerturbedRollouts(candidates=SAMPLES, failure_cost=cost)
-        planner = toy.plain(Edge(), reward, samples=SAMPLES, horizon=1, robustness=robustness)
-        return planner.plan(scenes(1), [torch.Generator().manual_seed(0)]).actions[0, 0, 2]
-
-    assert motion(0.0) == pytest.approx(0.09)  # two objects 1 cm off, against 10 cm
-    assert motion(1.0) == pytest.approx(0.1)
+    free, costly = (PerturbedRollouts(candidates=SAMPLES, failure_cost=cost) for cost in (0.0, 1.0))
+    # Two objects 1 cm off, against 10 cm.
+    assert chosen_motion(toy, free, model=Edge(), reward=reward) == pytest.approx(0.09)
+    assert chosen_motion(toy, costly, model=Edge(), reward=reward) == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"candidates": 0}, "candidates must be at least 1"),
-        ({"rollouts": 0}, "rollouts must be at least 1"),
-        ({"rounds": 0}, "rounds must be at least 1"),
-        ({"reduction_factor": 0}, "reduction_factor must be at least 1"),
-        ({"start_noise": -0.1}, "start_noise must be zero or a positive number"),
-        ({"failure_cost": float("nan")}, "failure_cost must be zero or a positive number"),
-    ],
-)
-def test_bad_options_are_one_clear_line(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        PerturbedRollouts(**options)
-
-
-def ones(count: int) -> State:
-    return State(torch.zeros(count, 2, 3), torch.ones(count, 2, 4), torch.ones(count, 2, dtype=torch.bool))
-
-
-def test_the_best_candidates_continue_with_more_rollouts(toy: SimpleNamespace) -> None:
+def test_the_best_candidates_continue_with_more_rollouts() -> None:
     rolled_out = []
 
     def counting(function: Callable, *given: Any) -> Any:
         rolled_out.append(given[4])  # [B, n, T, 4] pushes
         return function(*given)
 
-    state, actions = ones(2), torch.rand(2, SAMPLES, 1, 4, generator=torch.Generator().manual_seed(0))
-    options = PerturbedRollouts(candidates=32, rollouts=2, rounds=3, start_noise=0.0)
-    model: Any = toy.PointMass()  # whose f does what the push says, up to the objects' gain of zero
-    goal = ones(2).map(lambda field: field.unsqueeze(1))
+    state, actions = two_objects(2), torch.rand(2, SAMPLES, 1, 4, generator=torch.Generator().manual_seed(0))
+    options = PerturbedRollouts(candidates=32, rollouts=2, rounds=3, reduction_factor=4, start_noise=0.0)
     scores = torch.arange(float(SAMPLES)).expand(2, -1)
-    later = torch.stack([torch.arange(float(SAMPLES)), -torch.arange(float(SAMPLES))])  # the last ones are candidates
-    given = model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later, toy.generators(0, 1)
-    chosen = sequential_halving(options, *given, backend=counting)  # type: ignore[arg-type]
-    assert chosen.tolist() == [32, 63]
+    later = torch.stack([scores[0], -scores[0]])  # the last ones are candidates
+    tensors: Any = {"scores": scores, "goal": goal_at(state), "actions": actions, "later": later}
+    assert halving(options, state, backend=counting, **tensors) == [32, 63]
     assert [pushes.shape[1] for pushes in rolled_out] == [64, 64, 64]
     often = [[len(set(map(tuple, pushes[:, 0].tolist()))) for pushes in three] for three in rolled_out]
     assert often == [[32, 32], [8, 8], [2, 2]]
 
 
-def test_each_candidate_may_have_its_own_goal(toy: SimpleNamespace) -> None:
-    state, model = ones(2), toy.PointMass()
-    actions = torch.rand(2, SAMPLES, 3, 4, generator=torch.Generator().manual_seed(0))
+def test_each_candidate_may_have_its_own_goal() -> None:
+    state, actions = two_objects(2), torch.rand(2, SAMPLES, 3, 4, generator=torch.Generator().manual_seed(0))
     scores, later = torch.rand(2, SAMPLES, generator=torch.Generator().manual_seed(1)), torch.zeros(2, SAMPLES)
-    options = PerturbedRollouts(candidates=32)
-
-    def chosen(goal: State) -> list[int]:
-        given = options, model, toy.GoalDisc(goal=(9.0, 9.0)), state, goal, scores, actions, later
-        return sequential_halving(*given, toy.generators(0, 1)).tolist()
-
-    shared = state.map(lambda field: field.unsqueeze(1))
+    options = PerturbedRollouts(candidates=32, rounds=3, reduction_factor=4)
+    chosen = partial(halving, options, state, scores=scores, actions=actions, later=later)
+    shared = goal_at(state)
     own = shared.map(lambda field: field.expand(-1, SAMPLES, *field.shape[2:]).clone())
-    assert chosen(own) == chosen(shared)
+    assert chosen(goal=own) == chosen(goal=shared)
     # One candidate of each scene ends exactly at its own goal, and all others a metre away from theirs.
     lucky = scores.topk(32).indices[:, 20]
     moves = 0.1 * actions[..., 2:].sum(-2)  # what f predicts
     own.centers[..., :2] = moves.unsqueeze(-2) + 1.0
     own.centers[[0, 1], lucky, :, :2] -= 1.0
-    assert chosen(own) == lucky.tolist()
+    assert chosen(goal=own) == lucky.tolist()
 
 
-def test_without_a_goal_failures_and_the_later_cost_decide(toy: SimpleNamespace) -> None:
-    state, model = ones(1), toy.PointMass()
+def test_without_a_goal_failures_and_the_later_cost_decide() -> None:
     actions = torch.zeros(1, 3, 1, 4)
     actions[0, :, 0, 3] = torch.tensor([-1.0, 0.0, 0.0])  # the first one fails
     later = torch.tensor([[-0.2, 0.0, -0.05]])
-
-    def chosen(cost: float) -> int:
+    tensors: Any = {"scores": -later, "goal": None, "actions": actions, "later": later}
+    for cost, chosen in ((0.0, 0), (0.1, 0), (0.3, 2)):
         options = PerturbedRollouts(candidates=3, failure_cost=cost)
-        given = options, model, toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=-0.01), state, None, -later, actions
-        return int(sequential_halving(*given, later, toy.generators(0)))
-
-    assert [chosen(cost) for cost in (0.0, 0.1, 0.3)] == [0, 0, 2]
+        assert halving(options, two_objects(1), -0.01, **tensors) == [chosen]

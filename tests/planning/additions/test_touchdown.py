@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from cavin_pyro.data.observed import observed_points
 from cavin_pyro.envs.pushing import PushingEnv
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner, CvaeMpcPlanner, SectarPlanner
-from cavin_pyro.planning.additions.touchdown import ObservedPoints, prefer_free
+from cavin_pyro.planning.additions import ObservedPoints, Touchdown
 
 LOW, HIGH = torch.tensor([[0.0, -1.0]]), torch.tensor([[1.0, 1.0]])  # metres
 
@@ -40,9 +41,9 @@ def test_infinite_points_stand_for_none_among_many() -> None:
 def test_a_blocked_motion_loses_unless_all_are_blocked() -> None:
     scores = torch.tensor([[3.0, 2.0, 1.0]])
     first = pushes((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0))
-    assert prefer_free(scores, first, seen((0.5, 0.0)), 0.02).tolist() == [[-torch.inf, 2.0, 1.0]]
+    assert Touchdown(0.02).leave_out(scores, first, seen((0.5, 0.0))).tolist() == [[-torch.inf, 2.0, 1.0]]
     everywhere = seen((0.5, 0.0), (0.75, 0.0), (0.25, 0.0))
-    assert torch.equal(prefer_free(scores, first, everywhere, 0.02), scores)
+    assert torch.equal(Touchdown(0.02).leave_out(scores, first, everywhere), scores)
 
 
 class Scattered:
@@ -53,7 +54,7 @@ class Scattered:
         return torch.cat([starts, actions[..., 2:]], -1)
 
 
-def planners(toy: SimpleNamespace, distance: float) -> list[CavinPlanner | CvaeMpcPlanner | SectarPlanner]:
+def planners(toy: SimpleNamespace, *additions: Touchdown) -> list[CavinPlanner | CvaeMpcPlanner | SectarPlanner]:
     class Cascade(toy.PointMass, Scattered):
         def actions(self, state: State, effect_code: torch.Tensor, motion_code: torch.Tensor) -> torch.Tensor:
             return self.spread(super().actions(state, effect_code, motion_code), motion_code)
@@ -62,47 +63,37 @@ def planners(toy: SimpleNamespace, distance: float) -> list[CavinPlanner | CvaeM
         def actions(self, state: State, *, motion_code: torch.Tensor) -> torch.Tensor:
             return self.spread(super().actions(state, motion_code=motion_code), motion_code[..., 8:])
 
-    class Single(Scattered):
-        segment_length, effect_dimension = 3, 16
-        effect_prior, subgoal, next_state = (
-            getattr(toy.PointMass(), name) for name in ("effect_prior", "subgoal", "next_state")
-        )
-
+    class Single(toy.Single, Scattered):
         def actions(self, state: State, effect_code: torch.Tensor) -> torch.Tensor:
-            whole = toy.PointMass().actions(state, effect_code, torch.zeros_like(effect_code))
-            return self.spread(whole, effect_code[..., 8:])
+            return self.spread(super().actions(state, effect_code), effect_code[..., 8:])
 
-    reward, options = toy.GoalDisc(goal=(0.2, 0.0)), {"samples": 128, "horizon": 6, "touchdown_distance": distance}
-    return [
-        CavinPlanner(Cascade(), reward, **options),
-        CvaeMpcPlanner(Flat(), reward, **options),
-        SectarPlanner(Single(), reward, **options),
-    ]
+    options: dict = {"samples": 128, "horizon": 6, "additions": [*additions, "perturbed_rollouts"]}
+    return [CavinPlanner(Cascade(), **options), CvaeMpcPlanner(Flat(), **options), SectarPlanner(Single(), **options)]
 
 
 def test_no_planner_begins_on_an_object(toy: SimpleNamespace) -> None:
     points = torch.cartesian_prod(torch.linspace(0.2, 0.8, 61), torch.linspace(-0.6, 0.6, 121)).unsqueeze(0)
     table = ObservedPoints(points, LOW, HIGH)
-    state = toy.scenes([[(0.0, 0.0)]])
-    for careful, careless in zip(planners(toy, 0.02), planners(toy, 0.0), strict=True):
-        blocked = [
-            [
-                table.blocked(planner.plan(state, toy.generators(seed), table).actions[:, :1], 0.02).item()
-                for seed in range(16)
-            ]
+    state, reward = toy.scenes([[(0.0, 0.0)]] * 16), toy.GoalDisc(goal=(0.2, 0.0))
+    tables = ObservedPoints(*(field.expand(16, *field.shape[1:]) for field in table))
+    for careful, careless in zip(planners(toy, Touchdown(0.02)), planners(toy), strict=True):
+        plans = [
+            planner.plan(state, reward=reward, generators=toy.generators(*range(16)), observed=tables)
             for planner in (careful, careless)
         ]
-        assert not any(blocked[0])
-        assert any(blocked[1])
+        blocked = [tables.blocked(plan.actions[:, :1], 0.02) for plan in plans]
+        assert not blocked[0].any()
+        assert blocked[1].any()
 
 
 def test_each_environment_has_its_own_points(toy: SimpleNamespace) -> None:
-    planner, scene = planners(toy, 0.05)[0], toy.scenes([[(0.0, 0.0)]])
-    wanted = planner.plan(scene, toy.generators(0)).actions[0, 0, :2].tolist()
+    planner, scene = planners(toy, Touchdown(0.05))[0], toy.scenes([[(0.0, 0.0)]])
+    plan = partial(planner.plan, reward=toy.GoalDisc(goal=(0.2, 0.0)))
+    wanted = plan(scene, generators=toy.generators(0)).actions[0, 0, :2].tolist()
     apart = [seen(((wanted[0] + 1.0) / 2.0, wanted[1])), seen((9.0, 9.0))]
     both = ObservedPoints(*(torch.cat(fields) for fields in zip(*apart, strict=True)))
-    together = planner.plan(toy.scenes([[(0.0, 0.0)], [(0.0, 0.0)]]), toy.generators(0, 0), both).actions
-    alone = [planner.plan(scene, toy.generators(0), one).actions for one in apart]
+    together = plan(toy.scenes([[(0.0, 0.0)]] * 2), generators=toy.generators(0, 0), observed=both).actions
+    alone = [plan(scene, generators=toy.generators(0), observed=one).actions for one in apart]
     assert torch.equal(together, torch.cat(alone))
     assert alone[0][0, 0, :2].tolist() != wanted == alone[1][0, 0, :2].tolist()
 

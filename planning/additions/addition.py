@@ -1,0 +1,74 @@
+"""The interface of additions to Algorithm 1: five hooks and a flag, all of which change nothing by default."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+from torch import Tensor
+
+from cavin_pyro.models.state import State
+from cavin_pyro.planning.protocol import Objective, Plan, Scene
+from cavin_pyro.planning.returns import SubgoalDistance
+from cavin_pyro.planning.rollout import Candidates, Focus
+
+
+class ChosenEffect(NamedTuple):
+    """The effect plan of line 7, which the motions of lines 8 to 10 follow."""
+
+    subgoals: State  # [B, K, M, .]
+    segments: Tensor  # [B] int64, 1..K: segments until the effect plan ends
+    succeeded: Tensor  # [B] bool: it reaches the goal
+
+
+class Choice(NamedTuple):
+    """Candidates whose first actions are known: motions at line 10, or the plans of a baseline."""
+
+    scene: Scene
+    model: Any  # `cavin_pyro.planning.protocol.TransitionModel`
+    candidates: Candidates  # [B, N]
+    first_actions: Callable[[], Tensor]  # [B, N, T, A], of the first segment
+    effect: ChosenEffect | None = None  # which motions follow; None for the plans of a baseline
+    distance: SubgoalDistance = SubgoalDistance()  # of motions to its subgoals
+    subgoals: State | None = None  # [B, N], the first subgoal of each plan of a baseline
+
+
+class Addition:
+    """What can be added to Algorithm 1 and to the baselines. A subclass overrides the hooks that it needs.
+
+    `planner.additions=[...]` lists additions. Ours act in the order of `ADDITIONS`, the user's own before them.
+    """
+
+    stops_early: ClassVar[bool] = False  # a search by reward may stop when no candidate can become the best
+    for_one_push: ClassVar[bool] = False  # only for callers that plan again after each push
+    for_motions: ClassVar[bool] = False  # only for motions that follow an effect, which baselines do not have
+
+    def focus(self, focus: Focus, scene: Scene) -> Focus:
+        """The objects that codes, subgoals and actions are about (lines 5, 6, 8 and 9); f predicts all."""
+        return focus
+
+    def wrap_objective(self, objective: Objective, scene: Scene, effect: ChosenEffect | None) -> Objective:
+        """The objective of a search: the cumulative reward (line 7), or with `effect` the tracking cost (line 10)."""
+        return objective
+
+    def subgoal_distance(self, distance: SubgoalDistance, scene: Scene, segments: int) -> SubgoalDistance:
+        """The distance to subgoals, for motions of so many segments (line 10)."""
+        return distance
+
+    def rank(self, scores: Tensor, choice: Choice) -> Tensor:
+        """Scores `[B, N]`, of which the highest is chosen; -inf leaves a candidate out (line 10)."""
+        return scores
+
+    def revise(
+        self, plan: Plan, *, scene: Scene, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
+    ) -> Plan:
+        """The plan that is executed (line 11).
+
+        Args:
+            effects: `[B, N]`, of which `chosen: [B]` int64 are the plan's. plan_motions: lines 8 to 11 for other ones,
+                `plan_motions(effects, chosen)`; it advances the generators.
+        """
+        return plan
+
+
+HOOKS = ("focus", "wrap_objective", "subgoal_distance", "rank", "revise")
