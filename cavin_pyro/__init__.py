@@ -13,16 +13,21 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cavin_pyro.evaluation.comparison import compare
     from cavin_pyro.evaluation.evaluation import evaluate
+    from cavin_pyro.evaluation.factory import make_env, make_planner
+    from cavin_pyro.evaluation.rollout import rollout
     from cavin_pyro.storage.checkpoint import load, save
     from cavin_pyro.training.run import fit
 
 __version__ = "0.2.0"
-__all__ = ["compare", "evaluate", "fit", "load", "save"]
+__all__ = ["compare", "evaluate", "fit", "load", "make_env", "make_planner", "rollout", "save"]
 _HOMES = {
     "compare": "evaluation.comparison",
     "evaluate": "evaluation.evaluation",
     "fit": "training.run",
     "load": "storage.checkpoint",
+    "make_env": "evaluation.factory",
+    "make_planner": "evaluation.factory",
+    "rollout": "evaluation.rollout",
     "save": "storage.checkpoint",
 }
 

@@ -166,8 +166,11 @@ def describe(*, model: Model, guide: Guide | None = None, geometry: Geometry | N
     """The sections `model`, `guide` and `geometry`, from which the same parts can be built.
 
     Raises:
-        UserError: a part has an argument that no file can hold, or is of a class that no other program can import.
+        UserError: a part has an argument that no file can hold, or is of a class that no other program can import; or
+            the guide is another model's.
     """
+    if guide is not None and guide.model is not model:
+        raise UserError("the guide was built for another model: give guide.model, or build a guide for this one")
     parts = {"model": model, "guide": guide, "geometry": geometry}
     return {name: _described(part, name, model) for name, part in parts.items() if part is not None}
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import pyro
@@ -15,13 +14,13 @@ import torch
 from omegaconf import DictConfig
 
 from cavin_pyro.config.commands import CHECKPOINTS
+from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import choose_device, keep_freed_memory, set_matmul_precision
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import About, check_value
 from cavin_pyro.config.parts import check_sizes, class_of, construct
 from cavin_pyro.config.world import object_ranges, part_of, task_of
 from cavin_pyro.envs.layouts import GENERATED
-from cavin_pyro.envs.objects.sampling import NoRoomError
 from cavin_pyro.envs.pushing import PushingEnv
 from cavin_pyro.envs.tasks import GeneratedLayouts, Task, TaskReward
 from cavin_pyro.envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
@@ -31,7 +30,6 @@ from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Planner
 from cavin_pyro.planning.additions import ADDITIONS, Addition
 from cavin_pyro.planning.backends import GRAPHS
-from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
 from cavin_pyro.planning.optimizers import Shooting
 from cavin_pyro.planning.searching import SearchingPlanner
 from cavin_pyro.storage.checkpoint import load
@@ -60,26 +58,14 @@ class EpisodeRunner:
         return self.env.task
 
     def rollout(self, seed: int, **options: Any) -> Episode:
-        """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`.
-
-        Raises:
-            UserError: an optimizer of the user's own breaks the interface of optimizers, the model predicts nothing
-                finite, or the scene of this seed has no room for its objects.
-        """
-        parts = self.env, self.planner, self.geometry
+        """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`."""
         usual = {
             "pushes_per_plan": self.pushes_per_plan,
             "push_decimals": self.push_decimals,
             "reward": self.reward,
             "device": self.device,
         }
-        options = usual | options
-        try:
-            return rollout(*parts, seed=seed, **options)
-        except (OptimizerError, NoFiniteCandidateError) as error:
-            raise UserError(str(error)) from error
-        except NoRoomError as error:
-            raise UserError(f"seed={seed}: {error}") from error
+        return rollout(self.env, self.planner, self.geometry, seed=seed, **(usual | options))
 
 
 def check_options(config: DictConfig, device: torch.device) -> None:
@@ -128,12 +114,20 @@ def announce_objects(config: DictConfig) -> None:
         )
 
 
-def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
-    """Build the environment from the options of the task and the section `env`.
+def make_env(config: DictConfig | None = None, *, render: bool = False, **options: Any) -> PushingEnv:
+    """Build an environment as the command `plan` does.
+
+    env = cavin_pyro.make_env(task="crossing", reward="sparse", objects=3, env={"camera": "kinect2"})
+
+    Args:
+        config: of a command; by default that of `options`, which are the command's options of the task and the world:
+            `task`, `layout`, `reward`, `objects`, `maximum_steps`, `env` and others.
+        render: whether `env.render()` makes pictures, as `rollout(..., photograph=True)` needs them.
 
     Raises:
         UserError: an unknown task, layout or object, or a part of the world that lacks files.
     """
+    config = compose("plan", **options) if config is None else config
     task, tiles = task_of(config)
     with user_input():
         return PushingEnv(
@@ -155,31 +149,53 @@ def make_environment(config: DictConfig, *, render: bool = False) -> PushingEnv:
         )
 
 
-def make_planner(config: DictConfig, device: torch.device) -> tuple[Planner, Geometry]:
-    """Build the planner with the checkpoint's model, and the geometric features of the checkpoint.
+def make_planner(
+    model: Model | None,
+    planner: str | Mapping[str, Any] = "cavin",
+    *,
+    pushes_per_plan: int | None = 1,
+    device: str = "cpu",
+    seed: int = 0,
+    **options: Any,
+) -> Planner:
+    """Build a planner as the command `plan` does.
+
+    planner = cavin_pyro.make_planner(cavin_pyro.load("contact").model, "cavin", samples=256, horizon=30)
+
+    Validation of distributions is switched off in this process, as it takes a good part of a plan's time.
 
     Args:
-        device: of the model. The geometric features stay on the CPU, so that states are the same for every device.
+        model: with which it predicts; it is moved to `device`. None for `random`, which predicts nothing.
+        planner: a choice of the option `planner`, or a section with `_target_`, a class of one's own.
+        pushes_per_plan: as `rollout` executes them. seed: of what a planner's class samples when it is built.
+        options: of the planner, such as `samples`, `horizon`, `optimizer`; `plan --help=all` lists them as `planner.*`.
 
     Raises:
-        UserError: a checkpoint that cannot be used, or a planner that refuses its options.
+        UserError: an unknown planner or option, or a model that lacks what the planner needs.
     """
-    checkpoint = load(config.checkpoint, trust=list(config.trust))
-    geometry = checkpoint.geometry
+    given = {f"planner.{name}": value for name, value in options.items()}
+    shared = {"pushes_per_plan": pushes_per_plan, "device": device, "seed": seed}
+    config = compose("plan", planner=planner, **shared, **given)
+    return planner_of(config, model, choose_device(config.device))
+
+
+def planner_of(config: DictConfig, model: Model | None, device: torch.device) -> Planner:
+    """The planner of a configuration; for `model` and errors see `make_planner`."""
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free"):
         with user_input("planner"):
-            return construct(options), geometry
-    pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
-    model = checkpoint.model.to(device)
-    _check_planner(options, model, checkpoint.path)
+            return construct(options)
+    if model is None:
+        raise UserError(f"{planner_name(config)} needs a model: give one, or choose planner=random")
+    pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
+    _check_planner(options, model.to(device))
     if options.get("compile") is True and device.type == "cuda":
         options["compile"] = GRAPHS
     torch.manual_seed(config.seed)
     optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
     with user_input("planner"):
-        return construct(options, model=model, additions=additions, **optimizers), geometry
+        return construct(options, model=model, additions=additions, **optimizers)
 
 
 @user_input("planner", "checkpoint", "task", "tiles", "env", "layout", "generated", "pushes_per_plan")
@@ -187,17 +203,19 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     """Build an environment and a planner, and run episodes with them.
 
     Raises:
-        UserError: as `check_options`, `make_environment` and `make_planner`, or a layout without room for the objects.
+        UserError: as `check_options`, `load`, `make_env` and `make_planner`, or a layout without room for the objects.
     """
     device = choose_device(config.device)
     check_options(config, device)
     set_matmul_precision(config.matmul_precision)
     keep_freed_memory()
-    env = make_environment(config, render=render)
+    env = make_env(config, render=render)
     try:
         with user_input():
             reward = episode_rewards(env.tasks, reward=config.reward, margin=config.margin, device=device)
-        planner, geometry = make_planner(config, device)
+        trained = load(config.checkpoint, trust=list(config.trust))
+        geometry = trained.geometry  # on the CPU, so that states are the same for every device
+        planner = planner_of(config, None if config.planner.model_free else trained.model, device)
         if config.pushes_per_plan is not None:
             check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
@@ -271,7 +289,7 @@ def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
     return built
 
 
-def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
+def _check_planner(options: dict[str, Any], model: Model) -> None:
     """Make sure that the model has what the planner asks for, and no code that the planner would not choose.
 
     Raises:
@@ -288,6 +306,6 @@ def _check_planner(options: dict[str, Any], model: Model, path: Path) -> None:
         fitting = "|".join(name for name, (model_name, _) in CHECKPOINTS.items() if model_name == wanted)
         choice = f"choose checkpoint={fitting}, or " if fitting else "choose "
         raise UserError(
-            f"{planner.__name__} needs a checkpoint of model={wanted}, but {path} holds {type(model).__name__}, "
+            f"{planner.__name__} needs a checkpoint of model={wanted}, not {type(model).__name__}, "
             f"which {violation}: {choice}planner=random, which takes any"
         )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -12,13 +13,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavin_pyro.config.commands import PlanConfig
+from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_points, observed_state
+from cavin_pyro.envs.objects.sampling import NoRoomError
 from cavin_pyro.envs.pushing import ObservationDict, PushingEnv
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.tasks import Task, TaskReward
 from cavin_pyro.envs.workspace import PUSH_DECIMALS, executed_push
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Plan, Planner
+from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
 from cavin_pyro.planning.protocol import Reward
 from cavin_pyro.planning.records import apply
 
@@ -143,8 +148,8 @@ def rollout(
     geometry: Geometry,
     *,
     seed: int,
-    reward: Callable[[Task], Reward] = TaskReward,
-    pushes_per_plan: int | None = None,
+    reward: Callable[[Task], Reward] | None = None,
+    pushes_per_plan: int | None = 1,
     push_decimals: int | None = PUSH_DECIMALS,
     photograph: bool = False,
     callbacks: Sequence[EpisodeCallback] = (),
@@ -152,9 +157,16 @@ def rollout(
 ) -> Episode:
     """Run one episode from depth images, which the environment segments.
 
+    trained, env = cavin_pyro.load("contact"), cavin_pyro.make_env(task="crossing")
+    episode = cavin_pyro.rollout(env, cavin_pyro.make_planner(trained.model), trained.geometry, seed=1)
+    print(episode.outcome, len(episode.transitions))
+
     Args:
+        env: as `make_env` makes it. planner: as `make_planner`, or with its method `plan`.
+        geometry: which makes the features of the model's states; with `planner=random`, any.
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
-        reward: by which plans are made, from the episode's task; by default sparse and without a margin.
+        reward: by which plans are made, from the episode's task; by default of the environment's kind, with
+            the margin that `plan` has by default.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
             planner with the addition `first_push` is for 1.
         push_decimals: to which planned pushes are rounded (`executed_push`), so that an episode does not
@@ -164,14 +176,18 @@ def rollout(
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
 
     Raises:
-        NoRoomError: the layout has no room for the objects.
-        NoFiniteCandidateError: the planner found no plan with finite numbers.
+        UserError: the layout has no room for the objects, the planner found no plan with finite numbers, or an
+            optimizer of the user's own breaks the interface of optimizers.
         RuntimeError: the robot stands in the camera's view.
     """
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.scene.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
-    observation, _ = env.reset(seed=seed)
+    with _refusals(seed):
+        observation, _ = env.reset(seed=seed)
+    if reward is None:
+        kind = "dense" if env.reward.dense else "sparse"
+        reward = partial(TaskReward, reward=kind, margin=PlanConfig.margin, device=device)
     task_reward = reward(env.task)
     for callback in callbacks:
         callback.on_observation(observation)
@@ -180,7 +196,8 @@ def rollout(
         began = time.perf_counter()
         state = observed_state(observation, geometry, device)
         points = observed_points(observation, device)
-        plan = planner.plan(state, reward=task_reward, generators=[generator], observed=points)
+        with _refusals(seed):
+            plan = planner.plan(state, reward=task_reward, generators=[generator], observed=points)
         plan = apply(plan, lambda field: field.cpu())
         record = PlanRecord(
             step=len(episode.transitions),
@@ -222,6 +239,17 @@ def rollout(
     for callback in callbacks:
         callback.on_end(episode)
     return episode
+
+
+@contextmanager
+def _refusals(seed: int) -> Iterator[None]:
+    """What is wrong with a scene or an optimizer, as a `UserError`."""
+    try:
+        yield
+    except (OptimizerError, NoFiniteCandidateError) as error:
+        raise UserError(str(error)) from error
+    except NoRoomError as error:
+        raise UserError(f"seed={seed}: {error}") from error
 
 
 def _call_on_frame(callbacks: Sequence[EpisodeCallback]) -> None:

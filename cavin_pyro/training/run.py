@@ -56,7 +56,6 @@ def train(config: DictConfig) -> Trainer:
     Raises:
         UserError: a configuration or data that cannot be used, or a loss that is not finite.
     """
-    pyro.settings.set(module_local_params=True, **UNVALIDATED)
     with output_folder(config.output) as folder:
         return _train(config, folder)
 

@@ -48,7 +48,8 @@ NOT_RUN = {  # a part of a command, and why it does not run here
 }
 MADE = ("runs/train", "runs/pretrain", "data/pushes")  # by the README's commands
 SHORTER = {  # in blocks of Python
-    '"objects=3"': '"objects=3", "planner.samples=16", "maximum_steps=2"',
+    "episodes=20, workers=1": 'episodes=1, workers=1, maximum_steps=1, **{"planner.samples": 8}',
+    "steps=2000": "steps=2, batch_size=8",
     "samples=1024": "samples=16",
     "objects=3)": "objects=3, maximum_steps=2)",
     "num_samples=500": "num_samples=20",

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import cavin_pyro
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.pushing import PushingEnv
@@ -22,11 +24,12 @@ from cavin_pyro.evaluation.rollout import (
     EpisodeCallback,
     PlanRecord,
     Transition,
-    rollout,
 )
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import CavinPlanner, Plan, RandomPlanner
 from cavin_pyro.storage.checkpoint import save
+
+rollout = partial(cavin_pyro.rollout, pushes_per_plan=None)  # executes all T pushes of a plan
 
 
 @pytest.fixture

@@ -76,6 +76,8 @@ def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: P
     ):
         with pytest.raises(UserError, match=said):
             save(tmp_path / "a.safetensors", model=model)
+    with pytest.raises(UserError, match="^the guide was built for another model"):
+        save(tmp_path / "a.safetensors", model=CascadedModel(), guide=CascadedGuide(CascadedModel()))
     assert not list(tmp_path.iterdir())
 
 
