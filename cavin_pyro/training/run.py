@@ -163,7 +163,6 @@ def fit(
             check_same_run(folder, stored, ignore=free(options.schedule))
             if "data" in record:
                 check_same_data(folder, record["data"])
-            stored = write_config(folder, stored)
 
         def keep(step: int, row: dict[str, float]) -> None:
             best.update({name: value.clone() for name, value in programs.state_dict().items()})
@@ -174,7 +173,9 @@ def fit(
         run = Trainer(model, guide, objective, windows, folder, keep, options, seed=seed, mirror_signs=signs)
         run.resume()
         if run.step > options.steps:
-            raise UserError(f"{folder} holds {run.step} steps, not {options.steps}: give more, or another output=DIR")
+            raise UserError(f"{folder} holds a run of {run.step} steps: give trainer.steps= at least as many")
+        if output is not None:
+            stored = write_config(folder, stored)
         if run.rows:
             _keep_best(run, path, keep)
             best.update({name: value for name, value in load_file(path).items() if name in programs.state_dict()})

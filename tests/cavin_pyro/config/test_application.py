@@ -217,3 +217,26 @@ def test_a_reader_that_stops_early_ends_a_command_silently() -> None:
     done = subprocess.run(line, cwd=ROOT, env=env, stdout=writing, stderr=subprocess.PIPE, text=True)
     os.close(writing)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
+
+
+@pytest.mark.parametrize(
+    ("flags", "program", "status", "said"),
+    [
+        (
+            "",
+            "from cavin_pyro.config.application import guarded; guarded(lambda: __import__('slow'))",
+            130,
+            "interrupted",
+        ),
+        ("-OO", "import cavin_pyro.plan as plan; plan.main()", 2, "PYTHONOPTIMIZE=2"),
+    ],
+)
+def test_neither_an_interrupted_import_nor_stripped_docstrings_end_in_a_traceback(
+    flags: str, program: str, status: int, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "slow.py").write_text(
+        "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\nfinally:\n    raise ImportError"
+    )
+    command = [sys.executable, *flags.split(), "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == status and done.stderr.startswith(f"error: {said}") and done.stderr.count("\n") == 1
