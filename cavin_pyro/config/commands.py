@@ -21,6 +21,7 @@ CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of
 }
 DEFAULT_CHECKPOINT = "cavin"
 CALIBRATED = ("guide", "scales")
+SECTIONS = ("elbo", "guide", "prior", "predictive", "intervals", "subgoals")  # of the report of check
 COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of an episode
 ENV = {name: one.default for name, one in inspect.signature(PushingEnv).parameters.items()}
 GENERATED, RANGES = GeneratedLayouts(), ObjectRanges()
@@ -99,7 +100,7 @@ class CollectionOptions:
     checkpoint: str | None = option(None, "checkpoint for policy=model, by name or path; by default contact")
     motions: int = option(256, "motions sampled for each effect, for policy=model", minimum=1)
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1)
-    maximum_objects: int = option(OBJECT_SLOTS, f"objects, at most; files have room for {OBJECT_SLOTS}, or for more")
+    maximum_objects: int = option(OBJECT_SLOTS, "objects, at most", minimum=1, maximum=MAXIMUM_OBJECTS)
     episodes_per_shard: int = option(50, "episodes per file, the unit of resuming", minimum=1, maximum=10_000)
 
 
@@ -207,7 +208,7 @@ class CheckConfig:
     output: str | None = option(None, FOLDER)
     seed: int = seed_option()
     windows: int = option(1000, "held-out windows, and as many training windows", minimum=1)
-    sections: Any = option(None, "sections of the report, [elbo,subgoals]; by default all")
+    sections: list[str] | None = option(None, "sections of the report; by default all", choices=SECTIONS)
     export: str | None = option(None, "file.nc for samples of prior, guide and predictions, which ArviZ reads")
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
@@ -220,7 +221,7 @@ class CalibrateConfig(DeviceOptions):
     defaults: list[Any] = preset_defaults("")
     checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
     trust: list[str] = option([], TRUST)
-    parts: list[str] = option(["guide"], f"what to calibrate, {' or '.join(CALIBRATED)} or both: parts=[guide,scales]")
+    parts: list[str] = option(["guide"], "what to calibrate", choices=CALIBRATED)
     data: Any = option("data/pushes", f"{DATA}; the model's training data")
     output: str | None = option(None, "folder for the checkpoint; by default one in runs/")
     seed: int = seed_option()
@@ -294,7 +295,7 @@ class PlanConfig(EpisodeConfig):
     output: str | None = option(None, "folder for the results; by default one in runs/")
     video: bool = option(True, "write a video of the episode")
     save_goal: str | None = option(None, "file for the last scene, a goal for task=rearrange: .png or .safetensors")
-    viewer: str | None = option(None, "rerun writes a recording in 3D, episode.rrd, and needs the extra .[viewer]")
+    viewer: str | None = option(None, "recording in 3D, episode.rrd, by the extra .[viewer]", choices=("rerun",))
 
 
 @dataclass

@@ -18,7 +18,7 @@ from types import UnionType
 from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
-from omegaconf import BooleanNode, FloatNode, IntegerNode, OmegaConf, StringNode, ValueNode
+from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, OmegaConf, StringNode, ValueNode
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError
@@ -235,6 +235,8 @@ def _part_of(default: Any) -> Any:
 
 def _node_of(value: Any, annotation: Any) -> Any:
     """A value that may be replaced by those of its type; other types than plain ones are left to the class."""
+    if isinstance(value, dict):  # a part, whose place nothing but another part, or null, can take
+        return DictConfig(value, ref_type=dict[str, Any], element_type=Any, key_type=str)
     union = get_origin(annotation) in (Union, UnionType)
     inner = [part for part in get_args(annotation) if part is not type(None)] if union else [annotation]
     if len(inner) != 1 or inner[0] not in NODES:

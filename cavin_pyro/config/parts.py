@@ -90,23 +90,20 @@ def build_model(config: Config) -> Model:
     sizes = dict(config["model"])
     own_prior = sizes.pop("prior", None) or {}
     check_sizes("model", sizes)
-    try:
-        of_model = bool(own_prior.get("_target_"))
-        parts = {
-            f"{kind}_prior": build_part(
-                "model.prior" if of_model else "prior",
-                own_prior if of_model else config["prior"],
-                dimension=sizes[f"{kind}_dimension"],
-                feature_dimension=sizes["feature_dimension"],
-                effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
-            )
-            for kind in ("effect", "motion")
-            if f"{kind}_dimension" in sizes
-        }
-        given = {"feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
-        dynamics = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
-    except KeyError as error:
-        raise UserError(f"the configuration of the model lacks {error}") from error
+    of_model = bool(own_prior.get("_target_"))
+    parts = {
+        f"{kind}_prior": build_part(
+            "model.prior" if of_model else "prior",
+            own_prior if of_model else config["prior"],
+            dimension=sizes[f"{kind}_dimension"],
+            feature_dimension=sizes["feature_dimension"],
+            effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
+        )
+        for kind in ("effect", "motion")
+        if f"{kind}_dimension" in sizes
+    }
+    given = {"feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
+    dynamics = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
     scales = build_part("scales", config.get("scales") or FIXED_SCALES)
     model = _checked_model(build_part("model", sizes, **parts, scales=scales, dynamics=dynamics))
     if not parts and config["prior"]["_target_"] != STANDARD_PRIOR:

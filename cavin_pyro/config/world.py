@@ -10,14 +10,12 @@ from typing import Any
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.config.errors import UserError, one_line, user_input
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import construct
 from cavin_pyro.envs.layouts import task_class
-from cavin_pyro.envs.objects.object_sets import ObjectSet, chosen, load_object_set, plain_name
+from cavin_pyro.envs.objects.object_sets import chosen, load_object_set, plain_name
 from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.robots import Robot, robot_factory
-from cavin_pyro.envs.segmentation import Segmenter
-from cavin_pyro.envs.sensors import DepthSensor
+from cavin_pyro.envs.robots import robot_factory
 from cavin_pyro.envs.tasks import Task
 
 LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
@@ -26,7 +24,6 @@ LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes t
     "friction": (0.001, 10.0),
     "kilograms": (0.001, 1000.0),
 }
-PROTOCOLS: dict[str, type] = {"robot": Robot, "objects": ObjectSet, "camera": DepthSensor, "segmentation": Segmenter}
 Named = str | Mapping[str, Any] | DictConfig
 """The value of an option: a name of ours, or a section with `_target_`, a class of the user's, and its options."""
 
@@ -37,17 +34,13 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
     A class that is not there, or that is no task, is a `UserError`.
     """
     tiles: Any = OmegaConf.to_container(config.tiles)
-    if isinstance(config.task, str):
-        with user_input():
+    with user_input("task"):
+        if isinstance(config.task, str):
             return task_class(config.task), tiles
-    section: Any = OmegaConf.to_container(config.task)
-    target = section.pop("_target_", None)
-    try:
-        kind = get_class(target)
+        section: Any = OmegaConf.to_container(config.task)
+        kind = get_class(section.pop("_target_"))
         if not issubclass(kind, Task):
-            raise TypeError("derive it from cavin_pyro.envs.tasks.Task")
-    except Exception as error:
-        raise UserError(f"task._target_={target} is no task: {one_line(error)}") from error
+            raise ValueError(f"{kind.__name__} is no task: derive it from cavin_pyro.envs.tasks.Task")
     return kind, tiles | {name: value for name, value in section.items() if value is not None}
 
 
@@ -87,21 +80,10 @@ def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:
     Raises:
         UserError: an unknown name, missing files, or a class that cannot be built or is no such part.
     """
-    made: Any = value if isinstance(value, str) else partial(_made, f"env.{name}", dict(value), PROTOCOLS[name])
-    if name in ("objects", "camera") and not isinstance(made, str):
-        made = made()
-    with user_input():
+    made: Any = value if isinstance(value, str) else partial(construct, dict(value))
+    with user_input(f"env.{name}"):
+        if name in ("objects", "camera") and not isinstance(made, str):
+            made = made()
         if name == "robot":
             return robot_factory(made, assets)
         return load_object_set(made, assets) if name == "objects" else made
-
-
-def _made(name: str, section: Mapping[str, Any], protocol: type, *arguments: Any) -> Any:
-    with user_input(name):
-        made = construct(section, *arguments)
-    wanted = [member for member in {**vars(protocol), **protocol.__annotations__} if not member.startswith("_")]
-    if lacking := [member for member in wanted if not hasattr(made, member)]:
-        raise UserError(
-            f"{name}._target_={section['_target_']} is no {protocol.__name__}: it lacks {', '.join(lacking)}"
-        )
-    return made

@@ -63,7 +63,7 @@ def train(config: DictConfig) -> Trainer:
 def _train(config: DictConfig, folder: Path) -> Trainer:
     device = choose_device(config.device)
     config.device = device.type
-    selection = _chosen_windows(config)
+    selection = configured(WindowConfig, config.windows, "windows")
     torch.manual_seed(config.seed)
     model = build_model(config)
     guide = build_guide(config, model)
@@ -267,26 +267,6 @@ def train_only(names: Sequence[str], model: Model, guide: Guide) -> None:
             raise UserError(f"trained has {name!r}, which is no part of this model: choose from {', '.join(parts)}")
     for name, part in parts.items():
         part.requires_grad_(not names or name in names)
-
-
-def _chosen_windows(config: DictConfig) -> WindowConfig:
-    """The section `windows`, with which there can be windows to train on and to validate with.
-
-    Raises:
-        UserError: there can be none, however many transitions are collected.
-    """
-    chosen = configured(WindowConfig, config.windows, "windows")
-    if not 0 < chosen.validation_fraction < 1:
-        raise UserError(
-            f"windows.validation_fraction must be strictly between 0 and 1, not {chosen.validation_fraction:g}: "
-            "training and validation both need episodes"
-        )
-    if chosen.minimum_move >= chosen.maximum_move:
-        raise UserError(
-            f"windows.minimum_move must be below windows.maximum_move={chosen.maximum_move:g} metres, not "
-            f"{chosen.minimum_move:g}"
-        )
-    return chosen
 
 
 def _mirror_signs(reflect: bool, geometry: Geometry | None, guide: Guide) -> Tensor | None:

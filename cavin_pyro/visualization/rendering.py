@@ -72,10 +72,8 @@ def check_viewer(viewer: object) -> None:
     """Check the option `viewer`, before anything is written.
 
     Raises:
-        UserError: unknown viewer, or its package is not installed.
+        UserError: its package is not installed.
     """
-    if viewer not in (None, "rerun"):
-        raise UserError(f"unknown viewer {viewer!r}: choose rerun, or null for none")
     if viewer is not None and importlib.util.find_spec("rerun") is None:
         raise UserError(
             f"viewer={viewer} needs an optional part that is not installed: "

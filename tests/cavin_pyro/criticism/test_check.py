@@ -160,10 +160,9 @@ def test_sections_are_chosen_by_name_and_run_in_the_reports_order(monkeypatch: p
     monkeypatch.setattr(sections, "SECTIONS", {"one": None, "two": None, "three": None})
     assert sections.choose_sections(None, {}) == ["one", "two", "three"]
     assert sections.choose_sections(["three", "one"], {}) == ["one", "three"]
-    assert sections.choose_sections("two", {"one": {"scenes": 0}}) == ["two"]
-    for names, said in ((["one", "four"], "unknown section 'four': choose from one, two, three"), ([], "at least one")):
-        with pytest.raises(UserError, match=said):
-            sections.choose_sections(names, {})
+    assert sections.choose_sections(["two"], {"one": {"scenes": 0}}) == ["two"]
+    with pytest.raises(UserError, match="at least one"):
+        sections.choose_sections([], {})
     with pytest.raises(UserError, match=r"sizes\.one\.scenes must be at least 1, not 0"):
         sections.choose_sections(["one"], {"one": {"scenes": 0}})
 
