@@ -147,7 +147,7 @@ class Model(Program):
         """
         self(window.initial)
 
-    def transitions(self, window: Window, encoded: Tensor, actions: Tensor) -> Iterator[Transition]:
+    def transitions(self, window: Window, encoded: Tensor, actions: Tensor) -> Iterator[DynamicsStep]:
         """f's likelihoods for `window: [B]`, encoded by `encode`, and `actions: [..., B, T, 4]` (paper, equation 1).
 
         Of a whole window one, for all T pushes at once: events `[T, M, 3]` and `[T, M, F]`. It counts the transitions
@@ -159,13 +159,13 @@ class Model(Program):
             before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
             counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
             mean, scales = self.dynamics.outcome(before, encoded, actions)
-            yield Transition("", *self._likelihoods(mean, counted, scales, 2), after.centers, after.features)
+            yield DynamicsStep("", *self._likelihoods(mean, counted, scales, 2), after.centers, after.features)
             return
         state = window.first
         for push, action in enumerate(actions.unbind(-2), start=1):
             features = self.encoder(state) if self.dynamics.reads_encoding else None
             mean, scales = self.dynamics.outcome(state, features, action)
-            step = Transition(f"_{push}", *self._likelihoods(mean, state.mask, scales, 1))
+            step = DynamicsStep(f"_{push}", *self._likelihoods(mean, state.mask, scales, 1))
             yield step
             centers, sampled = step.sampled
             state = State(centers, unit(sampled), state.mask.expand(centers.shape[:-1]))
@@ -180,7 +180,7 @@ class Model(Program):
 
 
 @dataclass
-class Transition:
+class DynamicsStep:
     """f's likelihoods of all pushes of a window, or of one: for the sites next_centers and next_features.
 
     suffix: of the sites' names: none, or _1, ..., _T. observed_centers, observed_features: None if they are sampled.
