@@ -125,6 +125,8 @@ def check_value(name: str, value: Any, about: About) -> None:
     if isinstance(value, Mapping) and value.get("_target_"):
         return  # a class of the user's, which says itself what is wrong with it
     if about.choices is not None:
+        if value == []:
+            raise UserError(f"{name} must name at least one: choose from {', '.join(about.names or ())}")
         for entry in value if isinstance(value, list) else [value]:
             if entry not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")

@@ -23,7 +23,7 @@ from pyro import poutine
 from scipy.stats import t as student
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands import CALIBRATED, TrainerConfig
+from cavin_pyro.config.commands import TrainerConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.guide import LEVEL, simulate
 from cavin_pyro.criticism.intervals import assess_intervals
@@ -55,8 +55,6 @@ def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
         UserError: a checkpoint or data that cannot be used, an unknown part, or a model that has none of it.
     """
     path = find_checkpoint(config.checkpoint)
-    if not config.parts:
-        raise UserError(f"parts must name what to calibrate: choose from {', '.join(CALIBRATED)}")
 
     def accept(model: Model) -> None:
         if "scales" in config.parts:

@@ -221,7 +221,7 @@ def test_the_command_changes_the_guide_and_one_number_of_f_and_says_what_it_brou
     ("checkpoint", "option", "said"),
     [
         ("cavin", "parts=[prior]", "unknown parts 'prior': choose from guide, scales"),
-        ("cavin", "parts=[]", "parts must name what to calibrate: choose from guide, scales"),
+        ("cavin", "parts=[]", "parts must name at least one: choose from guide, scales"),
         ("cavin", "parts=[scales]", "choose parts=[guide], or train with dynamics=contact scales=predicted"),
         ("mpc", "steps=1", "DynamicsModel, which has no codes, so that there is no guide to calibrate"),
     ],
