@@ -25,7 +25,7 @@ from cavin_pyro.planning.protocol import (
     TransitionModel,
 )
 from cavin_pyro.planning.returns import best_of
-from cavin_pyro.planning.rollout import actions_of, predict_states
+from cavin_pyro.planning.rollout import actions_of, predict_states, project
 from cavin_pyro.planning.sampling import noise_each, sample_codes
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 
@@ -73,6 +73,7 @@ class FlatMotionSpace(NamedTuple):
     """Motion codes, the pushes that g generates from them alone, and the states that f predicts."""
 
     model: MotionModel
+    decimals: int | None = None
 
     @property
     def dimension(self) -> int:
@@ -84,7 +85,7 @@ class FlatMotionSpace(NamedTuple):
     ) -> SegmentRollout:
         """See `cavin_pyro.planning.protocol.SearchSpace`."""
         z = sample_codes(self.model.motion_prior, [plans], noise, generators)
-        a = self.model.actions(here, motion_code=z)
+        a = project(self.model.actions(here, motion_code=z), self.decimals)
         states, path = predict_states(self.model, here, a)
         return SegmentRollout(z, a, states, path)
 
@@ -100,13 +101,14 @@ class CvaeMpcPlanner(PushSearch):
 
     def __init__(self, model: MotionModel, **options: Any) -> None:
         """`options` are those of `PushSearch`."""
-        super().__init__(FlatMotionSpace(model), model, **options)
+        super().__init__(FlatMotionSpace(model, options.get("decimals")), model, **options)
 
 
 class PushSpace(NamedTuple):
     """Raw pushes, T a segment, uniform over the action space, and the states that f predicts step by step."""
 
     model: TransitionModel
+    decimals: int | None = None
 
     @property
     def dimension(self) -> int:
@@ -119,7 +121,7 @@ class PushSpace(NamedTuple):
         """See `cavin_pyro.planning.protocol.SearchSpace`."""
         if noise is None:
             noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
-        actions = (2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4))
+        actions = project((2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4)), self.decimals)
         states, path = predict_states(self.model, here, actions)
         return SegmentRollout(actions.flatten(-2), actions, states, path)
 
@@ -134,7 +136,7 @@ class MpcPlanner(PushSearch):
 
     def __init__(self, model: TransitionModel, **options: Any) -> None:
         """`options` are those of `PushSearch`."""
-        super().__init__(PushSpace(model), model, **options)
+        super().__init__(PushSpace(model, options.get("decimals")), model, **options)
 
 
 class SectarPlanner(SearchingPlanner):
@@ -154,7 +156,10 @@ class SectarPlanner(SearchingPlanner):
     def __init__(self, model: EffectActionModel, **options: Any) -> None:
         """`options` are those of `SearchingPlanner`."""
         super().__init__(model, **options)
-        self.space, self._actions = EffectSpace(model), model.actions
+        self.space, self.effect_actions = EffectSpace(model), model.actions
+
+    def _actions(self, here: State, effect_code: Tensor) -> Tensor:
+        return project(self.effect_actions(here, effect_code), self.decimals)
 
     def plan_scene(self, scene: Scene) -> Plan:
         """Plan for observed scenes `scene.state: [B]`."""
@@ -197,6 +202,7 @@ class CascadeSpace(NamedTuple):
     """Effect and motion codes of the cascade, the pushes that g generates from both, and the states that f predicts."""
 
     model: PlanningModel
+    decimals: int | None = None
 
     @property
     def dimension(self) -> int:
@@ -211,7 +217,7 @@ class CascadeSpace(NamedTuple):
         effect_noise, motion_noise = (None, None) if noise is None else noise.split(sizes, -1)
         c = sample_codes(self.model.effect_prior, [plans], effect_noise, generators)
         z = sample_codes(self.model.motion_prior, [plans, c], motion_noise, generators)
-        a = self.model.actions(here, c, z)
+        a = project(self.model.actions(here, c, z), self.decimals)
         states, path = predict_states(self.model, here, a)
         return SegmentRollout(torch.cat([c, z], -1), a, states, path)
 
@@ -230,7 +236,7 @@ class CavinWithoutEffectsPlanner(PushSearch):
 
     def __init__(self, model: PlanningModel, **options: Any) -> None:
         """`options` are those of `PushSearch`."""
-        super().__init__(CascadeSpace(model), model, **options)
+        super().__init__(CascadeSpace(model, options.get("decimals")), model, **options)
 
 
 class RandomPlanner:

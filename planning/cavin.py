@@ -14,7 +14,7 @@ from cavin_pyro.planning.checks import check_choice, check_fraction, check_weigh
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, Scene, SegmentRollout
 from cavin_pyro.planning.returns import SubgoalDistance, TrackingCost, best_of, interpolate, select_segment
-from cavin_pyro.planning.rollout import Candidates, Focus, actions_of, predict_states
+from cavin_pyro.planning.rollout import Candidates, Focus, actions_of, predict_states, project
 from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 
@@ -30,7 +30,6 @@ class CavinPlanner(SearchingPlanner):
     motion_horizon: motions are planned for all K segments, `full_horizon` (paper), or for the executed `first_segment`.
     feature_weight: square metres per squared unit of feature distance, in the distance to subgoals; 0: centres only.
     options: of `cavin_pyro.planning.searching.SearchingPlanner`, whose optimizer searches codes at both levels.
-
     Raises ValueError for counts below 1, a horizon that T does not divide, unknown names, and a negative weight.
     """
 
@@ -87,7 +86,7 @@ class CavinPlanner(SearchingPlanner):
         distance = self.added("subgoal_distance", SubgoalDistance(self.feature_weight), scene, self.motion_segments)
         tracking_cost = self.added("wrap_objective", TrackingCost(subgoals, effect.segments, distance), scene, effect)
         motions = self.search(
-            MotionSpace(self.model, c_star, focus),
+            MotionSpace(self.model, c_star, focus, self.decimals),
             tracking_cost,
             scene,
             optimizer=self.motion_optimizer,
@@ -132,6 +131,7 @@ class MotionSpace(NamedTuple):
     model: PlanningModel
     effect_codes: Tensor  # [B, K, C] c*, with which every sequence is paired
     focus: Focus
+    decimals: int | None
 
     @property
     def dimension(self) -> int:
@@ -145,6 +145,6 @@ class MotionSpace(NamedTuple):
         # Line 8: sample z_k, a segment at a time, as in line 5.
         z = sample_codes(self.model.motion_prior, [self.focus.of(plans), c], noise, generators)
         # Line 9: generate T actions by equation 3, and predict a state after each by equation 1.
-        a = self.model.actions(self.focus.of(here), c, z)
+        a = project(self.model.actions(self.focus.of(here), c, z), self.decimals)
         states, path = predict_states(self.model, here, a)
         return SegmentRollout(z, a, states, path)

@@ -66,6 +66,12 @@ def actions_of(segment: SegmentRecord) -> Tensor:
     return segment.rollout.actions
 
 
+def project(actions: Tensor, decimals: int | None) -> Tensor:
+    """Actions as they are executed: within [-1, 1], rounded to so many decimals. What is not finite becomes NaN."""
+    projected = torch.where(torch.isfinite(actions), actions.clamp(-1.0, 1.0), torch.nan)
+    return projected if decimals is None else projected.double().round(decimals=decimals).to(actions.dtype)
+
+
 def predict_states(model: TransitionModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
     """T `pushes: [B, n, T, 4]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]` and the path `[B, n, T, M, 3]`.
 

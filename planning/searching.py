@@ -61,6 +61,8 @@ class SearchingPlanner:
     stride_limits: two distances in metres; a segment that moves every object less than the first, or any object more
         than the second, ends the plan like a violation (0.1 and 0.3 from subgoal to subgoal in the published
         implementation); None in the paper.
+    decimals: to which actions are rounded before f predicts them, so that what is executed is what was scored; None
+        keeps them as they are, within [-1, 1].
     additions: to Algorithm 1, by name or objects, see `cavin_pyro.planning.additions`; none in the paper.
     add, drop: of commands: more additions, of which one replaces another of its class, and names to leave out.
     compile: true compiles the inner functions by `torch.compile`, which takes minutes and is cached on disk;
@@ -80,6 +82,7 @@ class SearchingPlanner:
         optimizer: str | Optimizer = "shooting",
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
+        decimals: int | None = None,
         additions: Sequence[str | Addition] = (),
         compile: bool | str = False,
     ) -> None:
@@ -93,7 +96,7 @@ class SearchingPlanner:
         self.backend = make_backend(compile, model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext)
         self.early_stopping = any(addition.stops_early for addition in self.additions)
         self.reparameterized = self.early_stopping or bool(compile)
-        self.model, self.reward_at, self.samples = model, reward_at, samples
+        self.model, self.reward_at, self.samples, self.decimals = model, reward_at, samples, decimals
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
 
     @property

@@ -25,7 +25,8 @@ from cavin_pyro.config.errors import UserError
 
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
-GIVEN = {  # which `build_model` gives, by group
+GIVEN = {  # which `build_model` or `make_planner` gives, by group
+    "planner": ("decimals",),
     "prior": ("dimension", "feature_dimension", "effect_dimension"),
     "geometry": ("feature_dimension",),
     "dynamics": ("feature_dimension", "width"),

@@ -22,7 +22,7 @@ from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning.additions.touchdown import Touchdown
 from cavin_pyro.planning.returns import best_of, squared_distance
-from cavin_pyro.planning.rollout import predict_states
+from cavin_pyro.planning.rollout import predict_states, project
 from cavin_pyro.planning.sampling import sample_each
 from cavin_pyro.storage.checkpoint import load
 
@@ -68,7 +68,7 @@ class ModelPushingPolicy:
         subgoal = model.subgoal(here, effect_code)
         codes = effect_code.expand(-1, self._motions, -1)
         motion_code = sample_each(model.motion_prior, [plans, codes], [self._random])
-        pushes = model.actions(here, effect_code=codes, motion_code=motion_code)
+        pushes = project(model.actions(here, effect_code=codes, motion_code=motion_code), None)
         ends, _ = predict_states(model, here, pushes)
         scores = -squared_distance(ends, subgoal)
         scores = Touchdown().leave_out(scores, pushes[:, :, 0], observed_points(seen))
@@ -76,7 +76,7 @@ class ModelPushingPolicy:
         moves = (subgoal.centers - here.centers)[0, 0, :, :2] * state.mask[0, :, None]
         target = int(moves.norm(dim=-1).argmax())
         self.intent = Intent(target, float(torch.atan2(moves[target, 1], moves[target, 0])))
-        return list(pushes[0, best].clamp(-1.0, 1.0).numpy())
+        return list(pushes[0, best].numpy())
 
 
 def load_pusher(name: str) -> tuple[Model, Geometry]:

@@ -194,8 +194,9 @@ def planner_of(config: DictConfig, model: Model | None, device: torch.device) ->
         options["compile"] = GRAPHS
     torch.manual_seed(config.seed)
     optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
+    given = {"model": model, "additions": additions, "decimals": config.get("push_decimals"), **optimizers}
     with user_input("planner"):
-        return construct(options, model=model, additions=additions, **optimizers)
+        return construct(options, **given)
 
 
 @user_input("planner", "checkpoint", "task", "tiles", "env", "layout", "generated", "pushes_per_plan")

@@ -18,6 +18,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES
 from cavin_pyro.models.networks.pointnet import PointNet
+from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.additions import FirstPush
 from cavin_pyro.planning.optimizers import OPTIMIZERS
@@ -133,6 +134,26 @@ def test_options_take_effect(planner: str, option: str) -> None:
         parts.env.close()
     returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
     assert not (torch.equal(*returns) and torch.equal(*actions))
+
+
+@pytest.mark.parametrize("planner", ["cavin", "paper", "sectar", "cvae_mpc", "mpc", "cavin_without_effects"])
+def test_what_is_executed_is_what_f_was_asked_and_lies_in_the_action_box(
+    planner: str, make_small_runner: Callable[..., EpisodeRunner], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner = make_small_runner(planner, FITTING.get(planner, "cascaded"), "maximum_steps=2", "margin=0")
+    model, asked = runner.planner.model, []  # type: ignore[attr-defined]
+
+    def next_state(state: State, action: torch.Tensor) -> State:
+        asked.append(action.reshape(-1, 4))
+        return usual(state, action)
+
+    usual = model.next_state
+    monkeypatch.setattr(model, "next_state", next_state)
+    executed = runner.rollout(1).transitions
+    rows = torch.cat(asked)
+    assert rows.abs().max() <= 1.0
+    assert {one.action.tobytes() for one in executed} <= {row.numpy().tobytes() for row in rows}
+    runner.env.close()
 
 
 @pytest.mark.parametrize("model", MODELS)
