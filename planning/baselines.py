@@ -18,8 +18,8 @@ from cavin_pyro.planning.protocol import (
     MotionModel,
     Plan,
     PlanningModel,
+    Query,
     RewardFunction,
-    Scene,
     SearchSpace,
     SegmentRollout,
     TransitionModel,
@@ -47,7 +47,7 @@ class PushSearch(SearchingPlanner):
         super().__init__(model, **options)
         self.space = space
 
-    def plan_scene(self, scene: Scene) -> Plan:
+    def plan_scene(self, scene: Query) -> Plan:
         """Plan for observed scenes `scene.state: [B]`. There are no effect codes and no subgoals."""
         candidates = self.search_by_reward(self.space, scene)
         # A sum is finite only if all of its terms are.
@@ -161,7 +161,7 @@ class SectarPlanner(SearchingPlanner):
     def _actions(self, here: State, effect_code: Tensor) -> Tensor:
         return project(self.effect_actions(here, effect_code), self.decimals)
 
-    def plan_scene(self, scene: Scene) -> Plan:
+    def plan_scene(self, scene: Query) -> Plan:
         """Plan for observed scenes `scene.state: [B]`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
         effects, here = self.search_by_reward(self.space, scene), scene.state.expand_plans(1)

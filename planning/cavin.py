@@ -12,7 +12,7 @@ from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import HOOKS, Choice, ChosenEffect
 from cavin_pyro.planning.checks import check_choice, check_fraction, check_weight
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
-from cavin_pyro.planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, Scene, SegmentRollout
+from cavin_pyro.planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, Query, SegmentRollout
 from cavin_pyro.planning.returns import SubgoalDistance, TrackingCost, best_of, interpolate, select_segment
 from cavin_pyro.planning.rollout import Candidates, Focus, actions_of, predict_states, project
 from cavin_pyro.planning.sampling import sample_codes
@@ -60,7 +60,7 @@ class CavinPlanner(SearchingPlanner):
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
         self.feature_weight = feature_weight
 
-    def plan_scene(self, scene: Scene) -> Plan:
+    def plan_scene(self, scene: Query) -> Plan:
         """Algorithm 1 for observed scenes `scene.state: [B]`."""
         # Line 1 (K = H / T) is in the constructor; lines 2, 3 and 12, the loop over t, are the caller's. Line 4: s_t.
         s_t, focus = scene.state, self.added("focus", Focus(), scene)
@@ -76,7 +76,7 @@ class CavinPlanner(SearchingPlanner):
             plan = addition.revise(plan, scene=scene, effects=effects, chosen=i, plan_motions=plan_motions)
         return plan
 
-    def plan_motions(self, scene: Scene, focus: Focus, effects: Candidates, i: Tensor) -> Plan:
+    def plan_motions(self, scene: Query, focus: Focus, effects: Candidates, i: Tensor) -> Plan:
         """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
         chosen, T = effects.take(i.unsqueeze(-1)), self.segment_length
         c_star, subgoals = chosen.codes[:, 0], focus.among(scene.state, chosen.states.map(lambda field: field[:, 0]))

@@ -205,7 +205,7 @@ def as_reward(function: RewardFunction) -> Reward:
     return function if isinstance(function, Reward) else FunctionReward(function)
 
 
-class Scene(NamedTuple):
+class Query(NamedTuple):
     """What one plan is made for: B environments."""
 
     state: State  # [B], observed
@@ -256,7 +256,7 @@ class ScoreState(Protocol):
         """`[B, n]` bool: not terminated."""
 
 
-class Objective(Protocol):
+class SearchObjective(Protocol):
     """Scores candidates. A named tuple or a frozen dataclass, so that a backend can compile it.
 
     The state of an objective that wraps another one has the other's state as its field `inner`: see `unwrap`.
@@ -344,4 +344,4 @@ class Planner(Protocol):
     def plan(
         self, state: State, *, reward: RewardFunction, generators: Sequence[torch.Generator], observed: Any = None
     ) -> Plan:
-        """Plan for the scenes `state: [B]`, each with its own generator; `observed` as in `Scene`."""
+        """Plan for the scenes `state: [B]`, each with its own generator; `observed` as in `Query`."""

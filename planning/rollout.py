@@ -14,7 +14,7 @@ from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.backends import Backend, eager
 from cavin_pyro.planning.checks import OptimizerError
-from cavin_pyro.planning.protocol import Evidence, Objective, SearchSpace, SegmentRollout, TransitionModel, unwrap
+from cavin_pyro.planning.protocol import Evidence, SearchObjective, SearchSpace, SegmentRollout, TransitionModel, unwrap
 from cavin_pyro.planning.returns import Progress
 from cavin_pyro.planning.sampling import noise_each, uniform_each
 
@@ -97,7 +97,7 @@ class ExtendedSegment(NamedTuple):
 
 def extend_segment(
     space: SearchSpace,
-    objective: Objective,
+    objective: SearchObjective,
     number: int,
     here: State,
     before: State,
@@ -169,7 +169,7 @@ class SearchProblem:
     """
 
     space: SearchSpace
-    objective: Objective
+    objective: SearchObjective
     state: State
     generators: Sequence[torch.Generator]  # one per environment
     segments: int  # K

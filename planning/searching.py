@@ -26,10 +26,10 @@ from cavin_pyro.planning.optimizers import Optimizer, make_optimizer, search
 from cavin_pyro.planning.protocol import (
     FixedShapes,
     ModelRequirements,
-    Objective,
     Plan,
+    Query,
     RewardFunction,
-    Scene,
+    SearchObjective,
     SearchSpace,
     TransitionModel,
     as_reward,
@@ -128,20 +128,20 @@ class SearchingPlanner:
             chunk = slice(start, start + size)
             seen = observed and records.apply(observed, itemgetter(chunk))
             try:
-                plans.append(self.plan_scene(Scene(state.scene(chunk), reward, generators[chunk], seen)))
+                plans.append(self.plan_scene(Query(state.scene(chunk), reward, generators[chunk], seen)))
             except NoFiniteCandidateError as error:
                 raise NoFiniteCandidateError(start + error.environment, error.what) from error
         return plans[0] if len(plans) == 1 else records.join(plans, dimension=0)
 
-    def plan_scene(self, scene: Scene) -> Plan:
+    def plan_scene(self, scene: Query) -> Plan:
         """Plan for the environments of one chunk."""
         raise NotImplementedError
 
     def search(
         self,
         space: SearchSpace,
-        objective: Objective,
-        scene: Scene,
+        objective: SearchObjective,
+        scene: Query,
         *,
         optimizer: Optimizer | None = None,
         segments: int | None = None,
@@ -171,7 +171,7 @@ class SearchingPlanner:
         )
         return search(optimizer or self.optimizer, problem, self.samples if samples is None else samples)
 
-    def search_by_reward(self, space: SearchSpace, scene: Scene) -> Candidates:
+    def search_by_reward(self, space: SearchSpace, scene: Query) -> Candidates:
         """Candidates `[B, N]` of K segments, searched by cumulative reward."""
         reward, limits = scene.reward, self.stride_limits
         if limits is not None:

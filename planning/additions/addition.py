@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 from torch import Tensor
 
 from cavin_pyro.models.state import State
-from cavin_pyro.planning.protocol import Objective, Plan, Scene
+from cavin_pyro.planning.protocol import Plan, Query, SearchObjective
 from cavin_pyro.planning.returns import SubgoalDistance
 from cavin_pyro.planning.rollout import Candidates, Focus
 
@@ -24,7 +24,7 @@ class ChosenEffect(NamedTuple):
 class Choice(NamedTuple):
     """Candidates whose first actions are known: motions at line 10, or the plans of a baseline."""
 
-    scene: Scene
+    scene: Query
     model: Any  # `cavin_pyro.planning.protocol.TransitionModel`
     candidates: Candidates  # [B, N]
     first_actions: Callable[[], Tensor]  # [B, N, T, A], of the first segment
@@ -43,15 +43,15 @@ class Addition:
     for_one_push: ClassVar[bool] = False  # only for callers that plan again after each push
     for_motions: ClassVar[bool] = False  # only for motions that follow an effect, which baselines do not have
 
-    def focus(self, focus: Focus, scene: Scene) -> Focus:
+    def focus(self, focus: Focus, scene: Query) -> Focus:
         """The objects that codes, subgoals and actions are about (lines 5, 6, 8 and 9); f predicts all."""
         return focus
 
-    def wrap_objective(self, objective: Objective, scene: Scene, effect: ChosenEffect | None) -> Objective:
+    def wrap_objective(self, objective: SearchObjective, scene: Query, effect: ChosenEffect | None) -> SearchObjective:
         """The objective of a search: the cumulative reward (line 7), or with `effect` the tracking cost (line 10)."""
         return objective
 
-    def subgoal_distance(self, distance: SubgoalDistance, scene: Scene, segments: int) -> SubgoalDistance:
+    def subgoal_distance(self, distance: SubgoalDistance, scene: Query, segments: int) -> SubgoalDistance:
         """The distance to subgoals, for motions of so many segments (line 10)."""
         return distance
 
@@ -60,7 +60,7 @@ class Addition:
         return scores
 
     def revise(
-        self, plan: Plan, *, scene: Scene, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
+        self, plan: Plan, *, scene: Query, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
     ) -> Plan:
         """The plan that is executed (line 11).
 

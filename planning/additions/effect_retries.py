@@ -17,7 +17,7 @@ from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions.addition import Addition
 from cavin_pyro.planning.checks import check_positive
-from cavin_pyro.planning.protocol import Plan, Scene
+from cavin_pyro.planning.protocol import Plan, Query
 from cavin_pyro.planning.returns import best_of
 from cavin_pyro.planning.rollout import Candidates
 
@@ -40,7 +40,7 @@ class EffectRetries(Addition):
         check_positive("retries", self.retries)
 
     def revise(
-        self, plan: Plan, *, scene: Scene, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
+        self, plan: Plan, *, scene: Query, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
     ) -> Plan:
         """See `Addition`."""
         scores = effects.returns

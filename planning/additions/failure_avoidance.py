@@ -11,7 +11,7 @@ from torch import Tensor
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import returns
 from cavin_pyro.planning.additions.addition import Addition, Choice, ChosenEffect
-from cavin_pyro.planning.protocol import Objective, Reward, Scene, SegmentRollout, unwrap
+from cavin_pyro.planning.protocol import Query, Reward, SearchObjective, SegmentRollout, unwrap
 from cavin_pyro.planning.returns import Progress, prefer
 
 FAILURE = 1e3  # square metres, the cost of a predicted failure: more than any distance on the table
@@ -26,7 +26,7 @@ class FailureAvoidance(Addition):
 
     for_motions = True
 
-    def wrap_objective(self, objective: Objective, scene: Scene, effect: ChosenEffect | None) -> Objective:
+    def wrap_objective(self, objective: SearchObjective, scene: Query, effect: ChosenEffect | None) -> SearchObjective:
         """See `Addition`; for motions only."""
         return objective if effect is None else AvoidFailures(objective, effect.segments, scene.reward)
 
@@ -64,7 +64,7 @@ class FailureState(NamedTuple):
 class AvoidFailures(NamedTuple):
     """An objective that also checks f's predictions for failures, step by step."""
 
-    objective: Objective
+    objective: SearchObjective
     segments: Tensor  # [B] int64: segments until the effect plan ends; later failures do not count
     reward: Reward
 

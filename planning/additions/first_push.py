@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from cavin_pyro.planning.additions.addition import Addition
-from cavin_pyro.planning.protocol import Scene
+from cavin_pyro.planning.protocol import Query
 from cavin_pyro.planning.returns import FIRST_PUSH, SubgoalDistance
 
 
@@ -19,6 +19,6 @@ class FirstPush(Addition):
 
     for_one_push = True
 
-    def subgoal_distance(self, distance: SubgoalDistance, scene: Scene, segments: int) -> SubgoalDistance:
+    def subgoal_distance(self, distance: SubgoalDistance, scene: Query, segments: int) -> SubgoalDistance:
         """See `Addition`."""
         return distance._replace(at=FIRST_PUSH) if segments == 1 and scene.reward.about == "all" else distance

@@ -20,7 +20,14 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions.addition import Addition, ChosenEffect
-from cavin_pyro.planning.protocol import Objective, RemainingDistance, Scene, SegmentRollout, replace_within, unwrap
+from cavin_pyro.planning.protocol import (
+    Query,
+    RemainingDistance,
+    SearchObjective,
+    SegmentRollout,
+    replace_within,
+    unwrap,
+)
 from cavin_pyro.planning.returns import Progress, TrackingState, select_segment
 
 CONTINUES = 0.9  # after each segment; 1 values the last state alone
@@ -34,7 +41,7 @@ class Guidance(Addition):
     Plans raise ValueError for a reward that does not know the remaining distance to the goal.
     """
 
-    def wrap_objective(self, objective: Objective, scene: Scene, effect: ChosenEffect | None) -> Objective:
+    def wrap_objective(self, objective: SearchObjective, scene: Query, effect: ChosenEffect | None) -> SearchObjective:
         """See `Addition`."""
         distance = scene.reward.distance_to_goal()
         if distance is None:
@@ -71,7 +78,7 @@ class GuidedProgress(NamedTuple):
 class GuidedReturn:
     """Cumulative reward plus the value of the states that a plan leads to: the objective at line 7."""
 
-    objective: Objective
+    objective: SearchObjective
     distance_to_goal: RemainingDistance
 
     def start(self, plans: State) -> GuidedProgress:
@@ -114,7 +121,7 @@ class GuidedTracking(NamedTuple):
     plans that miss the goal are guided; the motions of a plan that reaches it are ranked as without guidance.
     """
 
-    objective: Objective
+    objective: SearchObjective
     distance_to_goal: RemainingDistance
     subgoals: State  # [B, K, M, .]
     segments: Tensor  # [B] int64: segments until the effect plan ends

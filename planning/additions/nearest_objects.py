@@ -8,7 +8,7 @@ import torch
 
 from cavin_pyro.planning.additions.addition import Addition
 from cavin_pyro.planning.checks import check_positive
-from cavin_pyro.planning.protocol import Scene
+from cavin_pyro.planning.protocol import Query
 from cavin_pyro.planning.rollout import Focus
 
 
@@ -25,7 +25,7 @@ class NearestObjects(Addition):
     def __post_init__(self) -> None:
         check_positive("objects", self.objects)
 
-    def focus(self, focus: Focus, scene: Scene) -> Focus:
+    def focus(self, focus: Focus, scene: Query) -> Focus:
         """See `Addition`; all objects in scenes of up to `objects`."""
         state = scene.state
         if state.objects <= self.objects or scene.reward.about != "target":

@@ -14,7 +14,7 @@ from cavin_pyro.envs.tasks import TaskReward
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.additions import NearestObjects
-from cavin_pyro.planning.protocol import Reward, Scene
+from cavin_pyro.planning.protocol import Query, Reward
 from cavin_pyro.planning.rollout import Focus
 
 PLACES = [(0.0, 0.0), (0.9, 0.0), (0.1, 0.1), (0.8, 0.0), (0.2, 0.0), (0.0, 0.3)]  # metres; 0, 2, 4, 5 are nearest
@@ -28,7 +28,7 @@ def scene(*, real: int = 6) -> State:
 
 
 def focus(reward: Reward, objects: int = 4, **options: int) -> Focus:
-    return NearestObjects(objects).focus(Focus(), Scene(scene(**options), reward, []))
+    return NearestObjects(objects).focus(Focus(), Query(scene(**options), reward, []))
 
 
 def test_the_target_comes_first_and_then_the_nearest_in_their_order(toy: SimpleNamespace) -> None:

@@ -16,7 +16,7 @@ from cavin_pyro.planning import CavinPlanner, Reward
 from cavin_pyro.planning.additions import Choice, PerturbedRollouts
 from cavin_pyro.planning.additions.perturbed_rollouts import sequential_halving
 from cavin_pyro.planning.backends import eager
-from cavin_pyro.planning.protocol import Scene
+from cavin_pyro.planning.protocol import Query
 from tests.planning.conftest import GoalDisc, PointMass, generators, move, scenes
 
 SAMPLES = 64
@@ -78,7 +78,7 @@ def halving(
     robustness: PerturbedRollouts, state: State, below: float = -torch.inf, backend: Callable = eager, **tensors: Any
 ) -> list[int]:
     """The candidate of each scene that sequential halving chooses, with the f of a point mass."""
-    scene = Scene(state, GoalDisc((9.0, 9.0), forbidden_below=below), generators(*range(len(state.mask))))
+    scene = Query(state, GoalDisc((9.0, 9.0), forbidden_below=below), generators(*range(len(state.mask))))
     candidates: Any = SimpleNamespace(problem=SimpleNamespace(backend=backend))
     choice = Choice(scene, PointMass(), candidates, lambda: tensors["actions"])
     return sequential_halving(robustness, choice, **tensors).tolist()
