@@ -55,7 +55,7 @@ def export(folder: Path, target: Path) -> int:
         import minari
         from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
-        raise UserError(f"export needs Minari ({error}): pip install -c constraints.txt '.[minari]'") from error
+        raise UserError(f"export needs Minari ({error}): pip install -c constraints.txt -e '.[minari]'") from error
     if not re.fullmatch(r"[\w-]+-v\d+", target.resolve().name):
         raise UserError(f"--to {target} must end in a name and a version, as Minari wants: --to {target}-v0")
     metadata = read_metadata(folder)

@@ -122,7 +122,7 @@ def _cluster(function: Callable[[Any], Any], address: str | None) -> Iterator[tu
             socket.create_connection((host, int(port)), timeout=10.0).close()
         ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR", include_dashboard=False)
     except ImportError as error:
-        raise UserError(f"launcher=ray needs Ray ({error}): pip install -c constraints.txt '.[ray]'") from error
+        raise UserError(f"launcher=ray needs Ray ({error}): pip install -c constraints.txt -e '.[ray]'") from error
     except Exception as error:  # Ray has no class of its own for what can be wrong with a machine or an address
         where = f"no Ray cluster at address={address}" if address else "Ray did not start"
         raise UserError(f"{where} ({' '.join(str(error).split())[:200]})") from error

@@ -5,11 +5,12 @@ from __future__ import annotations
 import datetime
 import hashlib
 import platform
+import re
 import shlex
 import subprocess
 import sys
 from glob import glob
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ def provenance() -> dict[str, Any]:
         "program": f"cavin_pyro {__version__}",
         "revision": _revision(),
         "command": shlex.join(["python", *_program(), *sys.argv[1:]]),
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", "pybullet", "gymnasium")},
+        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", *_pybullet(), "gymnasium")},
         "machine": f"{platform.system()} {platform.machine()}",
     }
 
@@ -42,6 +43,19 @@ def _program() -> list[str]:
     script = Path(sys.argv[0])
     ours = script.parent.name == "cavin_pyro" or script.stem.startswith("cavin-")
     return ["-m", f"cavin_pyro.{script.stem.removeprefix('cavin-')}"] if ours else [script.name]
+
+
+def _pybullet() -> list[str]:
+    """The distribution whose module pybullet is imported: there are two, and if both are there its size tells."""
+    found = []
+    for name in ("pybullet", "pybullet-arm64"):
+        try:
+            home = distribution(name)
+            lines = re.findall(r"^(pybullet\.[^,/]*),.*,(\d+)$", home.read_text("RECORD") or "", re.MULTILINE)
+            found += [name for file, size in lines if Path(str(home.locate_file(file))).stat().st_size == int(size)]
+        except (PackageNotFoundError, OSError):
+            continue
+    return found
 
 
 def _version(name: str) -> str:

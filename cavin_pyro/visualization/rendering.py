@@ -77,7 +77,7 @@ def check_viewer(viewer: object) -> None:
     if viewer is not None and importlib.util.find_spec("rerun") is None:
         raise UserError(
             f"viewer={viewer} needs an optional part that is not installed: "
-            "run python -m pip install --constraint constraints.txt '.[viewer]' in the repository"
+            "run python -m pip install --constraint constraints.txt --editable '.[viewer]' in the repository"
         )
 
 

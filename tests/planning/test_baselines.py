@@ -66,7 +66,7 @@ def test_sectar_executes_what_g_makes_of_the_best_effect_code(toy: SimpleNamespa
 def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> None:
     class Broken(toy.Tabled):  # type: ignore[name-defined]
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
-            return torch.full((1, 1, 2, 4), torch.nan)
+            return torch.full((*effect_code.shape[:2], 2, 4), torch.nan)
 
     planner = SectarPlanner(Broken(EFFECTS, []), samples=3, horizon=4, additions=[PerturbedRollouts()])
     with pytest.raises(ValueError, match="^environment 0: the pushes of the chosen effect are not finite"):

@@ -244,4 +244,4 @@ def test_without_minari_one_line_tells_how_to_get_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "minari", None)
     status, _, errors = data("export", pushes, "--to", tmp_path / "pushes-v0")
-    assert status == 2 and errors.endswith("pip install -c constraints.txt '.[minari]'")
+    assert status == 2 and errors.endswith("pip install -c constraints.txt -e '.[minari]'")

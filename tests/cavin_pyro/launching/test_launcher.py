@@ -128,7 +128,7 @@ def _killed_once(mark: str) -> str:
 
 def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"launcher=ray needs Ray .*pip install -c constraints.txt '\.\[ray\]'"):
+    with pytest.raises(UserError, match=r"launcher=ray needs Ray .*pip install -c constraints.txt -e '\.\[ray\]'"):
         list(Launcher("ray").run(act, [("sleep", 0.0)]))
 
 
