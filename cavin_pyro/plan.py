@@ -32,7 +32,8 @@ def main(config: DictConfig) -> Figures:
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
         pushes = counted(row["steps"], "push", "pushes")
-        print(f"{runner.task.name}: {row['outcome']} after {pushes}, return {row['return']:.1f}")
+        idle = f", {row['ineffective']} of which moved nothing" if row["ineffective"] else ""
+        print(f"{runner.task.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)
         for name in episode_files(video=config.video, viewer=config.viewer):

@@ -143,7 +143,8 @@ class SectarPlanner(SearchingPlanner):
     """SeCTAR: effect codes ranked by reward, as in `CavinPlanner`; g generates the pushes from the chosen code alone.
 
     There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). f only predicts the states
-    after the pushes, for pictures and additions. An effect has one motion here, so additions rank effect plans.
+    after the pushes, for pictures and additions. An effect has one motion here, so additions rank effect plans. Where
+    pushes move nothing, h may still believe that they reach the subgoal, and the next plan starts from the same state.
 
     model: p(c | s), h, g without motion codes, f. For the options see `SearchingPlanner`. Raises ValueError for counts
     below 1, a horizon that T does not divide, and unknown names.
