@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from packaging.version import Version
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -46,6 +47,7 @@ def test_compiled_plans_agree_with_eager_plans(toy: SimpleNamespace) -> None:
         Distribution.set_default_validate_args(before)
 
 
+@pytest.mark.skipif(Version(torch.__version__) < Version("2.12"), reason="older torch leaves gaps, run eagerly")
 def test_one_segment_is_traced_as_a_whole(toy: SimpleNamespace) -> None:
     """Without the generation of code, which takes long: torch reads the functions of a plan without a break."""
     from cavin_pyro.planning.cavin import EffectSpace
