@@ -16,6 +16,7 @@ from cavin_pyro.envs.layouts import GENERATED, generate_task, possible_tasks
 from cavin_pyro.envs.objects.object_sets import ObjectSet, load_object_set, plain_name
 from cavin_pyro.envs.objects.sampling import Area, ObjectRanges
 from cavin_pyro.envs.observation import Observation
+from cavin_pyro.envs.physics import Uncopied
 from cavin_pyro.envs.randomness import GOAL, LAYOUT, named_stream
 from cavin_pyro.envs.robots import RobotFactory
 from cavin_pyro.envs.scene import Scene
@@ -34,7 +35,7 @@ VIDEO_SIZE = (512, 424)  # pixels
 ObservationDict = dict[str, NDArray[Any]]
 
 
-class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
+class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """Push objects on a table until a task's goal is reached, observed by a depth camera from above.
 
     Observation: `clouds` [M, 256, 3] metres, `centers` [M, 3] metres, `mask` [M] (known objects, object 0 is
@@ -54,7 +55,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         generated: what is wanted of `layout="generated"`, which is generated at every reset, unless it has a seed.
         reward: dense or sparse. criterion: what ends an episode as a violation, see `TaskReward`. Scenes and
             observations do not depend on it.
-        objects: how many, 1 to 10. ranges: object parameters.
+        objects: how many, 1 to 10. ranges: object parameters, or a mapping of them, which JSON can hold.
         robot: one of `cavin_pyro.envs.robots.ROBOTS`, or a factory of robots.
         object_set: a key of `cavin_pyro.envs.objects.object_sets.OBJECT_SETS`, or a set.
         camera, segmentation: see `cavin_pyro.envs.scene.Scene`.
@@ -79,7 +80,7 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         reward: str = "sparse",
         criterion: str = "strict",
         objects: int = 3,
-        ranges: ObjectRanges | None = None,
+        ranges: ObjectRanges | Mapping[str, Any] | None = None,
         object_set: str | ObjectSet = "builtin",
         assets: str | Path | None = None,
         maximum_steps: int = EPISODE_STEPS,
@@ -95,6 +96,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        if not isinstance(show_tiles, bool):
+            raise ValueError(f"show_tiles must be True or False, not {show_tiles!r}")
         if isinstance(task, Task) and (layout != 0 or tiles):
             raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
         self._generate: Callable[[np.random.Generator], Task] | None = None
@@ -113,7 +116,8 @@ class PushingEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
-        self.ranges = ranges or ObjectRanges(names=tuple(dict.fromkeys(map(plain_name, available.names))))
+        named = ranges or {"names": tuple(dict.fromkeys(map(plain_name, available.names)))}
+        self.ranges = ObjectRanges(**named) if isinstance(named, Mapping) else named
         slots = object_slots(self.objects)
         self.scene = Scene(
             camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets, slots=slots

@@ -19,7 +19,7 @@ from cavin_pyro.envs.markings import Place, TileGroup, paint_of
 from cavin_pyro.envs.objects.object_sets import BUILTIN, ObjectSet
 from cavin_pyro.envs.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
 from cavin_pyro.envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
-from cavin_pyro.envs.physics import PhysicsWorld, Poses
+from cavin_pyro.envs.physics import PhysicsWorld, Poses, Uncopied
 from cavin_pyro.envs.randomness import SENSOR, named_stream
 from cavin_pyro.envs.robots import TIP_HEIGHT, RobotFactory, Stopped, push, robot_factory, settle
 from cavin_pyro.envs.segmentation import Pixels, SegmenterFactory, segmenter_of
@@ -61,7 +61,7 @@ class PushReport:
     stopped: Stopped = ""
 
 
-class Scene:
+class Scene(Uncopied):
     """A simulated world: sample scenes, push, and observe.
 
     Args:

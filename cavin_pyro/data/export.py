@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
@@ -44,6 +45,8 @@ DESCRIPTION = (
 def export(folder: Path, target: Path) -> int:
     """Write a dataset as `target/data`, where `minari.load_dataset` finds it with `target`'s parent as its root.
 
+    Minari's `recover_environment` makes its world, of which a line says so if it cannot.
+
     Returns:
         How many episodes were written.
 
@@ -69,6 +72,7 @@ def export(folder: Path, target: Path) -> int:
                 partial.resolve(),  # because Minari takes the size of what it has written from a relative path twice
                 observation_space=observation_space(slots_of(metadata)),
                 action_space=spaces.Box(-1.0, 1.0, (4,), np.float32),
+                env_spec=environment_of(metadata),
                 data_format="hdf5",
             )
             storage.update_metadata(
@@ -95,6 +99,24 @@ def observation_space(slots: int) -> spaces.Dict:
     centers = spaces.Box(-infinite, infinite, (slots, 3), np.float32)
     clouds = spaces.Box(-infinite, infinite, (slots, POINTS_PER_OBJECT, 3), np.float16)
     return spaces.Dict({"centers": centers, "clouds": clouds, "visible": flags, "mask": flags})
+
+
+def environment_of(metadata: Mapping[str, Any]) -> EnvSpec | None:
+    """The environment with a dataset's world, in the task crossing; None, with a line, for parts of the user's own."""
+    made = metadata["configuration"]
+    for name in ("object_set", "camera", "segmentation"):
+        if not isinstance(made.get(name), str):
+            print(f"recover_environment() will not work: {name}={made.get(name)} has no name in this program")
+            return None
+    return EnvSpec(
+        id="cavin/Pushing-v0",
+        entry_point="cavin_pyro.envs.pushing:PushingEnv",  # which Gymnasium imports, so that nobody needs to
+        kwargs={
+            "objects": made.get("maximum_objects", slots_of(metadata)),
+            "maximum_steps": made["steps"],
+            **{name: made.get(name) for name in ("ranges", "object_set", "camera", "segmentation")},
+        },
+    )
 
 
 def _episodes(folder: Path) -> Iterator[Any]:

@@ -49,7 +49,13 @@ def geometry_fingerprint(geometry: Geometry) -> str:
 
 @torch.inference_mode()
 def cloud_features(geometry: Geometry, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Features [..., 64] of clouds [..., P, 3] metres from their centres."""
+    """Features [..., 64] of clouds [..., P, 3] metres from their centres.
+
+    Raises:
+        ValueError: there are none, or no points in them.
+    """
+    if not clouds.size:
+        raise ValueError(f"clouds have the shape {list(clouds.shape)}: at least one with a point is needed")
     flat = torch.from_numpy(np.ascontiguousarray(clouds)).flatten(0, -3)
     parts = [geometry(batch.float()) for batch in flat.split(BATCH)]
     return torch.cat(parts).reshape(*clouds.shape[:-2], -1).numpy()

@@ -24,8 +24,15 @@ def observed_state(
     Args:
         observation: `centers`, `clouds` and `mask` of `cavin_pyro.envs.observation.Observation`, [M, ...].
         device: of the state; `geometry` is on the CPU.
+
+    Raises:
+        ValueError: no object, or numbers of one that are not finite.
     """
-    objects = int(np.flatnonzero(observation["mask"]).max(initial=0)) + 1
+    real = np.flatnonzero(observation["mask"])
+    for name in ("clouds", "centers"):
+        if not (observation[name][real].size and np.isfinite(observation[name][real]).all()):
+            raise ValueError(f"{name} of an observation must be finite numbers of at least one object")
+    objects = int(real.max()) + 1
     centers = torch.from_numpy(observation["centers"][:objects])
     clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
     mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))

@@ -169,7 +169,13 @@ class WindowTable:
         return indices[torch.randint(len(indices), (count,), generator=generator)]
 
     def batch(self, indices: Tensor) -> Window:
-        """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`."""
+        """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`.
+
+        Raises:
+            ValueError: there are none.
+        """
+        if not len(indices):
+            raise ValueError("a batch needs at least one window")
         positions = self.starts[indices, None] + self._steps
         objects = int(self._objects[positions].max())
         positions = send(positions, self._actions.device)

@@ -23,6 +23,7 @@ import numpy as np
 import yaml
 
 from cavin_pyro.envs.tasks import TASKS, GeneratedLayouts, Task
+from cavin_pyro.envs.tasks.reach import check_reach
 from cavin_pyro.envs.tasks.tiles import TileSet
 
 RANDOM, GENERATED = "random", "generated"
@@ -119,8 +120,8 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
         tiles: fields that replace those of the layout; None values are ignored.
 
     Raises:
-        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, or tiles that contradict
-            the task.
+        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, tiles that contradict the
+            task, or a start from which no pushes lead to the goal.
     """
     kind = task_class(task)
     path = _path(kind, layout)
@@ -132,7 +133,13 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
         raise ValueError(f"layout {path} is for task {declared}: run it with task={declared}")
     overrides = {name: value for name, value in (tiles or {}).items() if value is not None}
     where = f"layout {path} with overrides" if overrides else f"layout {path}"
-    return parse_task(kind, content | overrides, where=where)
+    made = parse_task(kind, content | overrides, where=where)
+    try:
+        if kind in TASKS.values():  # a user's task may need more than one object
+            check_reach(made)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    return made
 
 
 def parse_task(task: str | type[Task], content: Mapping[str, Any], *, where: str = "layout") -> Task:

@@ -2,6 +2,6 @@
 
 from cavin_pyro.envs.physics.arm import Arm, ArmDescription, Kinematics
 from cavin_pyro.envs.physics.bullet import PYBULLET_DATA
-from cavin_pyro.envs.physics.world import TIME_STEP, PhysicsWorld, Poses
+from cavin_pyro.envs.physics.world import TIME_STEP, PhysicsWorld, Poses, Uncopied
 
-__all__ = ["PYBULLET_DATA", "TIME_STEP", "Arm", "ArmDescription", "Kinematics", "PhysicsWorld", "Poses"]
+__all__ = ["PYBULLET_DATA", "TIME_STEP", "Arm", "ArmDescription", "Kinematics", "PhysicsWorld", "Poses", "Uncopied"]

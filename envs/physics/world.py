@@ -45,16 +45,20 @@ class Poses:
     orientations: NDArray[np.float64]
 
 
-class PhysicsWorld:
+class Uncopied:
+    """What holds a simulation."""
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse copies and pickling: a copy would push the objects of the same simulation, and close it."""
+        raise TypeError("a simulation cannot be copied: make a second environment and reset it with the same seed")
+
+
+class PhysicsWorld(Uncopied):
     """One PyBullet world in DIRECT mode with a table in it.
 
     Every `reset` starts from an empty simulation: Bullet's contact caches would otherwise keep the history of earlier
     scenes, and equal seeds would not give equal states.
     """
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse `copy.deepcopy` and pickling: a copy would push the objects of the same simulation."""
-        raise TypeError("a simulation cannot be copied: make a second environment and reset it with the same seed")
 
     def __init__(self) -> None:
         self.client = connect()  # for the files of this package alone

@@ -62,8 +62,7 @@ class DistanceToGoal:
         self._own_goals = None if reward.task.goal_is_shared else reward.task
         if self._own_goals is not None:
             return
-        alone = torch.cat([grid(), torch.zeros_like(grid()[..., :1])], -1).unsqueeze(-2)  # one object at rest
-        outcome = reward(alone, alone, torch.ones_like(alone[..., 0], dtype=torch.bool))
+        outcome = outcome_alone(reward, grid())
         self._field = DistanceField(~outcome.failure, outcome.success).to(reward.device)
 
     def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
@@ -167,3 +166,9 @@ class TaskReward:
     def maximum_return(self) -> float:
         """Upper bound on the return of any episode; infinite where progress counts."""
         return math.inf if self.dense else self.task.maximum_return
+
+
+def outcome_alone(reward: TaskReward, points: Tensor) -> Outcome:
+    """The outcome for one object alone, at rest at each of the points [..., 2] metres: [...]."""
+    alone = torch.cat([points, torch.zeros_like(points[..., :1])], -1).unsqueeze(-2)
+    return reward(alone, alone, torch.ones_like(alone[..., 0], dtype=torch.bool))

@@ -19,12 +19,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.envs.layouts import generate_task, load_task, parse_task, possible_tasks
+from cavin_pyro.envs.layouts import generate_task, layout_numbers, load_task, parse_task, possible_tasks
 from cavin_pyro.envs.pushing import PushingEnv
 from cavin_pyro.envs.tasks import TASKS, GeneratedLayouts, Step, Task, TaskReward, TileSet
 from cavin_pyro.envs.tasks.crossing import Crossing
 from cavin_pyro.envs.tasks.generated import FEWEST, MOST, neighbours, paths, reachable_tiles, starting_tiles
 from cavin_pyro.envs.tasks.insertion import Insertion
+from cavin_pyro.envs.tasks.reach import check_reach
 from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, Tile, tile_center
 
 # SHA-256 of the nine layouts of the published implementation, as listed in the paper's appendix.
@@ -233,6 +234,50 @@ def test_every_scene_has_its_own_layout_with_room_for_five_objects(task: str, ti
 def test_what_cannot_be_generated_is_refused_in_one_line(task: str, wanted: dict[str, Any], problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         PushingEnv(task=task, layout="generated", generated=GeneratedLayouts(**wanted))
+
+
+U = [[0, 1], [1, 1], [2, 1], [2, 2], [2, 3], [1, 3], [0, 3]]
+FAR = [[3, 1], [4, 1], [4, 2], [4, 3], [3, 3]]
+
+
+@pytest.mark.parametrize(
+    ("region", "start", "goal", "stuck"),
+    [
+        (U, [0, 1], [0, 3], [0, 1]),  # no tool fits between the robot and the start
+        (FAR, [3, 1], [3, 3], [4, 3]),  # nor beyond the far row, to bring the target back
+        (U, [1, 1], [0, 3], None),
+        (U[:2] + U[-2:], [0, 1], [0, 3], None),  # apart for other reasons than the tool's reach
+        ([[0, 1], [0, 2], [0, 3]], [0, 1], [0, 3], None),  # sideways
+        (FAR[:2], [3, 1], [4, 1], None),
+    ],
+)
+def test_a_start_from_which_the_tool_cannot_push_to_the_goal_is_refused(
+    region: list, start: list, goal: list, stuck: list | None, tmp_path: Path
+) -> None:
+    tiles = {"region": region, "target_start": [start], "goal": [goal], "obstacle_start": [[2, 5]]}
+    path = write(tmp_path, tiles)
+    if stuck is None:
+        assert load_task("crossing", path) == Crossing(**tiles)
+        return
+    with pytest.raises(ValueError) as caught:
+        load_task("crossing", path)
+    said = str(caught.value)
+    assert said.startswith(f"layout {path}: target_start tile {start}: no push leads on from tile {stuck} to the goal")
+    assert "\n" not in said
+
+
+def test_every_object_to_gather_must_be_within_the_reach_of_pushes() -> None:
+    tiles = {"region": [[2, 3]], "target_start": [[2, 1]], "obstacle_start": [[1, 3], [0, 3]]}
+    with pytest.raises(ValueError, match=r"obstacle_start tile \[0, 3\]: no push leads on from tile \[0, 3\]"):
+        check_reach(parse_task("gathering", tiles))
+
+
+def test_pushes_solve_every_shipped_random_and_generated_layout() -> None:
+    shipped = [load_task(task, number) for task in TASKS for number in layout_numbers(task)]
+    for one in (*shipped, *SLOTS):
+        check_reach(one)
+    for task, tiles, seed in product(("crossing", "clearing", "insertion"), (4, 6, 8), range(5)):
+        check_reach(generated(task, seed, tiles=tiles))
 
 
 STARTS = {"target_start": [[1, 3]], "obstacle_start": [[1, 5]]}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import re
 import shutil
+import subprocess
+import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from itertools import combinations
@@ -14,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cavin_pyro.envs.files import process_folder
 from cavin_pyro.envs.objects.object_sets import ObjectSet, chosen, load_object_set
 from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectParameters, ObjectRanges, arrange, sample_objects
 from cavin_pyro.envs.objects.shapes import (
@@ -211,6 +216,25 @@ def test_a_folder_that_lacks_something_gets_its_one_line(
 def test_without_a_folder_the_line_says_how_to_get_one() -> None:
     with pytest.raises(ValueError, match=r"give env.assets=DIR; get them with: python -m cavin_pyro.assets ycb --to"):
         load_object_set("mixed")
+
+
+def test_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    here, name = f"cavin_pyro_meshes_{platform.node()}_", f"{ended.pid}_abc"
+    others = [f"{here}{os.getpid()}_abc", f"{here}x_abc", f"cavin_pyro_meshes_elsewhere_{name}", f"mine_{name}"]
+    for folder in (here + name, *others):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mug.obj").touch()
+    (tmp_path / f"{here}{ended.pid}_link").symlink_to(tmp_path / others[3])
+    made = process_folder("meshes")
+    assert {path.name for path in tmp_path.iterdir()} - {f"{here}{ended.pid}_link"} == {made.name, *others}
+    assert (tmp_path / others[3] / "mug.obj").exists()
+    monkeypatch.setattr(os, "getuid", lambda: -1)
+    (tmp_path / (here + name)).mkdir()
+    process_folder("meshes")
+    assert (tmp_path / (here + name)).exists()  # another user's
 
 
 def test_the_real_objects_are_the_papers_ten(real: Scene, real_assets: Path) -> None:

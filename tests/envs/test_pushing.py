@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -123,6 +124,14 @@ def test_the_reward_is_the_task_reward_of_the_observations(make: Make, task: str
     assert changed >= 1
 
 
+def test_an_environment_has_no_copy_that_would_close_its_simulation(make: Make) -> None:
+    env = make(objects=1)
+    for one in (env, env.scene, env.scene.world):
+        for copied in (copy.copy, copy.deepcopy):
+            with pytest.raises(TypeError, match="a simulation cannot be copied: make a second environment"):
+                copied(one)
+
+
 def test_an_episode_is_cut_off_after_its_steps(make: Make) -> None:
     env = make(objects=1, maximum_steps=2)
     env.reset(seed=0)
@@ -189,6 +198,7 @@ def test_the_same_seed_and_actions_give_the_same_episode(make: Make) -> None:
         ({"objects": 11}, r"^objects must be a whole number from 1 to 10, not 11$"),
         ({"maximum_steps": 0}, r"^maximum_steps must be at least 1, not 0$"),
         ({"render_mode": "human"}, r"^unknown render_mode 'human': choose rgb_array or None$"),
+        ({"show_tiles": "x"}, r"^show_tiles must be True or False, not 'x'$"),
         ({"task": "juggling"}, r"^unknown task 'juggling': choose from clearing, crossing, "),
         ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
         ({"criterion": "lax"}, r"^unknown criterion 'lax': choose from strict, published$"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -232,11 +233,22 @@ def test_minari_loads_every_episode(
         assert (about["options"]["root_seed"], about["options"]["episode"]) == (3, arrays["episode"][index])
         assert np.array_equal(about["options"]["mass"], arrays["mass"][index])
         assert dataset.observation_space.contains({name: value[0] for name, value in episode.observations.items()})
+        assert len(episode.observations["mask"]) == len(episode.actions) + 1
+    monkeypatch.delitem(gymnasium.registry, "cavin/Pushing-v0", raising=False)  # as in a process without our imports
+    env = dataset.recover_environment()
+    configuration = read_metadata(own_pushes)["configuration"]
+    assert env.unwrapped.maximum_steps == configuration["steps"] and env.unwrapped.scene.slots == 5
+    assert list(env.unwrapped.ranges.scale) == configuration["ranges"]["scale"]
+    env.close()
+    own = configuration | {"camera": {"_target_": "my_lab.Camera"}}
+    write_metadata(own_pushes, {**read_metadata(own_pushes), "configuration": own})
+    assert data("export", "pushes", "--to", "own-v0")[1].startswith("recover_environment() will not work: camera=")
+    assert minari.load_dataset("own-v0").env_spec is None
     assert "holds a dataset already" in data("export", "pushes", "--to", "pushes-v0")[2]
     assert data("export", "pushes", "--to", "other")[2].endswith("as Minari wants: --to other-v0")
     shard_path(own_pushes, 2).unlink()
     assert "episodes-00002.h5 is missing or corrupt" in data("export", "pushes", "--to", "made/pushes-v0")[2]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pushes", "pushes-v0"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["own-v0", "pushes", "pushes-v0"]
 
 
 def test_without_minari_one_line_tells_how_to_get_it(

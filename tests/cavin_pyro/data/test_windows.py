@@ -214,6 +214,8 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
     assert batch.states.mask.tolist() == mask[[4, 1]].tolist()
     assert batch.transition_mask.all() and batch.sequence_mask.all()
     assert table.batch(torch.tensor([1])).states.objects == 2
+    with pytest.raises(ValueError, match=r"^a batch needs at least one window$"):
+        table.batch(torch.tensor([], dtype=torch.int64))
     held_out = set(table.episodes[table.validation].tolist())
     assert len(held_out) == 1 and not held_out & set(table.episodes[table.training].tolist())
     assert sorted([*table.training.tolist(), *table.validation.tolist()]) == list(range(6))
