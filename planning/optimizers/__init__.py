@@ -9,20 +9,20 @@ import inspect
 
 from cavin_pyro.planning.checks import OptimizerError
 from cavin_pyro.planning.optimizers.base import Optimizer, samples_of_iteration, search
-from cavin_pyro.planning.optimizers.cross_entropy import CrossEntropy, ImprovedCrossEntropy
+from cavin_pyro.planning.optimizers.cem import CEM, ICEM
 from cavin_pyro.planning.optimizers.evolution import Evolution
-from cavin_pyro.planning.optimizers.path_integral import PathIntegral
-from cavin_pyro.planning.optimizers.sequential_monte_carlo import SequentialMonteCarlo
+from cavin_pyro.planning.optimizers.mppi import MPPI
 from cavin_pyro.planning.optimizers.shooting import Shooting
+from cavin_pyro.planning.optimizers.smc import SMC
 
 __all__ = [
+    "CEM",
+    "ICEM",
+    "MPPI",
     "OPTIMIZERS",
-    "CrossEntropy",
+    "SMC",
     "Evolution",
-    "ImprovedCrossEntropy",
     "Optimizer",
-    "PathIntegral",
-    "SequentialMonteCarlo",
     "Shooting",
     "make_optimizer",
     "search",
@@ -30,11 +30,11 @@ __all__ = [
 
 OPTIMIZERS: dict[str, type[Optimizer]] = {
     "shooting": Shooting,
-    "cem": CrossEntropy,
-    "icem": ImprovedCrossEntropy,
-    "mppi": PathIntegral,
+    "cem": CEM,
+    "icem": ICEM,
+    "mppi": MPPI,
     "evolution": Evolution,
-    "smc": SequentialMonteCarlo,
+    "smc": SMC,
 }
 
 
@@ -60,6 +60,6 @@ def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = 
         raise OptimizerError(
             f"optimizer {type(optimizer).__name__}: optimize must take the arguments (problem, samples), not {taken}"
         ) from error
-    if isinstance(optimizer, CrossEntropy | PathIntegral | Evolution):
+    if isinstance(optimizer, CEM | MPPI | Evolution):
         samples_of_iteration(samples, optimizer.iterations, 0)
     return optimizer

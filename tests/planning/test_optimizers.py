@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cavin_pyro.planning import CavinPlanner, MpcPlanner
 from cavin_pyro.planning.optimizers import OPTIMIZERS, make_optimizer, search
-from cavin_pyro.planning.optimizers.cross_entropy import coloured
+from cavin_pyro.planning.optimizers.cem import coloured
 from cavin_pyro.planning.returns import CumulativeReward
 from cavin_pyro.planning.rollout import Candidates, SearchProblem
 

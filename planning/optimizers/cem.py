@@ -16,7 +16,7 @@ MINIMUM_SCALE = 1e-3  # so that a search never collapses onto a point
 
 
 @dataclass(frozen=True)
-class CrossEntropy:
+class CEM:
     """Samples from a Gaussian fitted to the elites of the last iteration; the first iteration samples the prior.
 
     The cross-entropy method (Rubinstein and Kroese 2004).
@@ -64,14 +64,14 @@ class CrossEntropy:
 
 
 @dataclass(frozen=True)
-class ImprovedCrossEntropy(CrossEntropy):
+class ICEM(CEM):
     """The cross-entropy method with kept elites and noise that is coloured over a plan's segments.
 
     iCEM (Pinneri et al., CoRL 2020). From the published method: coloured noise, elites that compete again in the next
     iteration, and the mean as a candidate of the last iteration. Omitted: elites carried over from the last plan.
 
     kept_elite_fraction: fraction of the elites that compete again. exponent: the noise's power falls as
-    frequency^-exponent; 0 is white, 2 makes neighbouring segments similar. For the rest see `CrossEntropy`.
+    frequency^-exponent; 0 is white, 2 makes neighbouring segments similar. For the rest see `CEM`.
     """
 
     kept_elite_fraction: float = 0.3

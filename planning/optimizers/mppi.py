@@ -14,7 +14,7 @@ from cavin_pyro.planning.rollout import SearchProblem
 
 
 @dataclass(frozen=True)
-class PathIntegral:
+class MPPI:
     """Samples around the last mean, weighted by exp(return / temperature); the first iteration samples the prior.
 
     iterations: number of iterations, which share the samples equally. temperature: temperature of the weights, in units

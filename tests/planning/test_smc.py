@@ -12,8 +12,8 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
-from cavin_pyro.planning.optimizers import SequentialMonteCarlo, search
-from cavin_pyro.planning.optimizers.sequential_monte_carlo import active_returns
+from cavin_pyro.planning.optimizers import SMC, search
+from cavin_pyro.planning.optimizers.smc import active_returns
 from cavin_pyro.planning.protocol import Evidence, SegmentRollout
 from cavin_pyro.planning.returns import CumulativeReward
 from cavin_pyro.planning.rollout import Candidates, SearchProblem
@@ -59,7 +59,7 @@ def problem_of(toy: SimpleNamespace, runs: int = RUNS, segments: int = SEGMENTS,
 
 
 def estimate(problem: SearchProblem, samples: int = SAMPLES, **options: Any) -> Evidence:
-    search(SequentialMonteCarlo(**{"temperature": 1.0, **options}), problem, samples)
+    search(SMC(**{"temperature": 1.0, **options}), problem, samples)
     (evidence,) = problem.evidence
     return evidence
 
@@ -101,7 +101,7 @@ def test_where_no_return_is_finite_z_is_zero(toy: SimpleNamespace) -> None:
 
 def test_relabelled_environments_and_obstacles_have_the_same_evidence(toy: SimpleNamespace) -> None:
     reward = toy.GoalDisc((0.3, 0.1), forbidden_below=-0.2)
-    optimizer = SequentialMonteCarlo(temperature=30.0)
+    optimizer = SMC(temperature=30.0)
     planner = CavinPlanner(toy.PointMass(), samples=100, horizon=9, optimizer=optimizer)
     places = [[(0.0, 0.0), (0.1, -0.15), (0.5, 0.2)], [(0.1, 0.1), (0.2, 0.0), (0.4, -0.1)]]
 
@@ -131,7 +131,7 @@ def begun(toy: SimpleNamespace, count: int, segments: int = 2) -> Candidates:
 def test_moves_without_a_reward_leave_the_prior_as_it_is(toy: SimpleNamespace) -> None:
     particles = begun(toy, 20_000)
     for _ in range(3):
-        particles, proposed = SequentialMonteCarlo(step=0.7)._move(particles, torch.zeros(1))
+        particles, proposed = SMC(step=0.7)._move(particles, torch.zeros(1))
         assert torch.equal(particles.noise, proposed.noise)  # nothing to refuse a proposal for
     moments = particles.noise.mean(1), particles.noise.std(1)
     for moment, expected in zip(moments, (0.0, 1.0), strict=True):
@@ -143,7 +143,7 @@ def test_moves_lead_to_the_posterior(toy: SimpleNamespace, block: int) -> None:
     # N(0, 1) times exp(-2 |x - top|^2) is N(0.8 top, 0.2).
     particles, inverse = begun(toy, 10_000), torch.tensor([2.0])
     for _ in range(40):
-        particles, _ = SequentialMonteCarlo(step=0.5, block=block)._move(particles, inverse)
+        particles, _ = SMC(step=0.5, block=block)._move(particles, inverse)
     last = particles.noise[0, :, -block:]  # what the moves touch
     expected = 0.8 * torch.tensor(TOP)
     torch.testing.assert_close(last.mean(0), expected.expand(block, 2), rtol=0, atol=0.03)
@@ -155,7 +155,7 @@ def test_moves_lead_to_the_posterior(toy: SimpleNamespace, block: int) -> None:
 def test_failed_particles_are_replaced_by_copies_of_active_ones(toy: SimpleNamespace) -> None:
     reward = toy.GoalDisc(goal=(9.0, 9.0), forbidden_below=0.0)
     problem = SearchProblem(toy.Placed(), CumulativeReward(reward), toy.scenes([[(0.0, 0.1)]]), toy.generators(0), 4)
-    found = search(SequentialMonteCarlo(moves=0), problem, 400)
+    found = search(SMC(moves=0), problem, 400)
     assert found.count == 400
     firsts = found.noise[0, :, :-1, 1]
     assert (firsts >= 0).all()  # half of the samples of each segment are not
@@ -179,4 +179,4 @@ def test_successful_particles_stay_and_failed_ones_stay_where_all_have_failed(to
 
 @pytest.mark.parametrize(("segments", "moves", "particles"), [(1, 0, 100), (1, 1, 50), (2, 1, 40), (10, 1, 34)])
 def test_moves_cost_particles(segments: int, moves: int, particles: int) -> None:
-    assert SequentialMonteCarlo(moves=moves, block=2).particles(100, segments) == particles
+    assert SMC(moves=moves, block=2).particles(100, segments) == particles

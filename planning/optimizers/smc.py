@@ -22,7 +22,7 @@ from cavin_pyro.planning.sampling import noise_each, uniform_each
 
 
 @dataclass(frozen=True)
-class SequentialMonteCarlo:
+class SMC:
     """Extends, weights, resamples and moves particles, a segment at a time.
 
     After segment k of K the particles target p(codes) exp(return so far / temperature_k). A segment's weight is the
