@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.envs.observation import Observation
-from cavin_pyro.envs.robots import STICK_RADIUS
+from cavin_pyro.envs.robots.robot import STICK_RADIUS
 from cavin_pyro.envs.workspace import normalised_push, push_endpoints
 
 CANDIDATES = 2048  # pushes sampled at once

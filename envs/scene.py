@@ -21,7 +21,8 @@ from cavin_pyro.envs.objects.sampling import Area, NoRoomError, ObjectParameters
 from cavin_pyro.envs.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from cavin_pyro.envs.physics import PhysicsWorld, Poses, Uncopied
 from cavin_pyro.envs.randomness import SENSOR, named_stream
-from cavin_pyro.envs.robots import TIP_HEIGHT, RobotFactory, Stopped, push, robot_factory, settle
+from cavin_pyro.envs.robots import RobotFactory, robot_factory
+from cavin_pyro.envs.robots.robot import TIP_HEIGHT, Stopped, push, settle
 from cavin_pyro.envs.segmentation import Pixels, SegmenterFactory, segmenter_of
 from cavin_pyro.envs.sensors import DepthImage, DepthSensor, sensor_of
 from cavin_pyro.envs.sensors.camera import Camera

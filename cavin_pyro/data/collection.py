@@ -29,7 +29,7 @@ from cavin_pyro.data.dataset import (
     write_metadata,
     write_shard,
 )
-from cavin_pyro.data.model_policy import ModelPushingPolicy, PushingPolicy, load_pusher
+from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
 from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.policy import HeuristicPushingPolicy
@@ -45,6 +45,7 @@ from cavin_pyro.storage.progress import progress_bar
 
 PUSHER = "contact"  # the checkpoint of policy=model, without another
 OPTIONS_OF_POLICIES = {"model": ("checkpoint", "motions"), "heuristic": ("intent_length", "perturbation_rate")}
+PushingPolicy = HeuristicPushingPolicy | ModelPushingPolicy
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
 
 

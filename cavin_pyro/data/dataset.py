@@ -17,7 +17,7 @@ A merged dataset has the shards of several collections one after another. What t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ FARTHEST = 100.0  # metres; the table ends before 1
 LARGEST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, "F": 4096}  # of each dimension
 
 Arrays = dict[str, NDArray[Any]]
+UNREADABLE = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError)  # what h5py raises
 
 
 @dataclass(frozen=True)
@@ -115,14 +116,26 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapp
     Raises:
         CorruptShardError: the file is missing, truncated, damaged or not a shard; it is named.
     """
+    arrays = Arrays()
+    for defect in find_damage(path, names, metadata or {}, arrays):
+        raise CorruptShardError(f"shard {path} is missing or corrupt ({defect})")
+    return arrays
+
+
+def find_damage(path: Path, names: Iterable[str] | None, metadata: Mapping[str, Any], arrays: Arrays) -> Iterator[str]:
+    """What is wrong with a file by itself, for `read_shard`; what can be read of it goes into `arrays`."""
     try:
         with h5py.File(path, "r") as file:
-            check_file(file, (metadata or {}).get("configuration", {}))
-            arrays = {name: file[name][()] for name in (names or sorted(file))}
-        check_values(arrays)
-        return arrays
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise CorruptShardError(f"shard {path} is missing or corrupt ({str(error).splitlines()[0]})") from error
+            check_file(file, metadata.get("configuration", {}))
+            for name in sorted(file) if names is None else names:
+                try:
+                    array = file[name][()]
+                    check_values(name, array)
+                    arrays[name] = array
+                except UNREADABLE as error:
+                    yield f"array {name}: {str(error).splitlines()[0]}"
+    except UNREADABLE as error:
+        yield str(error).splitlines()[0] if path.exists() else "it is missing"
 
 
 def check_file(file: h5py.File, configuration: Mapping[str, Any]) -> None:
@@ -162,19 +175,18 @@ def _check_shape(name: str, array: h5py.Dataset, sizes: dict[str, int]) -> None:
         raise ValueError(f"{name} has shape {list(array.shape)}, not {wanted}")
 
 
-def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Check that the values of declared arrays are finite and within their ranges.
+def check_values(name: str, array: NDArray[Any]) -> None:
+    """Check that the values of a declared array are finite and within their range.
 
     Raises:
         ValueError: some are not.
     """
-    for name, array in arrays.items():
-        declared = DECLARED.get(name)
-        if declared is None or array.dtype == np.bool_ or array.size == 0:
-            continue
-        low, high = array.min(), array.max()  # NaN if any is
-        if not (declared.low <= low and high <= declared.high):
-            raise ValueError(f"{name} has values outside of {declared.low:g} to {declared.high:g}: {low:g} to {high:g}")
+    declared = DECLARED.get(name)
+    if declared is None or array.dtype == np.bool_ or array.size == 0:
+        return
+    low, high = array.min(), array.max()  # NaN if any is
+    if not (declared.low <= low and high <= declared.high):
+        raise ValueError(f"{name} has values outside of {declared.low:g} to {declared.high:g}: {low:g} to {high:g}")
 
 
 def padded(arrays: Mapping[str, NDArray[Any]], objects: int) -> Arrays:
@@ -298,13 +310,19 @@ def content_records(folder: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: no dataset, or one of these shards cannot be read.
     """
-    first, records = 0, []
+    names = ("transitions", "episodes", "configuration", "made_by")
+    return [
+        {**{name: source[name] for name in names}, "fingerprint": shard_digest(path)[:12]}
+        for source, path in _first_shards(folder)
+    ]
+
+
+def _first_shards(folder: Path) -> Iterator[tuple[dict[str, Any], Path]]:
+    """Each collection in a dataset, and the path of its first shard."""
+    first = 0
     for source in sources_of(read_metadata(folder)):
-        fingerprint = shard_digest(shard_path(folder, first))[:12]
-        names = ("transitions", "episodes", "configuration", "made_by")
-        records.append({**{name: source[name] for name in names}, "fingerprint": fingerprint})
+        yield source, shard_path(folder, first)
         first += source["shards"]
-    return records
 
 
 def shard_digest(path: Path) -> str:
@@ -327,14 +345,11 @@ def check_distinct(folders: Sequence[Path]) -> None:
     """
     known: dict[str, Path] = {}
     for folder in folders:
-        first = 0
-        for source in sources_of(read_metadata(folder)):
-            path = shard_path(folder, first)
+        for _, path in _first_shards(folder):
             content = file_digest(path) if path.exists() else str(path.resolve())
             if content in known:
                 raise UserError(f"data names the same episodes twice, {known[content]} and {folder}: name them once")
             known[content] = folder
-            first += source["shards"]
 
 
 def repeated_episode(known: set[tuple[int, int]], source: int, episodes: NDArray[np.int64]) -> str | None:

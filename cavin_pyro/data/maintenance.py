@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from cavin_pyro import __version__
@@ -18,9 +17,7 @@ from cavin_pyro.data.dataset import (
     COUNTS,
     FEATURES,
     Arrays,
-    check_distinct,
-    check_file,
-    check_values,
+    find_damage,
     read_metadata,
     read_shard,
     repeated_episode,
@@ -36,7 +33,6 @@ from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
 
 WORLD = ("object_set", "camera", "segmentation", "ranges", "steps")  # options that merged datasets have in common
-_UNREADABLE = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError)  # what h5py raises
 
 
 def describe(folder: Path) -> str:
@@ -124,13 +120,13 @@ def find_defects(folder: Path) -> Iterator[str]:
     with progress_bar("verifying", total=metadata["shards"], unit="file") as bar:
         for number, source in enumerate(source_of_shards(metadata)):
             path, arrays = shard_path(folder, number), Arrays()
-            found = [*_damage(path, ARRAYS, metadata, arrays), *_contradictions(arrays, metadata)]
+            found = [*find_damage(path, ARRAYS, metadata, arrays), *_contradictions(arrays, metadata)]
             if "episode" in arrays and (repetition := repeated_episode(known, source, arrays["episode"])):
                 found.append(f"it {repetition}")
             yield from (f"{path}: {defect}" for defect in found)
             for features in (one / path.name for one in beside if (one / path.name).exists()):
                 stored = Arrays()
-                yield from (f"{features}: {defect}" for defect in _damage(features, FEATURES, metadata, stored))
+                yield from (f"{features}: {defect}" for defect in find_damage(features, FEATURES, metadata, stored))
                 if (
                     not found
                     and "shard_digest" in stored
@@ -142,22 +138,6 @@ def find_defects(folder: Path) -> Iterator[str]:
             bar.update()
     if len(lengths) == metadata["shards"] and sum(lengths) != metadata["transitions"]:
         yield f"{folder / 'metadata.json'}: counts {metadata['transitions']} transitions, the files have {sum(lengths)}"
-
-
-def _damage(path: Path, names: Mapping[str, Any], metadata: Mapping[str, Any], arrays: Arrays) -> Iterator[str]:
-    """What is wrong with a file by itself; what can be read of it goes into `arrays`."""
-    try:
-        with h5py.File(path, "r") as file:
-            check_file(file, metadata["configuration"])
-            for name in names:
-                try:
-                    array = file[name][()]
-                    check_values({name: array})
-                    arrays[name] = array
-                except _UNREADABLE as error:
-                    yield f"array {name}: {str(error).splitlines()[0]}"
-    except _UNREADABLE as error:
-        yield str(error).splitlines()[0] if path.exists() else "it is missing"
 
 
 def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str]:
@@ -186,7 +166,6 @@ def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:
     every = [read_metadata(folder) for folder in folders]
     _check_same_world(folders, every)
     _check_seeds(folders, every)
-    check_distinct(folders)
     with output_folder(target):
         if (target / "metadata.json").exists() or any(target.resolve() == folder.resolve() for folder in folders):
             raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")

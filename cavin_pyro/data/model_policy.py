@@ -7,8 +7,6 @@ Dataset aggregation corrects them: collect with the model, and train f on the ou
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,15 +23,6 @@ from cavin_pyro.planning.returns import best_of, squared_distance
 from cavin_pyro.planning.rollout import predict_states, project
 from cavin_pyro.planning.sampling import sample_each
 from cavin_pyro.storage.checkpoint import load
-
-
-class PushingPolicy(Protocol):
-    """Chooses the pushes of a collection. `intent`: what its latest push was for."""
-
-    intent: Intent
-
-    def act(self, observation: Observation) -> NDArray[np.floating]:
-        """The next normalised push [4]."""
 
 
 class ModelPushingPolicy:
@@ -53,7 +42,7 @@ class ModelPushingPolicy:
         self.intent = Intent(0, 0.0)
 
     def act(self, observation: Observation) -> NDArray[np.floating]:
-        """See `PushingPolicy`."""
+        """The next normalised push [4]."""
         if not self._left:
             with one_thread():  # sums of several threads may differ in the last digit
                 self._left = self._segment(observation)

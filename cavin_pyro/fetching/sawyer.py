@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.robots import STICK_LENGTH, STICK_RADIUS
+from cavin_pyro.envs.robots.robot import STICK_URDF, WEIGHTLESS
 from cavin_pyro.fetching.install import Files, take
 from cavin_pyro.fetching.meshes import decimated, read_mesh
 
@@ -17,25 +17,6 @@ PACKAGE = "package://"  # what stands before the archive's folders in the descri
 FACES = 3000  # of a link's mesh, which is for the camera only
 JOINTS = tuple(f"right_j{number}" for number in range(7))
 SMALLEST = "0.001"  # metres; the simulator takes no box of size zero
-
-# A link without mass would weigh a kilogram in the simulator.
-WEIGHTLESS = (
-    '<inertial><mass value="0.0001"/><inertia ixx="1e-8" iyy="1e-8" izz="1e-8" ixy="0" ixz="0" iyz="0"/></inertial>'
-)
-_ROD = (
-    f'<origin xyz="0 0 {STICK_LENGTH / 2}"/>'
-    f'<geometry><cylinder radius="{STICK_RADIUS}" length="{STICK_LENGTH}"/></geometry>'
-)
-STICK = f"""<stick>
-<link name="stick">
-<inertial><origin xyz="0 0 {STICK_LENGTH / 2}"/><mass value="0.1"/>
-<inertia ixx="2e-4" iyy="2e-4" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial>
-<visual>{_ROD}</visual><collision>{_ROD}</collision></link>
-<joint name="stick_fixed" type="fixed"><origin xyz="0 0 0"/><parent link="right_hand"/><child link="stick"/></joint>
-<link name="stick_tip">{WEIGHTLESS}</link>
-<joint name="stick_tip_fixed" type="fixed"><origin xyz="0 0 {STICK_LENGTH}"/>
-<parent link="stick"/><child link="stick_tip"/></joint>
-</stick>"""
 
 
 class SawyerRobot:
@@ -66,7 +47,7 @@ class SawyerRobot:
             if joint.get("type") == "fixed" and axis is not None:
                 joint.remove(axis)
         _write(robot, folder / "sawyer.urdf")
-        robot.extend(ElementTree.fromstring(STICK))
+        robot.extend(ElementTree.fromstring(STICK_URDF.replace("HAND", "right_hand")))
         _write(robot, folder / "sawyer_stick.urdf")
         (folder / "LICENSE").write_bytes(take(files, "LICENSE"))
 

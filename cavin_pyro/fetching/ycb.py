@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.envs.objects.shapes import RECIPES
 from cavin_pyro.fetching.install import Files, take
 from cavin_pyro.fetching.meshes import (
     closed,
@@ -27,26 +27,17 @@ TOLERANCE = 0.013  # metres by which some side may differ from a published one
 OVERHANG = 0.030  # metres by which the longest side may exceed the longest published one
 
 
-@dataclass(frozen=True)
-class Published:
-    """An object's number in the set, mass in kilograms, and sides (or diameter and height) in metres."""
-
-    number: str
-    mass: float
-    size: tuple[float, ...]
-
-
-PUBLISHED = {
-    "sugar_box": Published("004_sugar_box", 0.514, (0.038, 0.089, 0.175)),
-    "tomato_soup_can": Published("005_tomato_soup_can", 0.349, (0.066, 0.101)),
-    "tuna_fish_can": Published("007_tuna_fish_can", 0.171, (0.085, 0.033)),
-    "pudding_box": Published("008_pudding_box", 0.187, (0.035, 0.110, 0.089)),
-    "gelatin_box": Published("009_gelatin_box", 0.097, (0.028, 0.085, 0.073)),
-    "potted_meat_can": Published("010_potted_meat_can", 0.370, (0.050, 0.097, 0.082)),
-    "banana": Published("011_banana", 0.066, (0.036, 0.190)),
-    "mug": Published("025_mug", 0.118, (0.080, 0.082)),
-    "a_cups": Published("065-a_cups", 0.013, (0.055, 0.060)),
-    "rubiks_cube": Published("077_rubiks_cube", 0.094, (0.057, 0.057, 0.057)),
+SCANS = {  # the folder in the set of each object
+    "sugar_box": "004_sugar_box",
+    "tomato_soup_can": "005_tomato_soup_can",
+    "tuna_fish_can": "007_tuna_fish_can",
+    "pudding_box": "008_pudding_box",
+    "gelatin_box": "009_gelatin_box",
+    "potted_meat_can": "010_potted_meat_can",
+    "banana": "011_banana",
+    "mug": "025_mug",
+    "a_cups": "065-a_cups",
+    "rubiks_cube": "077_rubiks_cube",
 }
 
 NOTICE = """YCB Object and Model Set: B. Calli, A. Walsman, A. Singh, S. Srinivasa, P. Abbeel, A. M. Dollar, 2015.
@@ -60,7 +51,7 @@ class YcbObjects:
 
     name = "ycb"
     site = "https://ycb-benchmarks.s3.amazonaws.com"
-    pieces = {name: f"data/google/{one.number}_google_16k.tgz" for name, one in PUBLISHED.items()}
+    pieces = {name: f"data/google/{scan}_google_16k.tgz" for name, scan in SCANS.items()}
     wanted: tuple[str, ...] = ("google_16k/nontextured.ply",)
 
     def make(self, piece: str, files: Files, folder: Path) -> None:
@@ -68,7 +59,7 @@ class YcbObjects:
         scan = read_mesh(take(files, self.wanted[0]), "ply", piece)
         long_side_along_x(scan)
         _check_size(piece, scan)
-        body, mass = closed(scan), PUBLISHED[piece].mass
+        body, (_, _, mass) = closed(scan), RECIPES[piece]
         body.density = mass / body.volume
         scan.apply_translation(-body.center_mass)
         mesh = decimated(scan, VISUAL_FACES)
@@ -85,19 +76,19 @@ class YcbObjects:
     def verify(self, folder: Path) -> str:
         """See `Kind`; looks at the files that the simulator will read."""
         manifest = read_json(folder / "meta.json")
-        for name, one in PUBLISHED.items():
+        for name, (_, _, mass) in RECIPES.items():
             if not isinstance(manifest, dict) or name not in manifest:
                 raise UserError(f"{folder} lacks {name}")
             (mesh,), parts = read_parts(folder / f"{name}.obj"), read_parts(folder / f"{name}_vhacd.obj")
             _check_size(name, mesh)
             _check_parts(name, mesh, parts)
-            if manifest[name].get("mass") != one.mass:
-                raise UserError(f"{name} weighs {manifest[name].get('mass')} kg, not {one.mass} as published")
-        return f"{len(PUBLISHED)} objects, as published in size and mass"
+            if manifest[name].get("mass") != mass:
+                raise UserError(f"{name} weighs {manifest[name].get('mass')} kg, not {mass} as published")
+        return f"{len(RECIPES)} objects, as published in size and mass"
 
 
 def _check_size(name: str, mesh: trimesh.Trimesh) -> None:
-    sides, published = mesh.extents, PUBLISHED[name].size
+    sides, published = mesh.extents, RECIPES[name][1]
     missing = [side for side in published if not np.abs(sides - side).min() <= TOLERANCE]
     if missing or sides.max() > max(published) + OVERHANG:
         found, wanted = (" x ".join(f"{1e3 * side:.0f}" for side in sorted(size)) for size in (sides, published))

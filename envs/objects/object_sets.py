@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -71,25 +71,32 @@ class ObjectSet(Protocol):
         """
 
 
-class ShapeObjects:
-    """Shapes of `cavin_pyro.envs.objects.shapes`, each written to a temporary folder at its first use.
+class NamedObjects:
+    """An object set from a function for each name, which makes the object of that name when it is asked for."""
 
-    Args:
-        names: of the objects. build: makes the shape of a name.
-    """
-
-    def __init__(self, names: tuple[str, ...], build: Callable[[str], Shape]) -> None:
-        self.names, self._build = names, build
+    def __init__(self, makers: Mapping[str, Callable[[str], ObjectAsset]]) -> None:
+        self.makers, self.names = makers, tuple(makers)
 
     def asset(self, name: str) -> ObjectAsset:
-        _check_name(name, self.names)
-        shape = self._build(name)
+        """See `ObjectSet`."""
+        if name not in self.makers:
+            raise ValueError(f"unknown object {name!r}: choose from {listed(self.names)}")
+        return self.makers[name](name)
+
+
+def shape_objects(names: Iterable[str], build: Callable[[str], Shape]) -> NamedObjects:
+    """Shapes of `cavin_pyro.envs.objects.shapes`, each written to a temporary folder when it is used."""
+
+    def asset(name: str) -> ObjectAsset:
+        shape = build(name)
         mesh = write_mesh(shape, _mesh_folder())
         return ObjectAsset(shape.name, shape.mass, shape.radius, collision=mesh, visual=mesh)
 
+    return NamedObjects(dict.fromkeys(names, asset))
 
-class ScannedObjects:
-    """The objects of the folder `assets/ycb`, called `ycb/NAME`. The constructor checks every file.
+
+def scanned_objects(assets: str | Path | None) -> NamedObjects:
+    """The objects of the folder `assets/ycb`, called `ycb/NAME`; every file is checked.
 
     The folder has for each object `NAME.obj` (visual mesh) and `NAME_vhacd.obj` (collision mesh: one convex part per
     group), in metres, z up, with the origin at the centre of mass, and one `meta.json` with names, masses (kilograms)
@@ -102,47 +109,25 @@ class ScannedObjects:
     Raises:
         ValueError: no folder was named, or a file in it is missing or damaged; the message says which command makes it.
     """
-
-    def __init__(self, assets: str | Path | None) -> None:
-        if assets is None:
-            raise ValueError(f"these objects are scans, in no folder that was named: give env.assets=DIR; {_GET}")
-        folder = assets_folder(assets) / SCANS
-        try:
-            manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
-            self._assets = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in manifest.items()}
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            what = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else f"damaged: {error!r}"
-            get = _GET.replace("DIR", str(folder.parent))
-            raise ValueError(f"the objects in {folder} cannot be used ({what[:200]}); {get}") from error
-        self.names = tuple(self._assets)
-
-    def asset(self, name: str) -> ObjectAsset:
-        _check_name(name, self.names)
-        return self._assets[name]
+    if assets is None:
+        raise ValueError(f"these objects are scans, in no folder that was named: give env.assets=DIR; {_GET}")
+    folder = assets_folder(assets) / SCANS
+    try:
+        manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+        scans = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in manifest.items()}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+        what = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else f"damaged: {error!r}"
+        get = _GET.replace("DIR", str(folder.parent))
+        raise ValueError(f"the objects in {folder} cannot be used ({what[:200]}); {get}") from error
+    return NamedObjects(dict.fromkeys(scans, scans.__getitem__))
 
 
-class MixedObjects:
-    """Several sets as one.
-
-    Args:
-        sets: without common names.
-    """
-
-    def __init__(self, *sets: ObjectSet) -> None:
-        self._sets = {name: one for one in sets for name in one.names}
-        self.names = tuple(self._sets)
-
-    def asset(self, name: str) -> ObjectAsset:
-        _check_name(name, self.names)
-        return self._sets[name].asset(name)
-
-
-BUILTIN = ShapeObjects(BUILTIN_NAMES, builtin_shape)
+BUILTIN = shape_objects(BUILTIN_NAMES, builtin_shape)
 OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
     "builtin": lambda assets: BUILTIN,
-    "ycb": ScannedObjects,
-    "mixed": lambda assets: MixedObjects(BUILTIN, ScannedObjects(assets)),
-    "random": lambda assets: ShapeObjects(RANDOM_NAMES, random_shape),
+    "ycb": scanned_objects,
+    "mixed": lambda assets: NamedObjects({**BUILTIN.makers, **scanned_objects(assets).makers}),
+    "random": lambda assets: shape_objects(RANDOM_NAMES, random_shape),
 }
 """Factories of object sets by name; their argument is the folder of assets, or None."""
 
@@ -180,11 +165,6 @@ def listed(names: Iterable[str]) -> str:
     """Names for a one-line message: all of them, or both ends of a long list."""
     every = list(names)
     return ", ".join(every if len(every) <= 40 else [*every[:2], "...", every[-1]])
-
-
-def _check_name(name: str, names: Sequence[str]) -> None:
-    if name not in names:
-        raise ValueError(f"unknown object {name!r}: choose from {listed(names)}")
 
 
 @cache

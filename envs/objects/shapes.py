@@ -9,7 +9,7 @@ Randomization and Generative Models for Robotic Grasping", whose recipe this fol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -110,26 +110,27 @@ def _banana(thickness: float, length: float) -> list[trimesh.Trimesh]:
     return [_hull(np.vstack(pair)) for pair in pairwise(sections)]
 
 
-_RECIPES = {  # metres and kilograms
-    "sugar_box": (lambda: _box(0.038, 0.089, 0.175), 0.514),
-    "tomato_soup_can": (lambda: _cylinder(0.066, 0.101), 0.349),
-    "tuna_fish_can": (lambda: _cylinder(0.085, 0.033), 0.171),
-    "pudding_box": (lambda: _box(0.110, 0.089, 0.035), 0.187),
-    "gelatin_box": (lambda: _box(0.085, 0.073, 0.028), 0.097),
-    "potted_meat_can": (lambda: _box(0.050, 0.097, 0.082), 0.370),
-    "banana": (lambda: _banana(0.036, 0.190), 0.066),
-    "mug": (lambda: _mug(0.080, 0.082), 0.118),
-    "a_cups": (lambda: _lathed(0.045, 0.055, 0.060), 0.013),
-    "rubiks_cube": (lambda: _box(0.057, 0.057, 0.057), 0.094),
+# How each is made of its published sides (or diameters, then height), metres; and its published mass, kilograms.
+RECIPES: dict[str, tuple[Callable[..., list[trimesh.Trimesh]], tuple[float, ...], float]] = {
+    "sugar_box": (_box, (0.038, 0.089, 0.175), 0.514),
+    "tomato_soup_can": (_cylinder, (0.066, 0.101), 0.349),
+    "tuna_fish_can": (_cylinder, (0.085, 0.033), 0.171),
+    "pudding_box": (_box, (0.110, 0.089, 0.035), 0.187),
+    "gelatin_box": (_box, (0.085, 0.073, 0.028), 0.097),
+    "potted_meat_can": (_box, (0.050, 0.097, 0.082), 0.370),
+    "banana": (_banana, (0.036, 0.190), 0.066),
+    "mug": (_mug, (0.080, 0.082), 0.118),
+    "a_cups": (_lathed, (0.045, 0.055, 0.060), 0.013),
+    "rubiks_cube": (_box, (0.057, 0.057, 0.057), 0.094),
 }
-BUILTIN_NAMES = tuple(_RECIPES)
+BUILTIN_NAMES = tuple(RECIPES)
 
 
 @cache
 def builtin_shape(name: str) -> Shape:
     """Build the shape of a name in `BUILTIN_NAMES`."""
-    build, mass = _RECIPES[name]
-    return shape_of(name, build(), mass)
+    build, size, mass = RECIPES[name]
+    return shape_of(name, build(*size), mass)
 
 
 def shape_of(name: str, parts: Sequence[trimesh.Trimesh], mass: float) -> Shape:

@@ -9,35 +9,9 @@ from pathlib import Path
 from cavin_pyro.envs.physics import PhysicsWorld
 from cavin_pyro.envs.robots.arm import ArmRobot
 from cavin_pyro.envs.robots.panda import panda
-from cavin_pyro.envs.robots.robot import (
-    SETTLED_SPEED,
-    STICK_LENGTH,
-    STICK_RADIUS,
-    TIP_HEIGHT,
-    Robot,
-    Stopped,
-    push,
-    settle,
-)
+from cavin_pyro.envs.robots.robot import Robot
 from cavin_pyro.envs.robots.sawyer import sawyer
-from cavin_pyro.envs.robots.stick import RETRACTED, StickRobot
-
-__all__ = [
-    "RETRACTED",
-    "ROBOTS",
-    "SETTLED_SPEED",
-    "STICK_LENGTH",
-    "STICK_RADIUS",
-    "TIP_HEIGHT",
-    "ArmRobot",
-    "Robot",
-    "RobotFactory",
-    "StickRobot",
-    "Stopped",
-    "push",
-    "robot_factory",
-    "settle",
-]
+from cavin_pyro.envs.robots.stick import StickRobot
 
 RobotFactory = Callable[[PhysicsWorld], Robot]
 """Puts a robot into an empty world."""

@@ -8,21 +8,12 @@ from xml.etree import ElementTree
 
 from cavin_pyro.envs.files import process_folder
 from cavin_pyro.envs.physics import PYBULLET_DATA, ArmDescription
-from cavin_pyro.envs.physics.arm import STICK, TIP
-from cavin_pyro.envs.robots.robot import STICK_LENGTH, STICK_RADIUS
+from cavin_pyro.envs.robots.robot import STICK_URDF
 
 POSTURE = (0.0, 0.3, 0.0, -1.8, 0.0, 2.2, 0.78)  # radians
 HOME = (1.51, 0.0, -0.03, -1.92, 0.02, 1.79, 0.63)  # radians; turned to the left, beside the table
 # Close to the table, for the Panda's arm is shorter than the Sawyer's; the two far corners are still too far away.
 BASE = (0.10, 0.0, 0.0)  # metres
-_LINK = """<link name="{name}">
-  <inertial><origin xyz="0 0 {middle}"/><mass value="{mass}"/>
-    <inertia ixx="{wide}" iyy="{wide}" izz="{thin}" ixy="0" ixz="0" iyz="0"/></inertial>{shapes}
-</link>"""
-_SHAPE = """<{kind}><origin xyz="0 0 {middle}"/>
-  <geometry><cylinder radius="{radius}" length="{length}"/></geometry></{kind}>"""
-_JOINT = """<joint name="{child}_fixed" type="fixed"><origin xyz="0 0 {height}"/><parent link="{parent}"/>
-  <child link="{child}"/></joint>"""
 
 
 def panda(assets: str | Path | None = None) -> ArmDescription:
@@ -38,10 +29,7 @@ def panda(assets: str | Path | None = None) -> ArmDescription:
 
 @cache
 def _urdf() -> Path:
-    """PyBullet's Panda without its hand, a stick on the flange instead, in a temporary folder of this process.
-
-    The stick is a link of the arm, not a constrained body: a constraint between bodies yields under load.
-    """
+    """PyBullet's Panda without its hand, a stick on the flange instead, in a temporary folder of this process."""
     source = PYBULLET_DATA / "franka_panda"
     tree = ElementTree.parse(source / "panda.urdf")
     robot = tree.getroot()
@@ -50,16 +38,7 @@ def _urdf() -> Path:
             robot.remove(part)
     for mesh in robot.iter("mesh"):
         mesh.attrib["filename"] = mesh.attrib["filename"].replace("package://", f"{source.as_posix()}/")
-    middle = STICK_LENGTH / 2
-    cylinder = {"middle": middle, "radius": STICK_RADIUS, "length": STICK_LENGTH}
-    shapes = "".join(_SHAPE.format(kind=kind, **cylinder) for kind in ("visual", "collision"))
-    for text in (
-        _LINK.format(name=STICK, middle=middle, mass=0.1, wide=2e-4, thin=1e-5, shapes=shapes),
-        _JOINT.format(parent="panda_link8", child=STICK, height=0.0),
-        _LINK.format(name=TIP, middle=0.0, mass=1e-4, wide=1e-8, thin=1e-8, shapes=""),
-        _JOINT.format(parent=STICK, child=TIP, height=STICK_LENGTH),
-    ):
-        robot.append(ElementTree.fromstring(text))
+    robot.extend(ElementTree.fromstring(STICK_URDF.replace("HAND", "panda_link8")))
     path = process_folder("panda") / "panda_stick.urdf"
     tree.write(path)
     return path

@@ -22,6 +22,25 @@ TIP_HEIGHT = 0.008  # metres above the table while pushing; lower than the flatt
 ABOVE_HEIGHT = 0.22  # metres above the table; higher than the tallest object standing, 0.175 m at scale 1.2
 PUSH_STEPS = 80  # physics steps for one push, a third of a second
 
+# The stick as links of an arm's URDF: a constraint between bodies would yield under load.
+WEIGHTLESS = (  # a link without mass would weigh a kilogram in the simulator
+    '<inertial><mass value="0.0001"/><inertia ixx="1e-8" iyy="1e-8" izz="1e-8" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+_ROD = (
+    f'<origin xyz="0 0 {STICK_LENGTH / 2}"/>'
+    f'<geometry><cylinder radius="{STICK_RADIUS}" length="{STICK_LENGTH}"/></geometry>'
+)
+STICK_URDF = f"""<stick>
+<link name="stick">
+<inertial><origin xyz="0 0 {STICK_LENGTH / 2}"/><mass value="0.1"/>
+<inertia ixx="2e-4" iyy="2e-4" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial>
+<visual>{_ROD}</visual><collision>{_ROD}</collision></link>
+<joint name="stick_fixed" type="fixed"><origin xyz="0 0 0"/><parent link="HAND"/><child link="stick"/></joint>
+<link name="stick_tip">{WEIGHTLESS}</link>
+<joint name="stick_tip_fixed" type="fixed"><origin xyz="0 0 {STICK_LENGTH}"/>
+<parent link="stick"/><child link="stick_tip"/></joint>
+</stick>"""
+
 Point = NDArray[np.float64]
 Stopped = Literal["", "unreachable", "blocked", "table"]
 """Why a motion ended early.

@@ -105,9 +105,7 @@ def _left_over(
     if not absent:
         return {}
     explained = np.any([one.region for one in found.values()] or [np.zeros_like(concerned)], axis=0)
-    labels, count = ndimage.label(concerned & ~ndimage.binary_dilation(explained, AROUND), AROUND)
-    pieces = [labels == 1 + number for number in range(count)]
-    pieces = [piece for piece in pieces if piece.sum() * CELL**2 >= MINIMUM_AREA]
+    pieces = _connected(concerned & ~ndimage.binary_dilation(explained, AROUND))
     observed = [shape_of(piece, heights.filled) for piece in pieces]
     matched = zip(absent.items(), _assign(list(absent.values()), observed), strict=True)
     return {
@@ -194,8 +192,12 @@ def _pieces(taken: Mask, heights: HeightMap) -> list[Mask]:
     """Regions of the map large enough for an object, outside of the cells `taken` by unmoved objects."""
     # Noise makes outlines flicker: a thin seam around an unmoved object belongs to it.
     seams = ndimage.binary_dilation(taken, AROUND)
-    free = ndimage.binary_closing(heights.occupied & ~seams, AROUND) & ~seams
-    labels, count = ndimage.label(free, AROUND)
+    return _connected(ndimage.binary_closing(heights.occupied & ~seams, AROUND) & ~seams)
+
+
+def _connected(cells: Mask) -> list[Mask]:
+    """The connected regions of some cells [I, J] that are large enough for an object."""
+    labels, count = ndimage.label(cells, AROUND)
     pieces = [labels == 1 + number for number in range(count)]
     return [piece for piece in pieces if piece.sum() * CELL**2 >= MINIMUM_AREA]
 

@@ -118,5 +118,5 @@ def _slot_in_far_side(place: int) -> Insertion:
 
 
 def _insertion(region: set[Tile], goal: set[Tile], target_start: set[Tile], obstacle_start: set[Tile]) -> Insertion:
-    groups = (TileSet(sorted(tiles)) for tiles in (region, goal, target_start, obstacle_start))
-    return Insertion(**dict(zip(("region", "goal", "target_start", "obstacle_start"), groups, strict=True)))
+    groups = {"region": region, "goal": goal, "target_start": target_start, "obstacle_start": obstacle_start}
+    return Insertion(**{name: TileSet(sorted(tiles)) for name, tiles in groups.items()})

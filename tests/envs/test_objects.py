@@ -28,7 +28,7 @@ from cavin_pyro.envs.objects.shapes import (
     builtin_shape,
     random_shape,
 )
-from cavin_pyro.envs.robots import SETTLED_SPEED
+from cavin_pyro.envs.robots.robot import SETTLED_SPEED
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from cavin_pyro.envs.objects.sampling import Area, ObjectRanges
 from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.policy import START_CLEARANCE, HeuristicPushingPolicy
-from cavin_pyro.envs.robots import STICK_RADIUS
+from cavin_pyro.envs.robots.robot import STICK_RADIUS
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, push_endpoints
 

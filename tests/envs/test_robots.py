@@ -13,9 +13,8 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavin_pyro.envs.robots import TIP_HEIGHT, push
 from cavin_pyro.envs.robots.arm import inverse_kinematics
-from cavin_pyro.envs.robots.robot import ABOVE_HEIGHT
+from cavin_pyro.envs.robots.robot import ABOVE_HEIGHT, TIP_HEIGHT, push
 from cavin_pyro.envs.robots.sawyer import sawyer
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW

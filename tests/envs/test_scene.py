@@ -14,7 +14,7 @@ from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.envs.physics import PhysicsWorld
 from cavin_pyro.envs.physics.visuals import Part
 from cavin_pyro.envs.pushing import VIDEO_SIZE, PushingEnv
-from cavin_pyro.envs.robots import SETTLED_SPEED, STICK_RADIUS
+from cavin_pyro.envs.robots.robot import SETTLED_SPEED, STICK_RADIUS
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.sensors.camera import Camera
 from cavin_pyro.envs.tasks import GOAL_MARKING, TileSet

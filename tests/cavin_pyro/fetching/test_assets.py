@@ -19,11 +19,11 @@ import trimesh
 
 from cavin_pyro.assets import main
 from cavin_pyro.envs.objects.object_sets import load_object_set
-from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
-from cavin_pyro.envs.robots import STICK_LENGTH
+from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES, RECIPES
+from cavin_pyro.envs.robots.robot import STICK_LENGTH
 from cavin_pyro.fetching.meshes import closed, convex_parts
 from cavin_pyro.fetching.sawyer import COMMIT, PACKAGE, SawyerRobot
-from cavin_pyro.fetching.ycb import PUBLISHED, YcbObjects
+from cavin_pyro.fetching.ycb import SCANS, YcbObjects
 
 pytest.importorskip("pooch", reason="pooch is not installed: it comes with the extras assets and test")
 
@@ -40,9 +40,11 @@ def packed(files: dict[str, bytes]) -> bytes:
 
 def scan(name: str, scale: float = 1.0) -> bytes:
     """A convex body of an object's published size, turned and moved as scans are."""
-    size = PUBLISHED[name].size
+    size = RECIPES[name][1]
     if name == "banana":
         mesh = trimesh.creation.box((0.190, 0.069, 0.036))
+    elif name == "a_cups":
+        mesh = trimesh.creation.cylinder(radius=size[1] / 2, height=size[2], sections=32)
     elif len(size) == 2:
         mesh = trimesh.creation.cylinder(radius=size[0] / 2, height=size[1], sections=32)
     else:
@@ -54,10 +56,10 @@ def scan(name: str, scale: float = 1.0) -> bytes:
 
 
 def ycb_archive(name: str, content: bytes) -> bytes:
-    return packed({f"{PUBLISHED[name].number}/google_16k/nontextured.ply": content})
+    return packed({f"{SCANS[name]}/google_16k/nontextured.ply": content})
 
 
-ARCHIVES = {YcbObjects.pieces[name]: ycb_archive(name, scan(name)) for name in PUBLISHED}
+ARCHIVES = {YcbObjects.pieces[name]: ycb_archive(name, scan(name)) for name in SCANS}
 SUGAR, CAN = list(ARCHIVES)[:2]
 
 
