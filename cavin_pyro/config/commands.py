@@ -263,7 +263,7 @@ class SceneConfig(DeviceOptions):
     criterion: str = option(
         ENV["criterion"],
         "which violations end an episode: those of the paper's text, or of its code",
-        choices="cavin_pyro.envs.tasks.CRITERIA",
+        choices="cavin_pyro.envs.tasks.reward.CRITERIA",
     )
     objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)

@@ -18,17 +18,8 @@ from cavin_pyro import __version__
 from cavin_pyro.config.commands import COLLECTION_CLEARANCE, CollectConfig, CollectionOptions, WorldConfig
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.world import object_ranges, part_of
-from cavin_pyro.data.dataset import (
-    ARRAYS,
-    COUNTS,
-    Arrays,
-    CorruptShardError,
-    read_metadata,
-    read_shard,
-    shard_path,
-    write_metadata,
-    write_shard,
-)
+from cavin_pyro.data import dataset
+from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
 from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from cavin_pyro.envs.observation import Observation
@@ -117,12 +108,12 @@ def collect(
     ):
         while metadata["transitions"] < transitions:
             arrays = next(shards)
-            write_shard(shard_path(folder, metadata["shards"]), arrays)
+            dataset.write_shard(dataset.shard_path(folder, metadata["shards"]), arrays)
             made = int(arrays["length"].sum())
             metadata["shards"] += 1
             metadata["episodes"] += len(arrays["length"])
             metadata["transitions"] += made
-            write_metadata(folder, metadata)
+            dataset.write_metadata(folder, metadata)
             bar.update(made)
     return metadata
 
@@ -185,7 +176,7 @@ def clutter_area(generator: np.random.Generator) -> Area:
 def _blank(config: CollectionConfig, scene: Scene) -> Arrays:
     sizes = {"S": config.steps, "S+1": config.steps + 1, "M": scene.slots, "P": POINTS_PER_OBJECT}
     arrays: Arrays = {}
-    for name, declared in ARRAYS.items():
+    for name, declared in dataset.ARRAYS.items():
         shape = [one if isinstance(one, int) else sizes[one] for one in declared.dimensions[1:]]  # without E
         arrays[name] = np.full(shape, declared.padding, declared.dtype)
     for slot, one in enumerate(scene.objects):
@@ -267,9 +258,9 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
             "configuration": wanted,
             "shape_names": list(part_of("objects", config.object_set, config.assets).names),
             "made_by": f"cavin_pyro {__version__}",
-            **dict.fromkeys(COUNTS, 0),
+            **dict.fromkeys(dataset.COUNTS, 0),
         }
-    metadata = read_metadata(folder)
+    metadata = dataset.read_metadata(folder)
     if "sources" in metadata:
         raise UserError(f"{folder} holds a merged dataset, which cannot grow: choose another output=DIR")
     stored = metadata["configuration"]
@@ -301,11 +292,11 @@ def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 
     metadata, damaged = _begin(config, folder), []
     for number in range(metadata["shards"]):
         try:
-            read_shard(shard_path(folder, number), metadata=metadata)
-        except CorruptShardError as error:
+            dataset.read_shard(dataset.shard_path(folder, number), metadata=metadata)
+        except dataset.CorruptShardError as error:
             print(f"collecting again: {error.args[0]}", flush=True)
             damaged.append(number)
     with closing(_shards(config, damaged, workers=workers)) as shards:
         for number, arrays in zip(damaged, shards, strict=True):
-            write_shard(shard_path(folder, number), arrays)
+            dataset.write_shard(dataset.shard_path(folder, number), arrays)
     return len(damaged)

@@ -17,17 +17,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import (
-    ARRAYS,
-    Arrays,
-    iterate_shards,
-    padded,
-    read_metadata,
-    seed_of,
-    slots_of,
-    source_of_shards,
-    sources_of,
-)
+from cavin_pyro.data import dataset
+from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.workspace import POINTS_PER_OBJECT
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
@@ -61,7 +52,7 @@ def export(folder: Path, target: Path) -> int:
         raise UserError(f"export needs Minari ({error}): pip install -c constraints.txt -e '.[minari]'") from error
     if not re.fullmatch(r"[\w-]+-v\d+", target.resolve().name):
         raise UserError(f"--to {target} must end in a name and a version, as Minari wants: --to {target}-v0")
-    metadata = read_metadata(folder)
+    metadata = dataset.read_metadata(folder)
     with output_folder(target):
         written, partial = target / "data", target / ".data.partial"
         if written.exists():
@@ -70,7 +61,7 @@ def export(folder: Path, target: Path) -> int:
         try:
             storage = MinariStorage.new(
                 partial.resolve(),  # because Minari takes the size of what it has written from a relative path twice
-                observation_space=observation_space(slots_of(metadata)),
+                observation_space=observation_space(dataset.slots_of(metadata)),
                 action_space=spaces.Box(-1.0, 1.0, (4,), np.float32),
                 env_spec=environment_of(metadata),
                 data_format="hdf5",
@@ -112,7 +103,7 @@ def environment_of(metadata: Mapping[str, Any]) -> EnvSpec | None:
         id="cavin/Pushing-v0",
         entry_point="cavin_pyro.envs.pushing:PushingEnv",  # which Gymnasium imports, so that nobody needs to
         kwargs={
-            "objects": made.get("maximum_objects", slots_of(metadata)),
+            "objects": made.get("maximum_objects", dataset.slots_of(metadata)),
             "maximum_steps": made["steps"],
             **{name: made.get(name) for name in ("ranges", "object_set", "camera", "segmentation")},
         },
@@ -123,11 +114,12 @@ def _episodes(folder: Path) -> Iterator[Any]:
     """The episodes of a dataset without their padding, a shard in memory at a time."""
     from minari.data_collector import EpisodeBuffer
 
-    metadata = read_metadata(folder)
-    seeds, sources = [seed_of(source) for source in sources_of(metadata)], source_of_shards(metadata)
+    metadata = dataset.read_metadata(folder)
+    seeds = [dataset.seed_of(source) for source in dataset.sources_of(metadata)]
+    sources = dataset.source_of_shards(metadata)
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
-        for number, shard in iterate_shards(folder, tuple(ARRAYS)):
-            arrays = padded(shard, slots_of(metadata))
+        for number, shard in dataset.iterate_shards(folder, tuple(dataset.ARRAYS)):
+            arrays = dataset.padded(shard, dataset.slots_of(metadata))
             for index in range(len(arrays["length"])):
                 options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}
                 options |= {name: arrays[name][index] for name in OBJECTS}

@@ -18,16 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import (
-    FEATURES,
-    Arrays,
-    check_distinct,
-    read_metadata,
-    read_shard,
-    shard_digest,
-    shard_path,
-    write_shard,
-)
+from cavin_pyro.data import dataset
+from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.objects.object_sets import listed, plain_name
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.files import clear_abandoned
@@ -70,18 +62,18 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
     Raises:
         CorruptShardError: the shard is corrupt.
     """
-    shard, metadata = shard_path(folder, number), read_metadata(folder)
+    shard, metadata = dataset.shard_path(folder, number), dataset.read_metadata(folder)
     path = folder / f"features-{fingerprint}" / shard.name
-    digest = np.frombuffer(bytes.fromhex(shard_digest(shard)), np.uint8)
+    digest = np.frombuffer(bytes.fromhex(dataset.shard_digest(shard)), np.uint8)
     with suppress(UserError):  # there are none, or damaged ones, which is no loss
-        stored = read_shard(path, tuple(FEATURES), metadata=metadata)
+        stored = dataset.read_shard(path, tuple(dataset.FEATURES), metadata=metadata)
         if np.array_equal(stored["shard_digest"], digest):
             return stored["features"]
-    features = cloud_features(geometry, read_shard(shard, ("clouds",), metadata=metadata)["clouds"])
+    features = cloud_features(geometry, dataset.read_shard(shard, ("clouds",), metadata=metadata)["clouds"])
     with suppress(OSError):  # a dataset on a read-only or full disk can still be trained on
         path.parent.mkdir(exist_ok=True)
         clear_abandoned(path.parent, older_than=ABANDONED_SECONDS)
-        write_shard(path, {"features": features, "shard_digest": digest})
+        dataset.write_shard(path, {"features": features, "shard_digest": digest})
     return features
 
 
@@ -91,7 +83,7 @@ def find_held_out(names: Sequence[str], folders: Sequence[Path], *, option: str)
     Raises:
         UserError: no dataset, or none has an object of such a name; `option` is where the names were given.
     """
-    known = [read_metadata(folder).get("shape_names", []) if names else [] for folder in folders]
+    known = [dataset.read_metadata(folder).get("shape_names", []) if names else [] for folder in folders]
     every = dict.fromkeys(plain_name(name) for one in known for name in one)
     for name in names:
         if name not in every:
@@ -117,11 +109,11 @@ def sample_clouds(
         UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
     """
     excluded = find_held_out(held_out_objects, folders, option="held_out_objects")
-    check_distinct(folders)
+    dataset.check_distinct(folders)
     shards = [
         (folder, number, numbers, metadata)
         for folder, numbers in zip(folders, excluded, strict=True)
-        for metadata in [read_metadata(folder)]
+        for metadata in [dataset.read_metadata(folder)]
         for number in range(metadata["shards"])
     ]
     chosen = generator.permutation(len(shards))[: max(1, min(len(shards), 100))]
@@ -129,7 +121,7 @@ def sample_clouds(
     sampled = []
     names = ("clouds", "visible", "length", "shape", "scale")
     for folder, number, numbers, metadata in [shards[index] for index in sorted(chosen)]:
-        arrays = read_shard(shard_path(folder, number), names, metadata=metadata)
+        arrays = dataset.read_shard(dataset.shard_path(folder, number), names, metadata=metadata)
         steps = np.arange(arrays["visible"].shape[1])
         real = arrays["visible"] & (steps[None, :, None] <= arrays["length"][:, None, None])
         real &= ~held_out(arrays, numbers)[:, None]

@@ -12,22 +12,8 @@ import numpy as np
 from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import shown
-from cavin_pyro.data.dataset import (
-    ARRAYS,
-    COUNTS,
-    FEATURES,
-    Arrays,
-    find_damage,
-    read_metadata,
-    read_shard,
-    repeated_episode,
-    seed_of,
-    shard_digest,
-    shard_path,
-    source_of_shards,
-    sources_of,
-    write_metadata,
-)
+from cavin_pyro.data import dataset
+from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS
 from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
@@ -41,8 +27,8 @@ def describe(folder: Path) -> str:
     Raises:
         UserError: no dataset.
     """
-    metadata = read_metadata(folder)
-    configuration, sources = metadata["configuration"], sources_of(metadata)
+    metadata = dataset.read_metadata(folder)
+    configuration, sources = metadata["configuration"], dataset.sources_of(metadata)
     whole, by_count, by_shape = _count(folder, metadata)
     full = metadata["transitions"] / (metadata["episodes"] * configuration["steps"])
     features = sorted(path for path in folder.glob("features-*") if path.is_dir())
@@ -53,7 +39,7 @@ def describe(folder: Path) -> str:
         f"{full:.1%} full",
         "files": f"{whole} of {metadata['shards']} readable, {_size(folder.glob('episodes-*.h5'))}; features of "
         f"{len(features)} geometries, {_size(file for one in features for file in one.glob('*.h5'))}",
-        "seeds": ", ".join(f"{seed_of(source)} ({source['episodes']} episodes)" for source in sources),
+        "seeds": ", ".join(f"{dataset.seed_of(source)} ({source['episodes']} episodes)" for source in sources),
         "objects": ", ".join(map("{} {}".format, metadata.get("shape_names", []), by_shape)),
         "on the table": ", ".join(f"{n}: {count}" for n, count in enumerate(by_count) if count)
         + " (objects: episodes)",
@@ -70,7 +56,7 @@ def _count(folder: Path, metadata: Mapping[str, Any]) -> tuple[int, list[int], l
     whole = 0
     for number in range(metadata["shards"]):
         try:
-            arrays = read_shard(shard_path(folder, number), ("mask", "shape"), metadata=metadata)
+            arrays = dataset.read_shard(dataset.shard_path(folder, number), ("mask", "shape"), metadata=metadata)
         except UserError:
             continue  # `verify` names it
         whole += 1
@@ -104,7 +90,7 @@ def verify(folder: Path) -> None:
             f"{folder} has {count} defect{'s' if count > 1 else ''}: python -m cavin_pyro.collect repair=true, with "
             "the options of the collection, collects damaged files again; train makes damaged features again"
         )
-    metadata = read_metadata(folder)
+    metadata = dataset.read_metadata(folder)
     print(f"{folder}: {metadata['shards']} files with {metadata['episodes']} episodes, no defect")
 
 
@@ -114,24 +100,22 @@ def find_defects(folder: Path) -> Iterator[str]:
     Raises:
         UserError: no dataset, or metadata that cannot be used.
     """
-    metadata = read_metadata(folder)
+    metadata = dataset.read_metadata(folder)
     known, lengths = set[tuple[int, int]](), list[int]()
     beside = [one for one in sorted(folder.glob("features-*")) if one.is_dir()]
     with progress_bar("verifying", total=metadata["shards"], unit="file") as bar:
-        for number, source in enumerate(source_of_shards(metadata)):
-            path, arrays = shard_path(folder, number), Arrays()
-            found = [*find_damage(path, ARRAYS, metadata, arrays), *_contradictions(arrays, metadata)]
-            if "episode" in arrays and (repetition := repeated_episode(known, source, arrays["episode"])):
+        for number, source in enumerate(dataset.source_of_shards(metadata)):
+            path, arrays = dataset.shard_path(folder, number), Arrays()
+            found = [*dataset.find_damage(path, dataset.ARRAYS, metadata, arrays), *_contradictions(arrays, metadata)]
+            if "episode" in arrays and (repetition := dataset.repeated_episode(known, source, arrays["episode"])):
                 found.append(f"it {repetition}")
             yield from (f"{path}: {defect}" for defect in found)
             for features in (one / path.name for one in beside if (one / path.name).exists()):
                 stored = Arrays()
-                yield from (f"{features}: {defect}" for defect in find_damage(features, FEATURES, metadata, stored))
-                if (
-                    not found
-                    and "shard_digest" in stored
-                    and stored["shard_digest"].tobytes().hex() != shard_digest(path)
-                ):
+                damage = dataset.find_damage(features, dataset.FEATURES, metadata, stored)
+                yield from (f"{features}: {defect}" for defect in damage)
+                digest = stored.get("shard_digest")
+                if not found and digest is not None and digest.tobytes().hex() != dataset.shard_digest(path):
                     yield f"{features}: it is of other content than {path}"
             if "length" in arrays:
                 lengths.append(int(arrays["length"].sum()))
@@ -163,7 +147,7 @@ def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:
     """
     if len(folders) < 2:
         raise UserError("merge takes at least two datasets: merge DIR DIR --to DIR")
-    every = [read_metadata(folder) for folder in folders]
+    every = [dataset.read_metadata(folder) for folder in folders]
     _check_same_world(folders, every)
     _check_seeds(folders, every)
     with output_folder(target):
@@ -175,19 +159,19 @@ def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:
         files = [(folder, n) for folder, one in zip(folders, every, strict=True) for n in range(one["shards"])]
         with progress_bar("copying", total=len(files), unit="file") as bar:
             for number, (folder, n) in enumerate(files):
-                _copy(shard_path(folder, n), shard_path(target, number))
-                for features in folder.glob(f"features-*/{shard_path(folder, n).name}"):
+                _copy(dataset.shard_path(folder, n), dataset.shard_path(target, number))
+                for features in folder.glob(f"features-*/{dataset.shard_path(folder, n).name}"):
                     beside = target / features.parent.name
                     beside.mkdir(exist_ok=True)
-                    _copy(features, shard_path(beside, number))
+                    _copy(features, dataset.shard_path(beside, number))
                 bar.update()
         metadata = _merged(every)
-        write_metadata(target, metadata)
+        dataset.write_metadata(target, metadata)
     return metadata
 
 
 def _merged(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    sources = [source for one in every for source in sources_of(one)]
+    sources = [source for one in every for source in dataset.sources_of(one)]
     first, *others = [source["configuration"] for source in sources]
     missing = object()  # what is not the same in all sources stands in theirs alone
     common = {name: value for name, value in first.items() if all(o.get(name, missing) == value for o in others)}
@@ -195,7 +179,7 @@ def _merged(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "configuration": common,
         "shape_names": every[0].get("shape_names", []),
         "made_by": f"cavin_pyro {__version__}",
-        **{name: sum(one[name] for one in every) for name in COUNTS},
+        **{name: sum(one[name] for one in every) for name in dataset.COUNTS},
         "sources": sources,
     }
 
@@ -214,8 +198,8 @@ def _check_same_world(folders: Sequence[Path], every: Sequence[dict[str, Any]]) 
 def _check_seeds(folders: Sequence[Path], every: Sequence[dict[str, Any]]) -> None:
     known: dict[int, Path] = {}
     for folder, one in zip(folders, every, strict=True):
-        for source in sources_of(one):
-            seed = seed_of(source)
+        for source in dataset.sources_of(one):
+            seed = dataset.seed_of(source)
             if seed in known:
                 raise UserError(
                     f"{known[seed]} and {folder} both have episodes of seed={seed}, which may be the same ones: "

@@ -19,15 +19,8 @@ from torch.nn import functional
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import (
-    Arrays,
-    CorruptShardError,
-    check_distinct,
-    iterate_shards,
-    padded,
-    read_metadata,
-    slots_of,
-)
+from cavin_pyro.data import dataset
+from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.state import State, Window
@@ -209,24 +202,24 @@ def load_windows(
     """
     config = config or WindowConfig()
     fingerprint = geometry_fingerprint(geometry)
-    every = [read_metadata(folder) for folder in folders]
-    steps = {metadata["configuration"]["steps"] for metadata in every}
-    if len(steps) > 1:
+    every = [dataset.read_metadata(folder) for folder in folders]
+    steps = [metadata["configuration"]["steps"] for metadata in every]
+    if len(set(steps)) > 1:
         raise UserError(
             "datasets with episodes of different length cannot be joined: "
-            + ", ".join(f"{folder} has steps={read_metadata(folder)['configuration']['steps']}" for folder in folders)
+            + ", ".join(f"{folder} has steps={one}" for folder, one in zip(folders, steps, strict=True))
         )
-    check_distinct(folders)
+    dataset.check_distinct(folders)
     excluded = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
     states = sum(metadata["episodes"] for metadata in every) * (max(steps) + 1)
-    found = _Finder(config, segment_length, seed, where, max(map(slots_of, every)), states, storage)
+    found = _Finder(config, segment_length, seed, where, max(map(dataset.slots_of, every)), states, storage)
     with progress_bar("reading", total=sum(metadata["shards"] for metadata in every), unit="file") as bar:
         for folder, numbers in zip(folders, excluded, strict=True):
-            for number, arrays in iterate_shards(folder, NEEDED, skip_corrupt=skip_corrupt):
+            for number, arrays in dataset.iterate_shards(folder, NEEDED, skip_corrupt=skip_corrupt):
                 try:
                     arrays["features"] = shard_features(folder, number, geometry, fingerprint)
-                except CorruptShardError as error:  # its clouds, which are read here alone, are corrupt
+                except dataset.CorruptShardError as error:  # its clouds, which are read here alone, are corrupt
                     if not skip_corrupt:
                         raise
                     print(f"left out: {error.args[0]}", flush=True)
@@ -284,7 +277,7 @@ class _Finder:
                 f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
                 f"T={T}: collect with steps of at least that many"
             )
-        episodes = padded(episodes, self._slots)
+        episodes = dataset.padded(episodes, self._slots)
         mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
         visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
         counts = _transitions_that_count(episodes, visible, config.maximum_step)

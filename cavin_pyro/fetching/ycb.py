@@ -9,16 +9,8 @@ import trimesh
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.envs.objects.shapes import RECIPES
+from cavin_pyro.fetching import meshes
 from cavin_pyro.fetching.install import Files, take
-from cavin_pyro.fetching.meshes import (
-    closed,
-    convex_parts,
-    decimated,
-    long_side_along_x,
-    read_mesh,
-    read_parts,
-    write_parts,
-)
 from cavin_pyro.storage.files import read_json, write_json
 
 VISUAL_FACES = 2000
@@ -56,17 +48,17 @@ class YcbObjects:
 
     def make(self, piece: str, files: Files, folder: Path) -> None:
         """See `Kind`."""
-        scan = read_mesh(take(files, self.wanted[0]), "ply", piece)
-        long_side_along_x(scan)
+        scan = meshes.read_mesh(take(files, self.wanted[0]), "ply", piece)
+        meshes.long_side_along_x(scan)
         _check_size(piece, scan)
-        body, (_, _, mass) = closed(scan), RECIPES[piece]
+        body, (_, _, mass) = meshes.closed(scan), RECIPES[piece]
         body.density = mass / body.volume
         scan.apply_translation(-body.center_mass)
-        mesh = decimated(scan, VISUAL_FACES)
-        parts = convex_parts(mesh)
+        mesh = meshes.decimated(scan, VISUAL_FACES)
+        parts = meshes.convex_parts(mesh)
         _check_parts(piece, mesh, parts)
-        write_parts(folder / f"{piece}.obj", [mesh])
-        write_parts(folder / f"{piece}_vhacd.obj", parts)
+        meshes.write_parts(folder / f"{piece}.obj", [mesh])
+        meshes.write_parts(folder / f"{piece}_vhacd.obj", parts)
         x, y, z = (float(f"{value:.5g}") for value in np.diag(body.moment_inertia))
         manifest = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
         manifest[piece] = {"mass": mass, "inertia_diag": [x, y, z]}
@@ -79,7 +71,7 @@ class YcbObjects:
         for name, (_, _, mass) in RECIPES.items():
             if not isinstance(manifest, dict) or name not in manifest:
                 raise UserError(f"{folder} lacks {name}")
-            (mesh,), parts = read_parts(folder / f"{name}.obj"), read_parts(folder / f"{name}_vhacd.obj")
+            (mesh,), parts = meshes.read_parts(folder / f"{name}.obj"), meshes.read_parts(folder / f"{name}_vhacd.obj")
             _check_size(name, mesh)
             _check_parts(name, mesh, parts)
             if manifest[name].get("mass") != mass:
@@ -101,5 +93,5 @@ def _check_parts(name: str, mesh: trimesh.Trimesh, parts: list[trimesh.Trimesh])
     if not all(part.is_watertight and part.volume > 0 for part in parts):
         raise UserError(f"{name}: a convex part is not closed")
     apart = np.abs(trimesh.util.concatenate(parts).bounds - mesh.bounds).max()
-    if apart > 0.005 or sum(part.volume for part in parts) < 0.9 * closed(mesh).volume:
+    if apart > 0.005 or sum(part.volume for part in parts) < 0.9 * meshes.closed(mesh).volume:
         raise UserError(f"{name}: its convex parts have not the shape of its surface")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.envs.tasks.reward import TaskReward, outcome_alone
 from cavin_pyro.envs.tasks.task import Task
-from cavin_pyro.envs.tasks.tiles import grid
+from cavin_pyro.envs.tasks.tiles import grid, table_distance
 from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TILE_ORIGIN, TILE_SIDE, tile_center
 
 BEHIND = 0.02  # metres from the centre of the thinnest object to the tool that pushes it
@@ -33,10 +33,11 @@ def check_reach(task: Task) -> None:
         return
     points = grid()[1::3, ::3]  # with the centres of tiles, 3 cm apart
     outcome, places = outcome_alone(TaskReward(task), points), points.numpy()
-    free, goal = (~outcome.failure).numpy(), outcome.success.numpy()
+    inner = table_distance(points) > 0.03  # every point has four neighbours
+    free, goal = (~outcome.failure & inner).numpy(), (outcome.success & inner).numpy()
     pushes = [(axis, sign, _can_push(places, axis, sign)) for axis, sign in product((0, 1), (1, -1))]
     solved = _steps(goal, free, [(axis, -sign, np.roll(possible, sign, axis)) for axis, sign, possible in pushes])
-    away = _steps(goal, free, [(axis, sign, _inner(free.shape, axis, sign)) for axis, sign, _ in pushes])
+    away = _steps(goal, free, [(axis, sign, np.ones_like(free)) for axis, sign, _ in pushes])
     for name in ("target_start", "obstacle_start") if task.about == "all" else ("target_start",):
         for tile in getattr(task, name):
             start = np.linalg.norm(places - tile_center(tile), axis=-1)
@@ -56,12 +57,7 @@ def _can_push(places: NDArray[np.float64], axis: int, sign: int) -> Mask:
     behind, aside = places[..., axis] - sign * BEHIND, places[..., 1 - axis]
     low, high = REACH_LOW[1 - axis] - BESIDE, REACH_HIGH[1 - axis] + BESIDE
     there = behind >= REACH_LOW[axis] if sign > 0 else behind <= REACH_HIGH[axis]
-    return there & (low <= aside) & (aside <= high) & _inner(places.shape[:2], axis, sign)
-
-
-def _inner(shape: tuple[int, ...], axis: int, sign: int) -> Mask:
-    """The points of a grid that have a next one along an axis."""
-    return np.indices(shape)[axis] != (shape[axis] - 1 if sign > 0 else 0)
+    return there & (low <= aside) & (aside <= high)
 
 
 def _steps(begin: Mask, free: Mask, moves: Moves) -> NDArray[np.int64]:

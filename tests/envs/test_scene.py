@@ -17,7 +17,8 @@ from cavin_pyro.envs.pushing import VIDEO_SIZE, PushingEnv
 from cavin_pyro.envs.robots.robot import SETTLED_SPEED, STICK_RADIUS
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.sensors.camera import Camera
-from cavin_pyro.envs.tasks import GOAL_MARKING, TileSet
+from cavin_pyro.envs.tasks import TileSet
+from cavin_pyro.envs.tasks.task import GOAL_MARKING
 from cavin_pyro.envs.workspace import (
     OBJECT_SLOTS,
     POINTS_PER_OBJECT,
