@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavin_pyro.envs.scene import Scene
-from cavin_pyro.envs.sensors import CAMERAS, IdealSensor, Kinect2, sensor_of
+from cavin_pyro.envs.sensors import Kinect2
 from cavin_pyro.envs.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
 from cavin_pyro.envs.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation
 
@@ -106,13 +106,3 @@ def test_the_kinect_stands_elsewhere_in_every_episode_and_is_believed_to_stand_n
             assert np.abs(np.subtract(camera.intrinsics, other.intrinsics)).max() <= bounds.intrinsics
             assert np.abs(np.subtract(camera.rotation, other.rotation)).max() <= 1.1 * bounds.rotation
     np.testing.assert_allclose(np.ptp(actual, axis=0), 2 * VIEWPOINT.translation, rtol=0.5)
-
-
-def test_cameras_go_by_names_poses_or_themselves() -> None:
-    assert set(CAMERAS) == {"ideal", "kinect2"}
-    camera, sensor = Camera(position=(0.5, 0.0, 1.2)), Kinect2()
-    assert sensor_of(camera).nominal == camera
-    assert sensor_of(sensor) is sensor
-    assert isinstance(sensor_of("ideal"), IdealSensor)
-    with pytest.raises(ValueError, match=r"^unknown camera 'webcam': choose from ideal, kinect2$"):
-        sensor_of("webcam")
