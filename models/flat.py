@@ -28,13 +28,7 @@ class FlatModel(Model):
     name = "flat"
     codes = ("motion_code",)
 
-    def __init__(
-        self,
-        *,
-        motion_dimension: int = 32,
-        motion_prior: Prior | None = None,
-        **shared: Any,
-    ) -> None:
+    def __init__(self, *, motion_dimension: int = 32, motion_prior: Prior | None = None, **shared: Any) -> None:
         """The networks of the cascade without h and the layers that read c.
 
         Args:

@@ -20,36 +20,31 @@ from cavin_pyro.planning.protocol import (
     PlanningModel,
     Query,
     RewardFunction,
-    SearchSpace,
     SegmentRollout,
     TransitionModel,
 )
 from cavin_pyro.planning.returns import best_of
 from cavin_pyro.planning.rollout import actions_of, predict_states, project
-from cavin_pyro.planning.sampling import noise_each, sample_codes
+from cavin_pyro.planning.sampling import noise_each, sample_codes, uniform_each
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 
 
 class PushSearch(SearchingPlanner):
     """The common part of CVAE-MPC and MPC, everything but the source of pushes.
 
-    space: generates the pushes of a segment, and predicts their states with f. stride_limits: metres per push, as
-    published 0.01 and 0.15; None in the paper. For the other options see `SearchingPlanner`.
+    stride_limits: metres per push, as published 0.01 and 0.15; None in the paper. For the other options see
+    `SearchingPlanner`.
 
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
     """
 
+    space: ClassVar[type]  # a `SearchSpace` that generates the pushes of a segment and predicts their states with f
     has_codes: ClassVar[bool] = False  # the space searches motion codes
     strides = "pushes"
 
-    def __init__(self, space: SearchSpace, model: TransitionModel, **options: Any) -> None:
-        """`options`: of `SearchingPlanner`."""
-        super().__init__(model, **options)
-        self.space = space
-
     def plan_scene(self, scene: Query) -> Plan:
         """Plan for observed scenes `scene.state: [B]`. There are no effect codes and no subgoals."""
-        candidates = self.search_by_reward(self.space, scene)
+        candidates = self.search_by_reward(type(self).space(self.model, self.decimals), scene)
         # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
         scores = torch.where(finite, candidates.returns, -torch.inf)
@@ -83,7 +78,6 @@ class FlatMotionSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         z = sample_codes(self.model.motion_prior, [plans], noise, generators)
         a = project(self.model.actions(here, motion_code=z), self.decimals)
         states, path = predict_states(self.model, here, a)
@@ -97,11 +91,8 @@ class CvaeMpcPlanner(PushSearch):
     """
 
     requires = ModelRequirements("flat", ("motion_prior", "actions", "next_state"), excluded=("effect_prior",))
+    space = FlatMotionSpace
     has_codes = True
-
-    def __init__(self, model: MotionModel, **options: Any) -> None:
-        """`options` are those of `PushSearch`."""
-        super().__init__(FlatMotionSpace(model, options.get("decimals")), model, **options)
 
 
 class PushSpace(NamedTuple):
@@ -118,7 +109,6 @@ class PushSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         if noise is None:
             noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
         actions = project((2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4)), self.decimals)
@@ -133,10 +123,7 @@ class MpcPlanner(PushSearch):
     """
 
     requires = ModelRequirements("dynamics", ("next_state",))
-
-    def __init__(self, model: TransitionModel, **options: Any) -> None:
-        """`options` are those of `PushSearch`."""
-        super().__init__(PushSpace(model, options.get("decimals")), model, **options)
+    space = PushSpace
 
 
 class SectarPlanner(SearchingPlanner):
@@ -155,7 +142,6 @@ class SectarPlanner(SearchingPlanner):
     )
 
     def __init__(self, model: EffectActionModel, **options: Any) -> None:
-        """`options` are those of `SearchingPlanner`."""
         super().__init__(model, **options)
         self.space, self.effect_actions = EffectSpace(model), model.actions
 
@@ -213,7 +199,6 @@ class CascadeSpace(NamedTuple):
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
-        """See `cavin_pyro.planning.protocol.SearchSpace`."""
         sizes = self.model.effect_dimension, self.model.motion_dimension
         effect_noise, motion_noise = (None, None) if noise is None else noise.split(sizes, -1)
         c = sample_codes(self.model.effect_prior, [plans], effect_noise, generators)
@@ -233,11 +218,8 @@ class CavinWithoutEffectsPlanner(PushSearch):
     """
 
     requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "actions", "next_state"))
+    space = CascadeSpace
     has_codes = True
-
-    def __init__(self, model: PlanningModel, **options: Any) -> None:
-        """`options` are those of `PushSearch`."""
-        super().__init__(CascadeSpace(model, options.get("decimals")), model, **options)
 
 
 class RandomPlanner:
@@ -266,17 +248,9 @@ class RandomPlanner:
         check_scenes(state, generators)
         environments, objects = state.mask.shape
         empty = state.centers.new_empty
-        samples = [
-            torch.rand(
-                self.segment_length,
-                4,
-                generator=generator,
-                dtype=state.centers.dtype,
-                device=generator.device,
-            )
-            for generator in generators
-        ]
-        actions = 2 * torch.stack(samples).to(state.centers.device) - 1 if samples else empty(0, self.segment_length, 4)
+        actions = empty(0, self.segment_length, 4)
+        if environments:
+            actions = 2 * uniform_each((self.segment_length, 4), generators, state.centers.device) - 1
         return Plan(
             actions=actions,
             planned_actions=actions,

@@ -50,6 +50,12 @@ def check_weight(name: str, value: float) -> None:
         raise ValueError(f"{name} must be zero or a positive number, not {value}")
 
 
+def check_temperature(value: float | None) -> None:
+    """Raise ValueError unless a temperature is None or a positive number."""
+    if value is not None and not 0 < value < math.inf:
+        raise ValueError(f"temperature must be a positive number or null, not {value}")
+
+
 def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:
     """The limits as a tuple. Raises ValueError unless they are two distances, in order and not negative."""
     numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)

@@ -196,7 +196,6 @@ class FunctionReward(Reward):
     function: RewardFunction
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
-        """See `RewardFunction`."""
         return self.function(previous, centers, mask)
 
 
@@ -240,33 +239,21 @@ class SearchSpace(Protocol):
         """
 
 
-class ScoreState(Protocol):
-    """The running score of candidates: a named tuple of fields `[B, n]`."""
-
-    @property
-    def returns(self) -> Tensor:
-        """`[B, n]`, higher is better; -inf for candidates with a prediction that is not finite."""
-
-    @property
-    def failed(self) -> Tensor:
-        """`[B, n]` bool: terminated by a failure, so that a copy of an active candidate may replace it."""
-
-    @property
-    def active(self) -> Tensor:
-        """`[B, n]` bool: not terminated."""
-
-
 class SearchObjective(Protocol):
     """Scores candidates. A named tuple or a frozen dataclass, so that a backend can compile it.
 
+    Its score state, the running score of candidates, is a named tuple of fields `[B, n]` with
+    returns: higher is better; -inf for candidates with a prediction that is not finite.
+    failed: bool, terminated by a failure, so that a copy of an active candidate may replace it.
+    active: bool, not terminated.
     The state of an objective that wraps another one has the other's state as its field `inner`: see `unwrap`.
     """
 
     def start(self, plans: State) -> Any:
-        """`ScoreState` of candidates without a segment, `plans: [B, n]`."""
+        """Score state of candidates without a segment, `plans: [B, n]`."""
 
     def advance(self, score_state: Any, segment: int, before: State, rollout: SegmentRollout) -> Any:
-        """`ScoreState` after one more segment, which begins at `before: [B, n]`."""
+        """Score state after one more segment, which begins at `before: [B, n]`."""
 
     def early_stopped(self, score_state: Any) -> Tensor:
         """`[B]` bool: no active candidate can still reach a higher return than the best terminated one."""

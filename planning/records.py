@@ -13,14 +13,7 @@ Record = TypeVar("Record", bound=tuple)
 
 def apply(record: Record, function: Callable[[Any], Any]) -> Record:
     """Apply one function to every field; None stays None. Plain tuples are allowed, too."""
-
-    def applied(value: Any) -> Any:
-        if isinstance(value, tuple):
-            parts = [applied(part) for part in value]
-            return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-        return None if value is None else function(value)
-
-    return applied(record)
+    return _combine([record], lambda values: function(values[0]))
 
 
 def take(record: Record, indices: Tensor) -> Record:

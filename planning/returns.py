@@ -102,11 +102,9 @@ class CumulativeReward:
     at: str = "path"
 
     def start(self, plans: State) -> Progress:
-        """Progress of candidates without a segment, `plans: [B, n]`."""
         return start(plans.centers)
 
     def advance(self, score_state: Progress, segment: int, before: State, rollout: SegmentRollout) -> Progress:
-        """Progress after one more segment from `before: [B, n]`."""
         path = rollout.path if self.at == "path" else rollout.path[..., -1:, :, :]
         return advance(score_state, self.reward, before.centers, path, before.mask)
 
@@ -149,9 +147,7 @@ class StrideLimits(Reward):
             outside[..., 0] = whole  # from its first step on: no reward counts in a segment that fails
         outside = outside & ~outcome.failure
         return LimitedStep(
-            torch.where(outside, STRIDE_PENALTY, outcome.reward),
-            outcome.success & ~outside,
-            outcome.failure | outside,
+            torch.where(outside, STRIDE_PENALTY, outcome.reward), outcome.success & ~outside, outcome.failure | outside
         )
 
     def _outside(self, before: Tensor, after: Tensor, mask: Tensor) -> Tensor:
@@ -235,12 +231,10 @@ class TrackingCost(NamedTuple):
     distance: SubgoalDistance
 
     def start(self, plans: State) -> TrackingState:
-        """The state of candidates without a segment, `plans: [B, n]`."""
         nothing = plans.centers.new_zeros(plans.batch_shape)
         return TrackingState(nothing, nothing, torch.ones_like(nothing, dtype=torch.bool))
 
     def advance(self, state: TrackingState, segment: int, before: State, rollout: SegmentRollout) -> TrackingState:
-        """The state after one more segment from `before: [B, n]`."""
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
         subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
         distance = self.distance(rollout.states, rollout.path, subgoal)

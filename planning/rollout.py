@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -320,12 +321,7 @@ class Candidates:
     @property
     def noise(self) -> Tensor:
         """`[B, n, k, D]`; only for reparameterised candidates."""
-
-        def noise_of(segment: SegmentRecord) -> Tensor:
-            assert segment.noise is not None
-            return segment.noise
-
-        return self.history(noise_of)
+        return self.history(attrgetter("noise"))
 
     @cached_property
     def rows(self) -> tuple[Tensor | None, ...]:

@@ -17,34 +17,26 @@ from cavin_pyro.models.state import State
 from cavin_pyro.planning.protocol import Reparameterized
 
 
-def sample_each(
-    prior: Callable[..., Distribution],
-    conditions: Sequence[State | Tensor],
-    generators: Sequence[torch.Generator],
-) -> Tensor:
-    """One sample per candidate from `prior(*conditions)`, each environment with its own generator: `[B, N, D]`.
-
-    `conditions`: the arguments of the prior, states and codes with leading dimensions `[B, N]`. The prior is
-    called once per environment, so its samples do not depend on the rest of the batch.
-    """
-    return torch.stack(
-        [
-            sample(prior(*(_scene(condition, index) for condition in conditions)), generator, _device(conditions[0]))
-            for index, generator in enumerate(generators)
-        ]
-    )
-
-
 def sample_codes(
     prior: Callable[..., Distribution],
     conditions: Sequence[State | Tensor],
     noise: Tensor | None,
-    generators: Sequence[torch.Generator],
+    generators: Sequence[torch.Generator] = (),
 ) -> Tensor:
-    """Codes `[B, N, D]` of `prior(*conditions)`: reparameterised from `noise: [B, N, D]`, or sampled without noise."""
-    if noise is None:
-        return sample_each(prior, conditions, generators)
-    return reparameterize_each(prior, conditions, noise)
+    """Codes `[B, N, D]` of `prior(*conditions)`: reparameterised from `noise: [B, N, D]`, or sampled without noise.
+
+    `conditions`: the arguments of the prior, states and codes with leading dimensions `[B, N]`. The prior is called
+    once per environment, each with its own generator, so its codes do not depend on the rest of the batch. Raises
+    ValueError for a prior that cannot be written as a function of noise.
+    """
+    codes = []
+    for index, source in enumerate(generators if noise is None else noise):
+        here = prior(*(one.scene(index) if isinstance(one, State) else one[index] for one in conditions))
+        if isinstance(source, Tensor):
+            codes.append(reparameterize(here, source))
+        else:
+            codes.append(sample(here, source, _device(conditions[0])))
+    return torch.stack(codes)
 
 
 def noise_each(
@@ -64,22 +56,6 @@ def uniform_each(
     """Uniform numbers in [0, 1), each environment's from its own generator: `[B, *shape]`; `device` as above."""
     samples = [torch.rand(*shape, generator=source, device=source.device) for source in generators]
     return torch.stack(samples).to(device or samples[0].device)
-
-
-def reparameterize_each(
-    prior: Callable[..., Distribution], conditions: Sequence[State | Tensor], noise: Tensor
-) -> Tensor:
-    """The codes `[B, N, D]` that standard normal `noise: [B, N, D]` determines, distributed as the prior.
-
-    The prior is called once per environment, as in `sample_each`. Raises ValueError for a prior that cannot be written
-    as a function of such noise.
-    """
-    return torch.stack(
-        [
-            reparameterize(prior(*(_scene(condition, index) for condition in conditions)), own)
-            for index, own in enumerate(noise)
-        ]
-    )
 
 
 def reparameterize(prior: Distribution, noise: Tensor) -> Tensor:
@@ -125,10 +101,6 @@ def sample(prior: Distribution, generator: torch.Generator, device: torch.device
 
 def _device(condition: State | Tensor) -> torch.device:
     return (condition.centers if isinstance(condition, State) else condition).device
-
-
-def _scene(condition: State | Tensor, index: int) -> State | Tensor:
-    return condition.scene(index) if isinstance(condition, State) else condition[index]
 
 
 @contextmanager

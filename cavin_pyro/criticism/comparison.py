@@ -98,11 +98,7 @@ def _unseen(loaded: Loaded) -> Tensor:
 def write_pair(config: DictConfig, names: Sequence[str], folder: Path, accept: Accept | None = None) -> list[Part]:
     """Check both checkpoints, and write a report on both and one on each, in the folders a and b; resumes.
 
-    Args:
-        accept: see `cavin_pyro.criticism.loading.load_trained`.
-
-    Raises:
-        UserError: see `load_pair`.
+    For `accept` and errors see `load_pair`.
     """
     check_same_run(folder, config, ignore=("output", "sections"))
     loaded = load_pair(config, accept)
@@ -143,8 +139,7 @@ def verdicts_side_by_side(parts: Mapping[str, Sequence[Part]]) -> Section:
 def assess_pair(contexts: Mapping[str, CheckContext], samples: int = 16) -> Section:
     """Paired differences of the terms of -ELBO of the contexts `a` and `b`, whose held-out windows are the same.
 
-    Args:
-        samples: of each guide for each window.
+    `samples`: of each guide for each window.
     """
     terms = {}
     for name, context in contexts.items():

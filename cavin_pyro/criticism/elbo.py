@@ -85,15 +85,7 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
             parts["validation"][1],
         ),
         _findings(differences, means["validation"], active),
-        {
-            **{
-                name: {term: interval._asdict() for term, interval in of_part.items()}
-                for name, of_part in means.items()
-            },
-            "difference": {term: interval._asdict() for term, interval in differences.items()},
-            "active": active,
-            "windows": counts,
-        },
+        {**means, "difference": differences, "active": active, "windows": counts},
         "-ELBO, held-out minus training windows (nats)",
         total,
         [

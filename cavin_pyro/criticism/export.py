@@ -80,11 +80,7 @@ def write_samples(
     data = arviz().from_dict(
         **{group: {name: value.numpy() for name, value in values.items()} for group, values in groups.items()},
         dims=DIMENSIONS,
-        coords={
-            "axis": ["x", "y", "z"],
-            "parameter": ["x", "y", "dx", "dy"],
-            "push": list(range(1, pushes + 1)),
-        },
+        coords={"axis": ["x", "y", "z"], "parameter": ["x", "y", "dx", "dy"], "push": list(range(1, pushes + 1))},
         attrs={**told, "seed": context.seed, "inference_library": "pyro", "creation_library": "cavin_pyro"},
     )
     for group in data.groups():

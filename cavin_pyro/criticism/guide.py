@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from cavin_pyro.criticism.codes import SYMBOLS, Codes, guide_density, log_weights, sample_guide, unsuitable_codes
-from cavin_pyro.criticism.estimates import Interval, arviz, covered, draw_ranks, mean_interval, rank
+from cavin_pyro.criticism.estimates import arviz, covered, draw_ranks, mean_interval, rank
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
 from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
@@ -26,6 +26,7 @@ NAME, TITLE = "guide", "Is the guide calibrated?"
 INFORMED = 0.1  # a dimension counts as informed where its variance shrinks by more, given s
 LEVEL = 0.9
 EQUAL = 1e-3  # nats
+PRIOR_SAMPLES = 32  # of each window, for its variance given s
 GOOD, BAD = (0.86, 0.94), (0.80, 0.98)  # of the coverage of 90 % intervals
 COLORS = {"effect_code": "#0072B2", "motion_code": "#D55E00"}
 JOINT_COLOR = "#009E73"
@@ -60,9 +61,7 @@ def assess_guide(
         simulated = simulated_ranks(context.model, context.guide, window, samples=samples)
     joint = mean_interval((simulated.joint <= LEVEL).double(), episodes)
     codes = {name: code_coverage(simulated, name, episodes) for name in context.codes}
-    graded = [joint, *(Interval(**one["informed"]) for one in codes.values())]
     weights = importance(context, weighted, particles)
-    shares = {key: Interval(**weights[key]) for key in ("unreliable", "effective")}
     return Section(
         NAME,
         TITLE,
@@ -74,7 +73,10 @@ def assess_guide(
             limit=weights["limit"],
         ),
         conclude(
-            worst(within(one.low, one.high, good=GOOD, bad=BAD) for one in graded),
+            worst(
+                within(one.low, one.high, good=GOOD, bad=BAD)
+                for one in (joint, *(code["informed"] for code in codes.values()))
+            ),
             "What 90 % regions cover, of all codes jointly and of the informed dimensions of each: good if the 95 % "
             f"interval over episodes lies within {GOOD[0]:.0%} to {GOOD[1]:.0%}, bad if it lies outside of "
             f"{BAD[0]:.0%} to {BAD[1]:.0%}.",
@@ -83,15 +85,15 @@ def assess_guide(
         ),
         [
             *(
-                f"90 % intervals of {SYMBOLS.get(name, name)} cover {Interval(**one['informed']).percent()} over the "
+                f"90 % intervals of {SYMBOLS.get(name, name)} cover {one['informed'].percent()} over the "
                 f"{one['informed_dimensions']} informed dimensions of {one['dimensions']}."
                 for name, one in codes.items()
             ),
             f"90 % regions of all codes cover {joint.percent()}.",
-            f"On real windows k-hat is above {weights['limit']:.2f} for {shares['unreliable'].percent()} of the "
-            f"windows, and {particles} importance samples are worth {shares['effective'].text(0)}.",
+            f"On real windows k-hat is above {weights['limit']:.2f} for {weights['unreliable'].percent()} of the "
+            f"windows, and {particles} importance samples are worth {weights['effective'].text(0)}.",
         ],
-        {"windows": len(episodes), "samples": samples, "joint": joint._asdict(), "codes": codes, "importance": weights},
+        {"windows": len(episodes), "samples": samples, "joint": joint, "codes": codes, "importance": weights},
         "coverage of 90 % regions of all codes",
         joint,
         figure=_figure(simulated),
@@ -135,13 +137,11 @@ class SimulatedRanks(NamedTuple):
 
 
 @torch.no_grad()
-def simulated_ranks(
-    model: Model, guide: Program, window: Window, *, samples: int, prior_samples: int = 32
-) -> SimulatedRanks:
+def simulated_ranks(model: Model, guide: Program, window: Window, *, samples: int) -> SimulatedRanks:
     """Where the true codes of windows simulated from those of `window: [B]` lie among `samples` of the guide."""
     codes, simulated = simulate(model, window)
     inferred = sample_guide(guide, simulated, samples)
-    prior = sample_guide(model, simulated, prior_samples)
+    prior = sample_guide(model, simulated, PRIOR_SAMPLES)
     ranks = {name: rank(inferred[name], codes[name]) for name in codes}
     truth = {name: value.unsqueeze(0) for name, value in codes.items()}
     densities = [
@@ -162,8 +162,8 @@ def code_coverage(simulated: SimulatedRanks, name: str, episodes: Tensor) -> dic
     """
     inside = covered(simulated.ranks[name], LEVEL)
     return {
-        "all": mean_interval(inside.mean(1), episodes)._asdict(),
-        "informed": mean_interval(covered(simulated.informed(name), LEVEL).mean(1), episodes)._asdict(),
+        "all": mean_interval(inside.mean(1), episodes),
+        "informed": mean_interval(covered(simulated.informed(name), LEVEL).mean(1), episodes),
         "by_dimension": inside.mean(0).tolist(),
         "dimensions": inside.shape[1],
         "informed_dimensions": int((simulated.contraction[name] > INFORMED).sum()),
@@ -190,8 +190,8 @@ def importance(context: CheckContext, windows: int, particles: int) -> dict[str,
     return {
         "windows": len(episodes),
         "limit": limit,
-        "unreliable": mean_interval(heavy.double(), episodes)._asdict(),
-        "effective": mean_interval(1 / weights.square().sum(-1), episodes)._asdict(),
+        "unreliable": mean_interval(heavy.double(), episodes),
+        "effective": mean_interval(1 / weights.square().sum(-1), episodes),
     }
 
 

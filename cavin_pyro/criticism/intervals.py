@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from pyro import poutine
 from torch import Tensor
 
-from cavin_pyro.criticism.estimates import Interval, covered, draw_ranks, rank, ratio_interval
+from cavin_pyro.criticism.estimates import covered, draw_ranks, rank, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import MOVED
 from cavin_pyro.criticism.section import Section, conclude, within, worst
@@ -93,14 +93,7 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
             f"the RMS error {one['error']:.3g}."
             for name, one in scores_of.items()
         ],
-        {
-            "windows": len(episodes),
-            "samples": samples,
-            "predictions": {
-                name: {key: one._asdict() if isinstance(one, Interval) else one for key, one in scores.items()}
-                for name, scores in scores_of.items()
-            },
-        },
+        {"windows": len(episodes), "samples": samples, "predictions": scores_of},
         "coverage of 90 % intervals of f, x and y of all objects",
         scores_of["f centres"]["90"],
         figure=_figure(predictions, ranks),

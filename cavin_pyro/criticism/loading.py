@@ -98,9 +98,6 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
     Windows are chosen and held out with the checkpoint's own configuration and seed, so that the held-out episodes are
     those that its training held out.
 
-    Args:
-        accept: see `load_trained`.
-
     Returns:
         The context, and `about` for the report (see `cavin_pyro.criticism.report`).
 
@@ -116,11 +113,7 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
 def load_trained(config: DictConfig, name: str, accept: Accept | None = None) -> Loaded:
     """A checkpoint by its name or path, with its programs, and the windows of the option `data` as its training split.
 
-    Args:
-        accept: raises a UserError for a model that cannot be used, before the data are read.
-
-    Raises:
-        UserError: as `load_context`.
+    `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
     """
     checkpoint = load(name, trust=list(config.trust))
     if accept is not None:
@@ -160,13 +153,14 @@ def context_of(
         validation_episodes=episodes["validation"],
         selection=selection,
     )
-    own_prior = (checkpoint.config["model"].get("prior") or {}).get("_target_")
+    own_prior = checkpoint.config["model"].get("prior")
+    prior = (own_prior or {}).get("_target_") or (checkpoint.config.get("prior") or {}).get("_target_")
     about = {
         "checkpoint": str(path),
         "weights": file_digest(path)[:12],
         "model": type(model).__name__,
         "guide": type(guide).__name__,
-        "prior": _last(own_prior or (checkpoint.config.get("prior") or {}).get("_target_")),
+        "prior": prior and str(prior).rpartition(".")[2],
         "trained": checkpoint.provenance,
         "data": [compare_data(folder, checkpoint.provenance) for folder in folders],
         "windows": {name: len(indices) for name, indices in chosen.items()},
@@ -238,7 +232,3 @@ def sample_windows(table: WindowTable, indices: Tensor, count: int, *, seed: Seq
 def unmasked_windows(table: WindowTable, indices: Tensor) -> Tensor:
     """Those of the windows `indices: [N]` int64 that `sequence_mask` keeps."""
     return indices[table.sequence_mask[indices]]
-
-
-def _last(target: str | None) -> str | None:
-    return target and str(target).rpartition(".")[2]

@@ -108,7 +108,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
             "pair_distance": nearness.pair,
             "tool_distance": nearness.tool,
             "statistics": {
-                name: {"observed": real[name].mean().item(), **each, "effect": effects[name]._asdict()}
+                name: {"observed": real[name].mean().item(), **each, "effect": effects[name]}
                 for name, each in compared.items()
             },
         },

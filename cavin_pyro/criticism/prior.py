@@ -84,7 +84,7 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
             f"A classifier of (s, c, z) orders {auc.percent()} of held-out pairs correctly (50 % by chance), and "
             f"{areas['control'].percent()} when the prior's codes are those of another scene."
         ],
-        {"windows": len(episodes), "auc": {source: area._asdict() for source, area in areas.items()}},
+        {"windows": len(episodes), "auc": areas},
         "AUC of a classifier, guide against prior",
         auc,
         figure=_figure(logits),

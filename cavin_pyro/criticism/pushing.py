@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -57,54 +56,43 @@ class Statistic:
 
 def statistics_of(nearness: Nearness) -> list[Statistic]:
     """All statistics. Those of h look at its subgoal, those of f at the states after each push."""
-    pair, tool = 100 * nearness.pair, 100 * nearness.tool  # centimetres
-    statistics = []
-    for part in ("h", "f"):
-        move, moved = f"farthest move over the segment, {part}", f"objects that move more than 1 cm, {part}"
-        near = f"pairs of centres nearer than {pair:.1f} cm, {part}"
-        statistics += [
-            Statistic(f"farthest_move_{part}", move, partial(_farthest_move, part), part, "m"),
-            Statistic(f"moved_objects_{part}", moved, partial(_moved_objects, part), part),
-            Statistic(f"close_pairs_{part}", near, partial(_close_pairs, part, nearness.pair), part),
-        ]
     start, touching = (
         "from a push's start to the nearest centre",
-        f"share of pushes that pass within {tool:.1f} cm of a centre",
+        f"share of pushes that pass within {100 * nearness.tool:.1f} cm of a centre",
     )
+
+    def touched(outcome: GeneratedWindow) -> Tensor:
+        return (path_distances(outcome).amin(-1) < nearness.tool).float().mean(-1)
+
     return [
-        *statistics,
+        *_statistics_of_ends("h", nearness.pair),
+        *_statistics_of_ends("f", nearness.pair),
         Statistic("start_to_nearest", start, lambda outcome: start_distances(outcome).amin(-1), "g", "m"),
-        Statistic("touching", touching, partial(_touching, nearness.tool), "g"),
+        Statistic("touching", touching, touched, "g"),
     ]
 
 
-def _end(part: str, outcome: GeneratedWindow) -> Tensor:
-    """Centres `[B, M, 3]` after the segment, as h or f has them."""
-    end = outcome.steps[:, -1] if part == "f" else outcome.subgoal
-    assert end is not None
-    return end
+def _statistics_of_ends(part: str, near: float) -> list[Statistic]:
+    """Those of the states after the segment as h or f has them; `near` in metres."""
 
+    def end(outcome: GeneratedWindow) -> Tensor:
+        end = outcome.steps[:, -1] if part == "f" else outcome.subgoal
+        assert end is not None
+        return end
 
-def _moves(part: str, outcome: GeneratedWindow) -> Tensor:
-    """How far each object goes over the segment: `[B, M]` metres, 0 for padding."""
-    return (_end(part, outcome) - outcome.first.centers).norm(dim=-1) * outcome.first.mask
+    def moves(outcome: GeneratedWindow) -> Tensor:  # [B, M] metres, 0 for padding
+        return (end(outcome) - outcome.first.centers).norm(dim=-1) * outcome.first.mask
 
+    def close_pairs(outcome: GeneratedWindow) -> Tensor:  # every pair stands in the matrix twice
+        return (pair_distances(end(outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
 
-def _farthest_move(part: str, outcome: GeneratedWindow) -> Tensor:
-    return _moves(part, outcome).amax(-1)
-
-
-def _moved_objects(part: str, outcome: GeneratedWindow) -> Tensor:
-    return (_moves(part, outcome) > MOVED).sum(-1).float()
-
-
-def _close_pairs(part: str, near: float, outcome: GeneratedWindow) -> Tensor:
-    # Every pair stands in the matrix twice.
-    return (pair_distances(_end(part, outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
-
-
-def _touching(near: float, outcome: GeneratedWindow) -> Tensor:
-    return (path_distances(outcome).amin(-1) < near).float().mean(-1)
+    move, moved = f"farthest move over the segment, {part}", f"objects that move more than 1 cm, {part}"
+    close = f"pairs of centres nearer than {100 * near:.1f} cm, {part}"
+    return [
+        Statistic(f"farthest_move_{part}", move, lambda outcome: moves(outcome).amax(-1), part, "m"),
+        Statistic(f"moved_objects_{part}", moved, lambda outcome: (moves(outcome) > MOVED).sum(-1).float(), part),
+        Statistic(f"close_pairs_{part}", close, close_pairs, part),
+    ]
 
 
 def _before(outcome: GeneratedWindow) -> Tensor:

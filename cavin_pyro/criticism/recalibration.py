@@ -187,11 +187,7 @@ class AdjustableScales(Protocol):
 
 
 def check_scales(model: Model) -> None:
-    """Refuse a model whose f predicts no scales, or none that can be widened.
-
-    Raises:
-        UserError: it does not.
-    """
+    """Refuse, by a UserError, a model whose f predicts no scales, or none that can be widened."""
     if not (isinstance(model.scales, PredictedScales) and isinstance(model.dynamics, AdjustableScales)):
         raise UserError(
             "parts=[scales] calibrates scales that f predicts, and this model's cannot be widened: choose "
@@ -227,14 +223,9 @@ def calibrate_f(context: CheckContext, windows: int, samples: int) -> tuple[floa
 def calibrate_scales(model: Model, window: Window) -> float:
     """Widen f's scales of centres so that 90 % intervals of x and y cover 90 % of the objects that moved over 1 cm.
 
-    The factor is the 90 % quantile of |error| / scale in `window: [B]`, which training must not have seen, over that of
-    f's Student's t; Lei and others 2018, "Distribution-free predictive inference for regression".
-
-    Returns:
-        The factor.
-
-    Raises:
-        UserError: nothing moved.
+    Returns the factor, the 90 % quantile of |error| / scale in `window: [B]`, which training must not have seen, over
+    that of f's Student's t; Lei and others 2018, "Distribution-free predictive inference for regression". A UserError:
+    nothing moved.
     """
     before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
     encoded = model.encode(window) if model.dynamics.reads_encoding else None

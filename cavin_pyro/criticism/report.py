@@ -42,18 +42,13 @@ Part = dict[str, Any]
 
 def render(section: Section) -> Part:
     """Turn the figure into an image and numbers into plain ones, so that a section can be stored on disk."""
-    return {
-        "name": section.name,
-        "title": section.title,
-        "explanation": section.explanation,
+    return {name: value for name, value in vars(section).items() if name != "figure"} | {
         "verdict": asdict(section.verdict),
-        "measure": section.measure,
-        "number": plain(section.number._asdict()) if section.number else None,
+        "number": plain(section.number and section.number._asdict()),
         "findings": list(section.findings),
         "values": plain(section.values),
         "tables": [asdict(table) for table in section.tables],
         "image": image(section.figure) if section.figure else None,
-        "caption": section.caption,
     }
 
 

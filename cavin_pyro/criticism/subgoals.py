@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS
-from cavin_pyro.criticism.estimates import Interval, ratio_interval
+from cavin_pyro.criticism.estimates import UNKNOWN, Interval, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
 from cavin_pyro.data.collection import clutter_area, open_scene
@@ -31,7 +31,7 @@ from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.returns import best_of, squared_distance
 from cavin_pyro.planning.rollout import predict_states
-from cavin_pyro.planning.sampling import sample_each
+from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.storage.progress import progress_bar
 
 SAMPLED, CLOSEST, GIVEN = "sampled", "closest", "given by the effect"  # how a motion is obtained
@@ -56,11 +56,7 @@ EXPLANATION = (
 
 
 def check_objects(model: Model, objects: int) -> None:
-    """Make sure that a model knows so many objects.
-
-    Raises:
-        UserError: it does not.
-    """
+    """Refuse, by a UserError, more objects than a model knows."""
     if objects > model.maximum_objects:
         raise UserError(f"sizes.subgoals.objects={objects}, but the model knows at most {model.maximum_objects}")
 
@@ -72,9 +68,6 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
         scenes: number of scenes to sample.
         objects: number of objects in a scene, at most as many as the model knows.
         samples: N, candidates for the closest motion.
-
-    Raises:
-        UserError: the model does not know so many objects.
     """
     check_objects(context.model, objects)
     if not context.codes:
@@ -96,15 +89,7 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
         EXPLANATION.format(scenes=scenes, objects=objects, samples=samples),
         _verdict(left, best, scenes),
         [_finding(name, numbers) for name, numbers in measured.items()],
-        {
-            "scenes": scenes,
-            "objects": objects,
-            "samples": samples,
-            "motions": {
-                name: {key: one._asdict() if isinstance(one, Interval) else one for key, one in numbers.items()}
-                for name, numbers in measured.items()
-            },
-        },
+        {"scenes": scenes, "objects": objects, "samples": samples, "motions": measured},
         f"part of the way to the subgoal that is left ({best})" if left else "",
         left,
         figure=draw_distances(groups),
@@ -199,18 +184,18 @@ def plan_segment(model: Model, state: State, motion: str, seed: list[int], sampl
     """
     here = state.expand_plans(1)
     if "effect_code" not in model.codes:
-        code = sample_each(model.motion_prior, [here], [_generator([*seed, 2])])
+        code = sample_codes(model.motion_prior, [here], None, [_generator([*seed, 2])])
         actions = model.actions(here, motion_code=code)
         ends, _ = predict_states(model, here, actions)
         return SegmentPlan(actions[0, 0].numpy(), None, ends.centers[0, 0].numpy())
-    code = sample_each(model.effect_prior, [here], [_generator([*seed, 2])])
+    code = sample_codes(model.effect_prior, [here], None, [_generator([*seed, 2])])
     subgoal = model.subgoal(here, code)
     if motion == GIVEN:
         actions = model.actions(here, effect_code=code)
     else:
         plans = state.expand_plans(1 if motion == SAMPLED else samples)
         code = code.expand(*plans.batch_shape, -1)
-        motion_code = sample_each(model.motion_prior, [plans, code], [_generator([*seed, 3])])
+        motion_code = sample_codes(model.motion_prior, [plans, code], None, [_generator([*seed, 3])])
         actions = model.actions(here, effect_code=code, motion_code=motion_code)
     ends, _ = predict_states(model, here, actions)
     best = int(best_of(-squared_distance(ends, subgoal), "distances of motions to the subgoal"))
@@ -260,7 +245,7 @@ def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> dict[str, Any]:
     subgoal = np.reshape([rollout.plan.subgoal for rollout in finished], shape)
     way, end = _lengths(subgoal - before), _lengths(reached - subgoal)
     wanted = way > MOVING
-    left = Interval(math.nan, math.nan, math.nan)
+    left = UNKNOWN
     if wanted.any():
         remaining, whole = (torch.from_numpy((lengths * wanted).sum(-1)) for lengths in (end, way))
         left = ratio_interval(remaining, whole, torch.arange(len(finished)), seed=seed)

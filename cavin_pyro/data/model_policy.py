@@ -21,7 +21,7 @@ from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning.additions.touchdown import Touchdown
 from cavin_pyro.planning.returns import best_of, squared_distance
 from cavin_pyro.planning.rollout import predict_states, project
-from cavin_pyro.planning.sampling import sample_each
+from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.storage.checkpoint import load
 
 
@@ -53,10 +53,10 @@ class ModelPushingPolicy:
         model, seen = self._model, vars(observation)
         state = observed_state(seen, self._geometry)
         here, plans = state.expand_plans(1), state.expand_plans(self._motions)
-        effect_code = sample_each(model.effect_prior, [here], [self._random])
+        effect_code = sample_codes(model.effect_prior, [here], None, [self._random])
         subgoal = model.subgoal(here, effect_code)
         codes = effect_code.expand(-1, self._motions, -1)
-        motion_code = sample_each(model.motion_prior, [plans, codes], [self._random])
+        motion_code = sample_codes(model.motion_prior, [plans, codes], None, [self._random])
         pushes = project(model.actions(here, effect_code=codes, motion_code=motion_code), None)
         ends, _ = predict_states(model, here, pushes)
         scores = -squared_distance(ends, subgoal)

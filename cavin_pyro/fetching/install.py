@@ -47,14 +47,8 @@ def install(kind: Kind, to: Path, source: str | None = None) -> str:
     The publishers name no checksums: SHA-256 of each archive is kept in `to / NAME.lock.json` once it has passed every
     check, and all later downloads, from any mirror, must be the same bytes.
 
-    Args:
-        source: a mirror of the publisher's site.
-
-    Returns:
-        A line on what the folder holds.
-
-    Raises:
-        UserError: a download or a check failed, or the folder cannot be written.
+    `source`: a mirror of the publisher's site. Returns a line on what the folder holds. A UserError: a download or a
+    check failed, or the folder cannot be written.
     """
     site = source or kind.site
     if urlsplit(site).scheme not in ("http", "https"):
@@ -139,11 +133,7 @@ def _read_archive(path: Path, wanted: tuple[str, ...]) -> Files:
 
 
 def take(files: Files, name: str) -> bytes:
-    """The bytes of a file of an archive.
-
-    Raises:
-        UserError: there is no such file.
-    """
+    """The bytes of a file of an archive; a UserError: there is no such file."""
     if name not in files:
         raise UserError(f"the archive holds no {name}: it is another archive")
     return files[name]

@@ -39,8 +39,7 @@ def convex_parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
 def closed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """A copy without the small holes of a scan, which has a volume, a centre of mass and an inertia.
 
-    Raises:
-        UserError: the surface is so open that it bounds no volume.
+    A UserError: the surface is so open that it bounds no volume.
     """
     whole = mesh.copy()
     whole.merge_vertices()
@@ -69,11 +68,7 @@ def write_parts(path: Path, parts: Sequence[trimesh.Trimesh]) -> None:
 
 
 def read_parts(path: Path) -> list[trimesh.Trimesh]:
-    """The parts of a Wavefront file, a group each.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """The parts of a Wavefront file, a group each; a UserError: the file is missing or damaged."""
     try:
         scene = trimesh.load_scene(path, split_objects=True, group_material=False, skip_materials=True)
         parts = [part for part in scene.geometry.values() if len(part.faces)]
@@ -85,11 +80,7 @@ def read_parts(path: Path) -> list[trimesh.Trimesh]:
 
 
 def read_mesh(content: bytes, kind: str, name: str) -> trimesh.Trimesh:
-    """A mesh from a file of another kind, without colours and normals: corners at one place become one vertex.
-
-    Raises:
-        UserError: it cannot be read.
-    """
+    """A mesh from a file of another kind, without colours and normals: corners at one place become one vertex."""
     try:
         mesh = trimesh.load_scene(io.BytesIO(content), file_type=kind).to_mesh()
         return trimesh.Trimesh(mesh.vertices, mesh.faces)

@@ -28,7 +28,6 @@ class SawyerRobot:
     wanted: tuple[str, ...] = (URDF, ".DAE", ".dae", ".STL", ".stl", "LICENSE")
 
     def make(self, piece: str, files: Files, folder: Path) -> None:
-        """See `Kind`."""
         try:
             robot = ElementTree.fromstring(take(files, URDF))
         except ElementTree.ParseError as error:
@@ -52,7 +51,6 @@ class SawyerRobot:
         (folder / "LICENSE").write_bytes(take(files, "LICENSE"))
 
     def verify(self, folder: Path) -> str:
-        """See `Kind`."""
         path = folder / "sawyer_stick.urdf"
         try:
             robot = ElementTree.parse(path).getroot()

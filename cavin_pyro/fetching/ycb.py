@@ -47,7 +47,6 @@ class YcbObjects:
     wanted: tuple[str, ...] = ("google_16k/nontextured.ply",)
 
     def make(self, piece: str, files: Files, folder: Path) -> None:
-        """See `Kind`."""
         scan = meshes.read_mesh(take(files, self.wanted[0]), "ply", piece)
         meshes.long_side_along_x(scan)
         _check_size(piece, scan)

@@ -130,11 +130,7 @@ def checkpoint_of(cell: Cell, home: Path, models: str | None) -> Path:
 
 
 def run_stages(stages: Sequence[Stage], workers: int) -> None:
-    """Run what is unfinished in their order, `workers` at a time.
-
-    Raises:
-        UserError: one has failed.
-    """
+    """Run what is unfinished in their order, `workers` at a time; a UserError: one has failed."""
     unfinished = [stage for stage in stages if not (stage.folder / RESULTS[stage.command]).exists()]
     launcher, here = Launcher(workers=workers), ((number, run_stage(one)) for number, one in enumerate(unfinished))
     with (

@@ -31,10 +31,9 @@ whole interval is above 0 and p is below 0.05; a loss is, unless its whole inter
 
 
 def write_results(home: Path, table: pd.DataFrame, command: str) -> list[Path]:
-    """Write figures, `statistics.json` and `results.md`, from the table alone; returns their paths.
+    """Write figures, `statistics.json` and `results.md` (with the `command` that makes them anew); returns their paths.
 
-    Args:
-        command: the line that makes them anew, for the page.
+    They follow from the table alone.
     """
     measured, compared = rates(table), paired_tests(table)
     write_json(home / "statistics.json", {"rates": measured.to_dict("records"), "tests": compared.to_dict("records")})

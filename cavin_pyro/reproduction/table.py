@@ -56,11 +56,7 @@ def write_table(path: Path, table: pd.DataFrame) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """The table of a run, in its order.
-
-    Raises:
-        UserError: the file cannot be read, or holds something else.
-    """
+    """The table of a run, in its order; a UserError: the file cannot be read, or holds something else."""
     try:
         return pd.read_parquet(path, columns=list(COLUMNS)).astype(COLUMNS)
     except (OSError, ValueError, KeyError, TypeError, pyarrow.ArrowException) as error:
@@ -69,11 +65,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def chosen_rows(table: pd.DataFrame, config: DictConfig) -> pd.DataFrame:
-    """The rows that the options `methods`, `planners`, `tasks`, `rewards` and `objects` choose.
-
-    Raises:
-        UserError: there is none.
-    """
+    """The rows that the options `methods`, `planners`, `tasks`, `rewards` and `objects` choose; a UserError: none."""
     for name in CELL:
         table = table[table[name].isin(list(config[name if name == "objects" else f"{name}s"]))]
     if table.empty:

@@ -65,11 +65,7 @@ def table_box(view: View) -> tuple[float, float, float, float]:
 def circle(
     center: NDArray[np.floating], view: View, radius: float = TARGET_RADIUS
 ) -> tuple[tuple[float, float], float]:
-    """Centre and radius of a circle on the table around a point [3] metres, by default to mark the target with.
-
-    Args:
-        radius: metres.
-    """
+    """Centre and radius of a circle of `radius` metres on the table around a point [3] metres, to mark it with."""
     column, row = view.project(center)
     edge = on_table(np.array([[0.0, 0.0], [0.0, radius]]), view)
     return (float(column), float(row)), float(np.linalg.norm(edge[1] - edge[0]))
@@ -77,22 +73,13 @@ def circle(
 
 def subgoal_chains(record: PlanRecord, view: View) -> dict[int, Pixels]:
     """The chosen subgoals: a path [1 + segments, 2] of each object that moves; object 0 is the target."""
-    return _paths(record, record.plan.subgoals.centers[0].numpy()[: int(record.plan.segments[0])], view)
+    return object_paths(record, record.plan.subgoals.centers[0].numpy()[: int(record.plan.segments[0])], view)
 
 
 def predicted_paths(record: PlanRecord, view: View) -> dict[int, Pixels]:
     """f's predictions: a path [1 + steps, 2] of each object that moves."""
     steps = int(record.plan.segments[0]) * record.plan.actions.shape[1]
-    return _paths(record, record.plan.predicted_centers[0].numpy()[:steps], view)
-
-
-def reached_paths(record: PlanRecord, reached: NDArray[np.float32], view: View) -> dict[int, Pixels]:
-    """The observed states: a path [1 + n, 2] of each object that moved.
-
-    Args:
-        reached: [n, M, 3] metres, centres observed after each push.
-    """
-    return _paths(record, reached, view)
+    return object_paths(record, record.plan.predicted_centers[0].numpy()[:steps], view)
 
 
 def pushes(record: PlanRecord, view: View) -> Pixels:
@@ -119,8 +106,8 @@ def candidate_subgoals(record: PlanRecord, task: Task, view: View, *, count: int
     return view.project(points[chosen]), every[chosen]
 
 
-def _paths(record: PlanRecord, centers: NDArray[np.float32], view: View) -> dict[int, Pixels]:
-    """`centers`: [steps, M, 3] metres -> the paths of the real objects that move, by their numbers.
+def object_paths(record: PlanRecord, centers: NDArray[np.float32], view: View) -> dict[int, Pixels]:
+    """From where the plan was made through `centers`: [n, M, 3] metres: a path [1 + n, 2] of each object that moves.
 
     A plan may have fewer objects than the observation; the others are padding.
     """

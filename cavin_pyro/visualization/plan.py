@@ -38,9 +38,9 @@ from cavin_pyro.visualization.overlay import (
     View,
     candidate_subgoals,
     circle,
+    object_paths,
     predicted_paths,
     pushes,
-    reached_paths,
     subgoal_chains,
     table_box,
     tile_corners,
@@ -93,7 +93,7 @@ def draw_overlay(
         panel.plot(chain[:, 0], chain[:, 1], **style, markevery=slice(1, None), zorder=4 if number == 0 else 3.5)
     _draw_pushes(panel, record, view)
     if reached is not None:
-        draw_paths(panel, reached_paths(record, reached, view))
+        draw_paths(panel, object_paths(record, reached, view))
     draw_objects(panel, record.centers, record.mask, view)
     draw_places(panel, task, view)
 
@@ -184,7 +184,9 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     """
     if not episode.plan_records:
         raise ValueError("the episode holds no plan to draw: run it first")
-    plan_records = spread_plans(episode)
+    count = len(episode.plan_records)
+    chosen = np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)  # the first and the last among them
+    plan_records = [episode.plan_records[index] for index in chosen]
     panels = len(plan_records) + 1
     columns = {2: 2, 4: 2}.get(panels, 3)
     rows = -(-panels // columns)
@@ -197,7 +199,9 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     for panel in axes.flat[panels:]:
         panel.set_axis_off()
     if scale is not None:
-        draw_return_scale(figure, scale, ax=axes, fraction=0.02, pad=0.01, aspect=30)
+        bar = figure.colorbar(ScalarMappable(scale, RETURNS), ax=axes, fraction=0.02, pad=0.01, aspect=30)
+        bar.set_label("return of a candidate", fontsize=9)
+        bar.ax.tick_params(labelsize=8)
     figure.suptitle(
         f"{task.name}, seed {episode.seed}: {episode.outcome} after {counted(len(episode.transitions))}", fontsize=12
     )
@@ -205,13 +209,6 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     entries = len(handles) if columns == 3 else -(-len(handles) // 2)
     figure.legend(handles=handles, loc="outside lower center", ncols=entries, fontsize=9, frameon=False)
     save_figure(path, figure)
-
-
-def spread_plans(episode: Episode) -> list[PlanRecord]:
-    """At most `PANELS` plans of an episode, evenly spread, the first and the last among them."""
-    count = len(episode.plan_records)
-    chosen = np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)
-    return [episode.plan_records[index] for index in chosen]
 
 
 def draw_plan_record(
@@ -244,13 +241,6 @@ def return_scale(returns: NDArray[np.float32]) -> Normalize | None:
     return Normalize(low, high if high > low else low + 1.0)
 
 
-def draw_return_scale(figure: Figure, scale: Normalize, **place: Any) -> None:
-    """Draw the colours of the candidates' returns; `place`: as in `Figure.colorbar`."""
-    bar = figure.colorbar(ScalarMappable(scale, RETURNS), **place)
-    bar.set_label("return of a candidate", fontsize=9)
-    bar.ax.tick_params(labelsize=8)
-
-
 def _error(record: PlanRecord, reached: NDArray[np.float32] | None) -> str:
     """The error of f after the last executed push: the largest distance over the objects, for a title."""
     predicted = record.plan.predicted_centers[0].numpy()
@@ -268,7 +258,7 @@ def draw_end(panel: Axes, episode: Episode, task: Task, camera: Camera | None) -
     centers = np.array([transition.centers for transition in episode.transitions], dtype=np.float32).reshape(
         -1, *first.centers.shape
     )
-    draw_paths(panel, reached_paths(first, centers, view))
+    draw_paths(panel, object_paths(first, centers, view))
     draw_objects(panel, centers[-1] if len(centers) else last.centers, last.mask, view)
     draw_places(panel, task, view)
     won = episode.outcome == "success"

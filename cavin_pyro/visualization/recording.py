@@ -31,9 +31,9 @@ from cavin_pyro.visualization.overlay import (
     REACHED_COLOR,
     SUBGOAL_COLOR,
     candidate_subgoals,
+    object_paths,
     predicted_paths,
     pushes,
-    reached_paths,
     subgoal_chains,
 )
 from cavin_pyro.visualization.plan import RETURNS, return_scale
@@ -86,7 +86,7 @@ class EpisodeRecording(EpisodeCallback):
         self._stream.log("world/observed/centers", rr.Points3D(centers, colors=(255, 255, 255), radii=0.006))
         if self._record is not None:
             self._reached.append(observation["centers"])
-            paths = reached_paths(self._record, np.array(self._reached), Space())
+            paths = object_paths(self._record, np.array(self._reached), Space())
             self._log_paths("world/reached", paths, REACHED_COLOR, radius=0.006)
 
     def on_plan(self, record: PlanRecord) -> None:

@@ -36,14 +36,10 @@ PLAN_COLUMNS = (
 
 
 class EpisodeProgress(EpisodeCallback):
-    """Prints each push: number, what happened, reward, the time of the plan that it began, and what is left.
-
-    Args:
-        maximum_steps: pushes after which the episode ends.
-    """
+    """Prints each push: number, what happened, reward, the time of the plan that it began, and what is left."""
 
     def __init__(self, maximum_steps: int) -> None:
-        self.maximum_steps = maximum_steps
+        self.maximum_steps = maximum_steps  # pushes after which the episode ends
         self._began: float | None = None
         self._planned: PlanRecord | None = None  # a plan whose first push is not made yet
 
@@ -69,11 +65,7 @@ class EpisodeProgress(EpisodeCallback):
 
 
 def check_viewer(viewer: object) -> None:
-    """Check the option `viewer`, before anything is written.
-
-    Raises:
-        UserError: its package is not installed.
-    """
+    """Refuse, by a UserError, the option `viewer` without its package, before anything is written."""
     if viewer is not None and importlib.util.find_spec("rerun") is None:
         raise UserError(
             f"viewer={viewer} needs an optional part that is not installed: "
@@ -94,11 +86,7 @@ def check_goal(path: str | None) -> None:
 
 
 def write_goal(path: str, scene: Scene) -> None:
-    """Write a scene as it is now to a file for `task.goal`, atomically.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+    """Write a scene as it is now to a file for `task.goal`, atomically; a UserError: it cannot be written."""
     try:
         with atomic_write(Path(path)) as temporary:
             save_goal(temporary, scene)
@@ -111,8 +99,7 @@ def render_episode(
 ) -> dict[str, Any]:
     """Run one episode, print its pushes and write `episode_files` about it; returns its results' row.
 
-    Args:
-        viewer: "rerun" writes a recording for it as well.
+    `viewer`: "rerun" writes a recording for it as well.
     """
     env = runner.env
     with ExitStack() as stack:

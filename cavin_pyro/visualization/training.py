@@ -34,12 +34,8 @@ def save_figure(path: Path, figure: Figure) -> None:
 def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None:
     """The loss and each term of the objective over training steps.
 
-    Args:
-        rows: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and
-            `validation_<term>`; empty cells are skipped.
-
-    Raises:
-        ValueError: there is no row.
+    `rows`: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and `validation_<term>`; empty
+    cells are skipped. A ValueError: there is no row.
     """
     if not rows:
         raise ValueError("there is no row of metrics to draw: train first")
@@ -53,11 +49,7 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
 def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: NDArray[np.float32]) -> None:
     """Clouds and their reconstructions, from above and from the side.
 
-    Args:
-        clouds: [8, 256, 3] metres from their centres; any other number of them will do.
-
-    Raises:
-        ValueError: there is no cloud.
+    `clouds`: [8, 256, 3] metres from their centres, or another number of them. A ValueError: there is no cloud.
     """
     if len(clouds) == 0:
         raise ValueError("there is no cloud to draw: give at least one [256, 3]")

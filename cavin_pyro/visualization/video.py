@@ -38,11 +38,7 @@ FORMAT: dict[str, Any] = {
 
 @contextmanager
 def episode_video(path: Path, env: PushingEnv, task: Task) -> Iterator[EpisodeVideo]:
-    """Yield a video of an episode; the H.264 file, which browsers play, takes its place at the end, atomically.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Yield a video of an episode; the H.264 file, which browsers play, takes its place at the end, atomically."""
     with atomic_write(path) as temporary:
         writer = imageio.get_writer(temporary, mode="I", **FORMAT)
         try:

@@ -120,19 +120,10 @@ class Dynamics(PushOutcome):
 class MetaDynamics(nn.Module):
     """h: mean of the subgoal, the state T pushes ahead, given an effect code."""
 
-    def __init__(
-        self,
-        *,
-        effect_dimension: int = 16,
-        feature_dimension: int = 64,
-        width: int = 64,
-        maximum_displacement: float = SUBGOAL_RANGE,
-    ) -> None:
+    def __init__(self, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64) -> None:
         super().__init__()
         self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=width)
-        self.change = StateChange(
-            maximum_displacement=maximum_displacement, feature_dimension=feature_dimension, width=width
-        )
+        self.change = StateChange(maximum_displacement=SUBGOAL_RANGE, feature_dimension=feature_dimension, width=width)
 
     def effect(self, encoded: Tensor, effect_code: Tensor) -> Tensor:
         """Effect feature of (s, c): `[..., M, width]`. The action generator reads it too."""
@@ -180,7 +171,5 @@ class ActionGenerator(nn.Module):
 def _coordinates(inputs: int, segment_length: int, width: int) -> nn.Sequential:
     """Two numbers for each of the T pushes: `[..., inputs] -> [..., T, 2]`."""
     return nn.Sequential(
-        fully_connected(inputs, width),
-        nn.Linear(width, 2 * segment_length),
-        nn.Unflatten(-1, (segment_length, 2)),
+        fully_connected(inputs, width), nn.Linear(width, 2 * segment_length), nn.Unflatten(-1, (segment_length, 2))
     )

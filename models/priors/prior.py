@@ -65,21 +65,10 @@ class SceneContext(nn.Module):
 
 
 class LearnedPrior(Part):
-    """Base class of learned priors.
-
-    Args:
-        dimension: of the code. feature_dimension: F of the states.
-        effect_dimension: C for p(z | s, c), None for p(c | s).
-        width: width of all layers.
-    """
+    """Base class of learned priors. For their dimensions see `Prior`; `width`: of all layers."""
 
     def __init__(
-        self,
-        *,
-        dimension: int = 16,
-        feature_dimension: int = 64,
-        effect_dimension: int | None = None,
-        width: int = 32,
+        self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None, width: int = 32
     ) -> None:
         super().__init__()
         self.dimension = dimension

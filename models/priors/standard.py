@@ -12,21 +12,11 @@ from cavin_pyro.models.state import State
 
 
 class StandardPrior(Part):
-    """N(0, I) for every state (the paper's prior).
-
-    Every prior is built with these three dimensions and called with these two arguments; learned priors use them.
-    """
+    """N(0, I) for every state (the paper's prior), without layers; of its dimensions, see `Prior`, one is read."""
 
     def __init__(
         self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None
     ) -> None:
-        """It has no layers; the last two dimensions are not read.
-
-        Args:
-            dimension: of the code.
-            feature_dimension: F of the states.
-            effect_dimension: C for p(z | s, c), None for p(c | s).
-        """
         super().__init__()
         self.dimension = dimension
 

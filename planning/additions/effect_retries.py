@@ -42,7 +42,6 @@ class EffectRetries(Addition):
     def revise(
         self, plan: Plan, *, scene: Query, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
     ) -> Plan:
-        """See `Addition`."""
         scores = effects.returns
         for number in range(self.retries):
             after = plan.predicted_centers[:, plan.actions.shape[1] - 1]

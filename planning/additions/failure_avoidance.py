@@ -31,7 +31,6 @@ class FailureAvoidance(Addition):
         return objective if effect is None else AvoidFailures(objective, effect.segments, scene.reward)
 
     def rank(self, scores: Tensor, choice: Choice) -> Tensor:
-        """See `Addition`."""
         state = unwrap(choice.candidates.score_state, FailureState)
         # Without the cost of a failure, next to which distances lose their last digits.
         scores = torch.where(state.progress.failed & torch.isfinite(scores), state.inner.returns, scores)
@@ -52,12 +51,10 @@ class FailureState(NamedTuple):
 
     @property
     def failed(self) -> Tensor:
-        """`[B, n]` bool: none, as without failure avoidance."""
         return self.inner.failed
 
     @property
     def active(self) -> Tensor:
-        """`[B, n]` bool: all, as without failure avoidance."""
         return self.inner.active
 
 
@@ -69,12 +66,10 @@ class AvoidFailures(NamedTuple):
     reward: Reward
 
     def start(self, plans: State) -> FailureState:
-        """The state of candidates without a segment, `plans: [B, n]`."""
         progress = returns.start(plans.centers)
         return FailureState(self.objective.start(plans), progress, progress.failed)
 
     def advance(self, state: FailureState, segment: int, before: State, rollout: SegmentRollout) -> FailureState:
-        """The state after one more segment from `before: [B, n]`."""
         inner = self.objective.advance(state.inner, segment, before, rollout)
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
         progress = state.progress._replace(succeeded=state.progress.succeeded | ~counts)  # later segments cannot fail
@@ -83,5 +78,4 @@ class AvoidFailures(NamedTuple):
         return FailureState(inner, progress, torch.where(executed, progress.failed, state.failed_in_executed))
 
     def early_stopped(self, state: FailureState) -> Tensor:
-        """As without failure avoidance."""
         return self.objective.early_stopped(state.inner)

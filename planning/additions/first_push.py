@@ -20,5 +20,4 @@ class FirstPush(Addition):
     for_one_push = True
 
     def subgoal_distance(self, distance: SubgoalDistance, scene: Query, segments: int) -> SubgoalDistance:
-        """See `Addition`."""
         return distance._replace(at=FIRST_PUSH) if segments == 1 and scene.reward.about == "all" else distance

@@ -42,7 +42,6 @@ class Guidance(Addition):
     """
 
     def wrap_objective(self, objective: SearchObjective, scene: Query, effect: ChosenEffect | None) -> SearchObjective:
-        """See `Addition`."""
         distance = scene.reward.distance_to_goal()
         if distance is None:
             raise ValueError("the addition guidance needs a reward with a `distance_to_goal`: leave it out")
@@ -65,12 +64,10 @@ class GuidedProgress(NamedTuple):
 
     @property
     def failed(self) -> Tensor:
-        """bool: as without guidance."""
         return self.inner.failed
 
     @property
     def active(self) -> Tensor:
-        """bool: as without guidance."""
         return self.inner.active
 
 
@@ -82,12 +79,10 @@ class GuidedReturn:
     distance_to_goal: RemainingDistance
 
     def start(self, plans: State) -> GuidedProgress:
-        """Progress of candidates without a segment, `plans: [B, n]`."""
         potential = self.potential(plans.centers, plans.mask)
         return self.valued(self.objective.start(plans), potential, torch.zeros_like(potential), plans.mask)
 
     def advance(self, state: GuidedProgress, segment: int, before: State, rollout: SegmentRollout) -> GuidedProgress:
-        """Progress after one more segment from `before: [B, n]`."""
         inner = self.objective.advance(state.inner, segment, before, rollout)
         potential = self.potential(rollout.states.centers, before.mask)
         arrives = CONTINUES**segment  # the probability that the plan comes so far
@@ -128,11 +123,9 @@ class GuidedTracking(NamedTuple):
     guided: Tensor  # [B] bool: the chosen effect plan misses the goal
 
     def start(self, plans: State) -> Any:
-        """The state of candidates without a segment, `plans: [B, n]`."""
         return self.objective.start(plans)
 
     def advance(self, state: Any, segment: int, before: State, rollout: SegmentRollout) -> Any:
-        """The state after one more segment from `before: [B, n]`."""
         after = self.objective.advance(state, segment, before, rollout)
         counts = (self.guided & (segment < self.segments)).unsqueeze(-1)  # [B, 1]
         subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
@@ -142,5 +135,4 @@ class GuidedTracking(NamedTuple):
         return replace_within(after, TrackingState, lambda tracking: tracking._replace(cost=tracking.cost + cost))
 
     def early_stopped(self, state: Any) -> Tensor:
-        """As without guidance."""
         return self.objective.early_stopped(state)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -101,13 +100,7 @@ class PerturbedRollouts(Addition):
 
 
 def sequential_halving(
-    robustness: PerturbedRollouts,
-    choice: Choice,
-    *,
-    scores: Tensor,
-    goal: State | None,
-    actions: Tensor,
-    later: Tensor,
+    robustness: PerturbedRollouts, choice: Choice, *, scores: Tensor, goal: State | None, actions: Tensor, later: Tensor
 ) -> Tensor:
     """The candidate with the lowest cost on average, `[B]` int64; it advances the generators.
 
@@ -155,27 +148,16 @@ def perturbed_rollouts(
     if goal is not None and goal.batch_shape[-1] > 1:
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
     pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, n, A]
-    noise = _antithetic_noise((count, pushes.shape[-2], 2), scene.generators, pushes.device)
+    half = noise_each((-(-count // 2), pushes.shape[-2], 2), scene.generators, pushes.device)
+    noise = torch.cat((half, -half), 1)[:, :count]  # antithetic: its mean is 0 for an even count
     pushes[..., :2] += robustness.start_noise * noise.repeat(1, actions.shape[1], 1, 1)  # the same for every motion
     pushes = pushes.clamp(-1.0, 1.0)
     costs, failed = backend(_rollout_costs, choice.model, scene.reward, scene.state, goal, pushes, choice.distance)
     return costs.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
 
 
-def _antithetic_noise(shape: Sequence[int], generators: Sequence[torch.Generator], device: torch.device) -> Tensor:
-    """Normal noise `[B, n, ...]`, whose second half is the first with the opposite sign: its mean is 0 if n is even."""
-    count, *rest = shape
-    half = noise_each((-(-count // 2), *rest), generators, device)
-    return torch.cat((half, -half), 1)[:, :count]
-
-
 def _rollout_costs(
-    model: TransitionModel,
-    reward: Reward,
-    state: State,
-    goal: State | None,
-    pushes: Tensor,
-    distance: SubgoalDistance,
+    model: TransitionModel, reward: Reward, state: State, goal: State | None, pushes: Tensor, distance: SubgoalDistance
 ) -> tuple[Tensor, Tensor]:
     """Rollouts of `pushes: [B, n, T, 4]` by f: square metres to the `goal` and whether they fail, `[B, n]` each."""
     plans = state.expand_plans(pushes.shape[1])

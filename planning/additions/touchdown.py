@@ -33,7 +33,6 @@ class Touchdown(Addition):
         check_weight("distance", self.distance)
 
     def rank(self, scores: Tensor, choice: Choice) -> Tensor:
-        """See `Addition`."""
         observed = choice.scene.observed
         if not isinstance(observed, ObservedPoints) or observed.points.shape[1] == 0:
             return scores

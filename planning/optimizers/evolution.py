@@ -53,7 +53,6 @@ class Evolution:
         return 1 + self.generations
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
-        """See `Optimizer`."""
         initial = min(max(1, round(self.initial_fraction * samples)), samples - self.generations)
         candidates = problem.evaluate(problem.noise(initial), replacement=self.replacement)
         population = Population(candidates.noise, candidates.returns)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 
-from cavin_pyro.planning.checks import check_fraction, check_positive
+from cavin_pyro.planning.checks import check_fraction, check_positive, check_temperature
 from cavin_pyro.planning.optimizers.base import samples_of_iteration
 from cavin_pyro.planning.optimizers.weights import adapt_temperature
 from cavin_pyro.planning.rollout import SearchProblem
@@ -35,8 +34,7 @@ class MPPI:
         check_positive("iterations", self.iterations)
         check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
         check_fraction("shrink", self.shrink, positive=True)
-        if self.temperature is not None and not 0 < self.temperature < math.inf:
-            raise ValueError(f"temperature must be a positive number or null, not {self.temperature}")
+        check_temperature(self.temperature)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""

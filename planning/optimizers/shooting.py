@@ -18,7 +18,6 @@ class Shooting:
     replacement: bool = True
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
-        """See `Optimizer`."""
         if not problem.reparameterized:
             problem.sample(samples, replacement=self.replacement)
             return

@@ -1,38 +1,21 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
-import pyro
 import pytest
-import torch
-from torch.nn import functional
 
-from cavin_pyro.models.state import State, Window
-
-
-@pytest.fixture(autouse=True)
-def clean_pyro() -> Iterator[None]:
-    pyro.clear_param_store()
-    torch.manual_seed(0)
-    with pyro.settings.context(module_local_params=True):
-        yield
-    pyro.clear_param_store()
+from cavin_pyro.models.state import Window
+from tests.models import conftest as of_models
+from tests.models.conftest import clean_pyro  # noqa: F401
 
 
 def _random_window(batch: int = 4, steps: int = 3, objects: int = 4, features: int = 6) -> Window:
     """Windows with padding, an object that vanishes, and some pairs and windows that do not count."""
-    low, high = torch.tensor([0.22, -0.61, 0.0]), torch.tensor([0.98, 0.61, 0.1])
-    centers = low + (high - low) * torch.rand(batch, steps + 1, objects, 3)
-    vectors = functional.normalize(torch.randn(batch, steps + 1, objects, features), dim=-1)
-    mask = torch.ones(batch, steps + 1, objects, dtype=torch.bool)
-    mask[:, :, -1] = False  # padding
+    window = of_models._random_window(batch, steps, objects, features)
+    mask = window.states.mask.clone()
     mask[2, 2:, 0] = False  # gone after the second push
-    transition_mask = torch.ones(batch, steps, dtype=torch.bool)
-    transition_mask[0, 1] = False
-    transition_mask[3] = False
-    sequence_mask = torch.arange(batch) != 1
-    actions = 2 * torch.rand(batch, steps, 4) - 1
-    return Window(State(centers, vectors, mask), actions, transition_mask, sequence_mask)
+    window.transition_mask[3] = False
+    return window._replace(states=window.states._replace(mask=mask))
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ For the numbers see test_cavin_replay.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -32,29 +31,17 @@ RETURNS = [-2.0 - 1.0 + 99.0, -4.0, -2.0 + 99.0]
 PRESET = "early_stopping", PerturbedRollouts(256, rounds=3, reduction_factor=4)  # additions of their presets
 
 
-def sectar_plan(toy: SimpleNamespace, effects: Sequence[Sequence[float]]) -> Plan:
-    class Single(toy.Tabled):  # type: ignore[name-defined]
-        def actions(self, state: State, effect_code: Tensor) -> Tensor:
-            return super().actions(state, effect_code, 0.125 * torch.eye(16)[0].expand_as(effect_code))
-
-    planner = SectarPlanner(Single(effects, []), samples=3, horizon=4)
-    return planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
-
-
-def cvae_mpc_plan(toy: SimpleNamespace, motions: Sequence[Sequence[float]]) -> Plan:
-    class Flat(toy.Tabled):  # type: ignore[name-defined]
-        def motion_prior(self, state: State) -> Any:
-            return super().motion_prior(state, state.centers)
-
-        def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
-            return super().actions(state, torch.zeros_like(motion_code), motion_code)
-
-    planner = CvaeMpcPlanner(Flat([], motions), samples=3, horizon=4)
+def replay(toy: SimpleNamespace, kind: type, model: Any, **options: Any) -> Plan:
+    planner = kind(model, samples=3, horizon=4, **options)
     return planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
 
 
 def test_sectar_executes_what_g_makes_of_the_best_effect_code(toy: SimpleNamespace) -> None:
-    plan = sectar_plan(toy, EFFECTS)
+    class Single(toy.Tabled):  # type: ignore[name-defined]
+        def actions(self, state: State, effect_code: Tensor) -> Tensor:
+            return super().actions(state, effect_code, 0.125 * torch.eye(16)[0].expand_as(effect_code))
+
+    plan = replay(toy, SectarPlanner, Single(EFFECTS, []))
     assert plan.candidate_returns.tolist() == [RETURNS]
     assert plan.effect_codes[0, :, 0].tolist() == [0.5, 1.0]
     assert line(plan.subgoals.centers) == [0.5, 1.5]
@@ -68,14 +55,20 @@ def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> Non
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
             return torch.full((*effect_code.shape[:2], 2, 4), torch.nan)
 
-    planner = SectarPlanner(Broken(EFFECTS, []), samples=3, horizon=4, additions=[PerturbedRollouts()])
     with pytest.raises(ValueError, match="^environment 0: the pushes of the chosen effect are not finite"):
-        planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
+        replay(toy, SectarPlanner, Broken(EFFECTS, []), additions=[PerturbedRollouts()])
 
 
 def test_cvae_mpc_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
+    class Flat(toy.Tabled):  # type: ignore[name-defined]
+        def motion_prior(self, state: State) -> Any:
+            return super().motion_prior(state, state.centers)
+
+        def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
+            return super().actions(state, torch.zeros_like(motion_code), motion_code)
+
     # T = 2 pushes by z each: the same positions as those of the effects.
-    plan = cvae_mpc_plan(toy, [[code / 2 for code in row] for row in EFFECTS])
+    plan = replay(toy, CvaeMpcPlanner, Flat([], [[code / 2 for code in row] for row in EFFECTS]))
     assert plan.candidate_returns.tolist() == [RETURNS]
     assert plan.motion_codes[0, :, 0].tolist() == [0.25, 0.5]
     assert plan.planned_actions[0].tolist() == [[0, 0, 0.25, 0]] * 2 + [[0, 0, 0.5, 0]] * 2
@@ -218,8 +211,7 @@ def test_pushes_that_are_not_finite_never_win(kind: type, toy: SimpleNamespace) 
 def test_codes_are_sampled_as_the_cascade_generates_them(toy: SimpleNamespace) -> None:
     # Two segments of three samples: a row of each table per segment, and T = 2 pushes by c / 2 + z.
     effects, motions = [[-0.5, 0.5, -2.0], [0.25, 0.5, 0.0]], [[0.0, 0.125, 0.0], [0.0, 0.25, 0.0]]
-    planner = CavinWithoutEffectsPlanner(toy.Tabled(effects, motions), samples=3, horizon=4)
-    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), reward=toy.Line(), generators=toy.generators(0))
+    plan = replay(toy, CavinWithoutEffectsPlanner, toy.Tabled(effects, motions))
     # The second one goes to 0.75, where a copy of it takes the first one's place, and succeeds with its third push.
     assert plan.candidate_returns[0, 1] == -2.0 + 99.0 == plan.expected_return
     assert plan.motion_codes[0, :, [0, 16]].tolist() == [[0.5, 0.125], [0.5, 0.25]]

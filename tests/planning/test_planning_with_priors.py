@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from torch import nn
-from torch.distributions import Distribution, ExpTransform, Independent, Normal, TransformedDistribution, Uniform
+from torch.distributions import ExpTransform, Independent, Normal, TransformedDistribution, Uniform
 
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.priors.conditional import ConditionalPrior
@@ -16,7 +16,7 @@ from cavin_pyro.models.priors.mixture import ObjectMixturePrior
 from cavin_pyro.models.priors.standard import StandardPrior
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner, Plan
-from cavin_pyro.planning.sampling import noise_each, reparameterize, reparameterize_each, sample_each
+from cavin_pyro.planning.sampling import noise_each, reparameterize, sample_codes
 
 each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, FlowPrior, ObjectMixturePrior])
 
@@ -64,10 +64,11 @@ def test_a_plan_comes_out_and_again_from_the_same_seed(kind: type, horizon: str,
 @each_prior
 def test_noise_stands_for_the_code_that_the_prior_draws_with_it(kind: type, toy: SimpleNamespace) -> None:
     model, state = model_with(kind), scenes(toy).expand_plans(6)
-    effects = reparameterize_each(model.effect_prior, [state], noise_each((6, 5), toy.generators(3, 4)))
-    torch.testing.assert_close(effects, sample_each(model.effect_prior, [state], toy.generators(3, 4)))
-    motions = reparameterize_each(model.motion_prior, [state, effects], noise_each((6, 4), toy.generators(5, 6)))
-    torch.testing.assert_close(motions, sample_each(model.motion_prior, [state, effects], toy.generators(5, 6)))
+    noise = [noise_each((6, 5), toy.generators(3, 4)), noise_each((6, 4), toy.generators(5, 6))]
+    effects = sample_codes(model.effect_prior, [state], noise[0])
+    torch.testing.assert_close(effects, sample_codes(model.effect_prior, [state], None, toy.generators(3, 4)))
+    motions = sample_codes(model.motion_prior, [state, effects], noise[1])
+    torch.testing.assert_close(motions, sample_codes(model.motion_prior, [state, effects], None, toy.generators(5, 6)))
 
 
 @each_prior
@@ -76,38 +77,6 @@ def test_an_environment_does_not_see_the_others(kind: type, toy: SimpleNamespace
     alone = plan_with(toy, model_with(kind), scenes(toy).scene(slice(1, 2)), 4)
     assert torch.allclose(both.candidate_returns[1], alone.candidate_returns[0], atol=1e-5)
     assert torch.allclose(both.actions[1], alone.actions[0], atol=1e-5)
-
-
-@pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior, ObjectMixturePrior])
-def test_what_the_prior_has_learned_is_what_is_considered(kind: type, toy: SimpleNamespace) -> None:
-    """A prior trained on codes near 2 proposes codes near 2."""
-    model = model_with(kind)
-    prior, state = model.prior_of_effects, scenes(toy).scene(slice(0, 1)).expand((64,))
-    optimizer = torch.optim.Adam(prior.parameters(), 3e-2)
-    for _ in range(100):
-        optimizer.zero_grad()
-        (-prior(state).log_prob(2 + 0.1 * torch.randn(64, 5))).mean().backward()
-        optimizer.step()
-    first = plan_with(toy, model, scenes(toy), 3, 4).effect_codes[0, 0]
-    assert (first - 2).abs().max() < 1
-
-
-def learned_prior(state: State, effect_code: torch.Tensor) -> Distribution:
-    """A prior that reads what it is given."""
-    mean = state.centers[..., 0, :1] + effect_code
-    return Independent(Normal(mean, 0.1), 1)
-
-
-def test_an_environment_draws_the_same_whoever_else_is_in_the_batch(toy: SimpleNamespace) -> None:
-    state = toy.scenes([[(0.1, 0.0)], [(50.0, 0.0)], [(-50.0, 0.0)]]).expand_plans(8)
-    codes = torch.randn(3, 8, 16)
-    together = sample_each(learned_prior, [state, codes], toy.generators(5, 6, 7))
-    for index, seed in enumerate((5, 6, 7)):
-        scene = slice(index, index + 1)
-        alone = sample_each(learned_prior, [state.scene(scene), codes[scene]], toy.generators(seed))
-        assert torch.equal(alone[0], together[index])
-    assert (together[1] > 40).all()
-    assert (together[2] < -40).all()
 
 
 def test_transformed_normals_are_searched_through_their_transforms() -> None:

@@ -50,30 +50,17 @@ def test_every_step_of_an_active_plan_counts(toy: SimpleNamespace) -> None:
     assert progress.segments == 2
 
 
-def test_rewards_after_a_success_do_not_count(toy: SimpleNamespace) -> None:
-    ended = advance(toy.Line(), [0.5, 1.0, 1.5], [-1.0, -1.0, -1.0])
-    assert ended.returns == -1.0 + 99.0
-    assert ended.succeeded
-    assert not ended.failed
-    assert ended.segments == 1
-
-
-def test_rewards_after_a_failure_do_not_count(toy: SimpleNamespace) -> None:
-    ended = advance(toy.Line(), [-0.2, -0.4, -0.6], [1.0, 1.0, 1.0])
-    assert ended.returns == -2.0 - 101.0
-    assert ended.failed
-    assert not ended.succeeded
-    assert ended.segments == 1
+def test_rewards_after_the_end_do_not_count(toy: SimpleNamespace) -> None:
+    won = advance(toy.Line(), [0.5, 1.0, 1.5], [-1.0, -1.0, -1.0])
+    assert (won.returns, won.succeeded, won.failed, won.segments) == (-1.0 + 99.0, True, False, 1)
+    lost = advance(toy.Line(), [-0.2, -0.4, -0.6], [1.0, 1.0, 1.0])
+    assert (lost.returns, lost.succeeded, lost.failed, lost.segments) == (-2.0 - 101.0, False, True, 1)
 
 
 def test_a_step_that_succeeds_and_fails_is_a_failure(toy: SimpleNamespace) -> None:
-    def contradictory(previous: torch.Tensor, centers: torch.Tensor, mask: torch.Tensor) -> StepOutcome:
-        both = torch.ones(centers.shape[:-2], dtype=torch.bool)
-        return toy.StepOutcome(torch.zeros(both.shape), both, both)
-
-    ended = advance(contradictory, [0.0])
-    assert ended.failed
-    assert not ended.succeeded
+    both = torch.ones(1, dtype=torch.bool)
+    ended = advance(lambda *_: toy.StepOutcome(torch.zeros(1), both, both), [0.0])
+    assert ended.failed and not ended.succeeded
 
 
 def test_the_reward_sees_each_step_with_the_state_before_it(toy: SimpleNamespace) -> None:

@@ -8,13 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cavin_pyro.planning.optimizers.base import samples_of_iteration
-from cavin_pyro.planning.optimizers.weights import (
-    RANGE,
-    SAME,
-    TEMPERATURES,
-    adapt_temperature,
-    effective_sample_size,
-)
+from cavin_pyro.planning.optimizers.weights import RANGE, SAME, TEMPERATURES, adapt_temperature, effective_sample_size
 
 INFINITE = float("inf")
 STEP = (RANGE[1] / RANGE[0]) ** (1 / (TEMPERATURES - 1))  # between neighbours on the grid of inverse temperatures

@@ -15,6 +15,7 @@ from cavin_pyro.criticism.guide import simulate
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
 from cavin_pyro.guides.cascaded import CascadedGuide
+from cavin_pyro.guides.none import NoGuide
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.dynamics_only import DynamicsModel
 from cavin_pyro.models.likelihoods import LikelihoodScales
@@ -27,12 +28,6 @@ PRECISION = 1 / NOISE**2
 
 def normal(mean: Tensor, scale: float) -> distributions.TorchDistribution:
     return distributions.Normal(mean, torch.as_tensor(scale, dtype=mean.dtype)).to_event(1)
-
-
-class NoGuide(PyroModule):
-    """Draws nothing."""
-
-    def forward(self, window: Window) -> None: ...
 
 
 class SceneModel(PyroModule):
@@ -148,7 +143,7 @@ def right() -> SimpleNamespace:
         model = cascade_of()
         windows = {part: generated_by(model, part) for part in ("f", "h")}
         alone = DynamicsModel(**SIZES).requires_grad_(False)
-        dynamics = CheckContext(alone, NoGuide(), PointNet(), windows["f"], windows["f"])
+        dynamics = CheckContext(alone, NoGuide(alone), PointNet(), windows["f"], windows["f"])
     return SimpleNamespace(context=cascade_context, dynamics=dynamics, make=cascade_of, model=model, windows=windows)
 
 

@@ -19,12 +19,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
 from cavin_pyro.criticism.comparison import assess_pair, check_pair, write_pair
-from cavin_pyro.criticism.loading import (
-    CheckContext,
-    compare_data,
-    load_context,
-    trained_windows,
-)
+from cavin_pyro.criticism.loading import CheckContext, compare_data, load_context, trained_windows
 from cavin_pyro.criticism.section import Section, Verdict
 from cavin_pyro.data.dataset import content_records
 from cavin_pyro.data.windows import load_windows

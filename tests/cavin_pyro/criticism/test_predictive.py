@@ -40,36 +40,27 @@ def values(made: GeneratedWindow, near: Nearness = NEAR) -> dict[str, Tensor]:
     return {statistic.name: statistic.function(made)[0] for statistic in statistics_of(near)}
 
 
-@pytest.fixture
-def pushed() -> GeneratedWindow:
+def test_statistics_by_hand() -> None:
     """Two objects 0.2 m apart; the first push moves one by 0.06 m, the second misses both by far.
 
     f lets the second object slip by 0.012 m in the second push; h wants the first 0.16 m further, at the second.
     """
-    return outcome(
+    pushed = outcome(
         centers=[[[0.5, 0.0], [0.7, 0.0]], [[0.56, 0.0], [0.7, 0.0]], [[0.56, 0.0], [0.7, 0.012]]],
         pushes=[[0.42, 0.0, 0.1, 0.0], [0.5, 0.4, 0.0, 0.1]],
         subgoal=[[0.66, 0.0], [0.7, 0.0]],
     )
-
-
-def test_moves_are_of_the_farthest_object_and_of_those_beyond_a_centimetre(pushed: GeneratedWindow) -> None:
-    found = values(pushed)
-    assert found["farthest_move_h"].item() == pytest.approx(0.16, abs=1e-6)
-    assert found["farthest_move_f"].item() == pytest.approx(0.06, abs=1e-6)
-    assert (found["moved_objects_h"].item(), found["moved_objects_f"].item()) == (1.0, 2.0)
-
-
-def test_objects_inside_each_other_are_counted_as_pairs(pushed: GeneratedWindow) -> None:
-    found = values(pushed)
-    assert (found["close_pairs_h"].item(), found["close_pairs_f"].item()) == (1.0, 0.0)
-    assert values(pushed, Nearness(pair=0.15, tool=0.04))["close_pairs_f"].item() == 1.0
-
-
-def test_pushes_start_where_they_start(pushed: GeneratedWindow) -> None:
     found = values(pushed)
     aside = math.hypot(0.06, 0.4)  # from (0.5, 0.4) to the first object, which lies at (0.56, 0) by then
-    assert found["start_to_nearest"].tolist() == pytest.approx([0.08, aside], abs=1e-6)
+    assert found.pop("start_to_nearest").tolist() == pytest.approx([0.08, aside], abs=1e-6)
+    assert {name: value.item() for name, value in found.items()} == pytest.approx(
+        {
+            **{"farthest_move_h": 0.16, "farthest_move_f": 0.06, "moved_objects_h": 1.0, "moved_objects_f": 2.0},
+            **{"close_pairs_h": 1.0, "close_pairs_f": 0.0, "touching": 0.5},
+        },
+        abs=1e-6,
+    )
+    assert values(pushed, Nearness(pair=0.15, tool=0.04))["close_pairs_f"].item() == 1.0
 
 
 def test_a_push_touches_along_its_whole_path() -> None:

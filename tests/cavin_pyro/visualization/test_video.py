@@ -4,7 +4,6 @@ from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from cavin_pyro.envs.pushing import VIDEO_SIZE, PushingEnv
@@ -41,14 +40,3 @@ def test_an_episode_is_filmed_from_the_first_push_to_the_last_as_browsers_play_i
     content = path.read_bytes()
     assert 0 < content.index(b"moov") < content.index(b"mdat")  # it begins before it is loaded
     assert [one.name for one in tmp_path.iterdir()] == ["episode.mp4"]
-
-
-def test_a_crash_keeps_the_video_of_an_earlier_run_and_nothing_else(tmp_path: Path) -> None:
-    env = PushingEnv(task="insertion", objects=1)
-    env.reset(seed=0)
-    (tmp_path / "old.mp4").write_bytes(b"old")
-    with pytest.raises(KeyboardInterrupt), episode_video(tmp_path / "old.mp4", env, env.task) as video:
-        video.on_frame()
-        raise KeyboardInterrupt
-    env.close()
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]

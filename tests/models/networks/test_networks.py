@@ -18,7 +18,6 @@ from cavin_pyro.models.networks.dynamics import (
     SUBGOAL_RANGE,
     ActionGenerator,
     Dynamics,
-    MetaDynamics,
     StateChange,
 )
 from cavin_pyro.models.networks.layers import TABLE_CENTER, StateEncoder, neighbours
@@ -41,22 +40,6 @@ def test_networks_know_the_table_and_the_tool_as_the_environments_do() -> None:
     """They do not know the environments, and so have these numbers a second time."""
     assert (*CENTER, 0.0) == TABLE_CENTER
     assert TOOL_RADIUS == STICK_RADIUS
-
-
-@pytest.mark.parametrize(("objects", "most"), [(5, None), (9, 4)])
-def test_relations_equal_their_definition_pair_by_pair(
-    random_state: Callable[..., State], objects: int, most: int | None
-) -> None:
-    """For one scene, two FC on each difference, summed over the nearest other real objects."""
-    encoder, state = small_encoder(most), double(random_state(objects=objects, real=objects - 1))
-    positions = (state.centers - torch.tensor([0.6, 0.0, 0.0], dtype=torch.float64)) / 0.1
-    for i in range(objects - 1):
-        others = sorted(range(objects - 1), key=lambda j: (positions[j] - positions[i])[:2].norm())
-        expected = torch.zeros(8, dtype=torch.float64)
-        for j in others[1:][:most]:
-            expected = expected + encoder.relation(encoder.difference(positions[j] - positions[i]).relu())
-        assert torch.allclose(encoder(state)[i, 16:], expected, atol=1e-12)
-        assert expected.abs().max() > 0.1
 
 
 @settings(max_examples=20, deadline=None)
@@ -89,22 +72,6 @@ def test_order_and_padding_leave_features_and_predictions(random_state: Callable
     for field, expected in zip(dynamics(shuffled, encoder(shuffled), action), predicted, strict=True):
         assert torch.allclose(field, expected[:, ORDER], atol=1e-12)
     assert torch.equal(predicted.centers[:, 3], state.centers[:, 3])
-
-
-@settings(max_examples=15, deadline=None)
-@given(batch=st.lists(st.integers(1, 3), min_size=1, max_size=3), objects=st.integers(1, 10))
-def test_leading_dimensions_broadcast(random_state: Callable[..., State], batch: list[int], objects: int) -> None:
-    encoder, meta_dynamics = small_encoder(4), MetaDynamics(effect_dimension=5, **SIZES).double()
-    generator = ActionGenerator(motion_dimension=5, width=8).double()
-    state, codes = double(random_state(*batch[:-1], 1, objects=objects)), torch.randn(*batch, 5, dtype=torch.float64)
-    effect = meta_dynamics.effect(encoder(state), codes)
-    subgoal, actions = meta_dynamics(state, effect), generator(effect, state.mask, codes)
-    assert (subgoal.batch_shape, subgoal.mask.shape, actions.shape) == ((*batch,), (*batch, objects), (*batch, 3, 4))
-    last = tuple(size - 1 for size in batch)
-    alone = state.expand(batch).map(lambda field: field[last])
-    effect = meta_dynamics.effect(encoder(alone), codes[last])
-    assert torch.allclose(subgoal.centers[last], meta_dynamics(alone, effect).centers, atol=1e-10)
-    assert torch.allclose(actions[last], generator(effect, alone.mask, codes[last]), atol=1e-10)
 
 
 def test_an_object_alone_has_no_relations_and_other_features_are_refused(random_state: Callable[..., State]) -> None:

@@ -87,13 +87,7 @@ def test_h_and_g_read_the_nearest_and_f_reads_all(toy: SimpleNamespace) -> None:
     planner = CavinPlanner(model, 32, 6, additions=[NearestObjects(4)])  # type: ignore[arg-type]
     reward = toy.GoalDisc(goal=(0.2, 0.0), about="target")
     plan = planner.plan(toy.scenes([PLACES]), reward=reward, generators=toy.generators(0))
-    assert model.read == {
-        "effect_prior": {4},
-        "subgoal": {4},
-        "motion_prior": {4},
-        "actions": {4},
-        "next_state": {6},
-    }
+    assert model.read == {"effect_prior": {4}, "subgoal": {4}, "motion_prior": {4}, "actions": {4}, "next_state": {6}}
     assert plan.subgoals.centers.shape == (1, 2, 6, 3)
     assert plan.predicted_centers.shape[2] == 6
     left_out = plan.subgoals.centers[0, :, [1, 3]] - toy.scenes([PLACES]).centers[0, [1, 3]]
