@@ -21,9 +21,8 @@ def _run() -> None:
     kinds = {kind.name: kind for kind in (YcbObjects(), SawyerRobot())}
     parser = Parser(prog="python -m cavin_pyro.assets", description=main.__doc__)
     parser.add_argument("kind", choices=kinds, help="the ten YCB objects of the paper, or the Sawyer arm")
-    parser.add_argument(
-        "--to", type=Path, required=True, metavar="DIR", help="folder, in which the kind gets its own subfolder"
-    )
+    to = "folder, in which the kind gets its own subfolder"
+    parser.add_argument("--to", type=Path, required=True, metavar="DIR", help=to)
     parser.add_argument("--source", metavar="URL", help="a mirror of the publisher's site, with the same paths")
     arguments = parser.parse_args()
     print(install(kinds[arguments.kind], arguments.to, arguments.source))

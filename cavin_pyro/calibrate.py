@@ -16,14 +16,8 @@ def main(config: DictConfig) -> None:
     import pyro
 
     from cavin_pyro.config.device import choose_device
+    from cavin_pyro.criticism import recalibration
     from cavin_pyro.criticism.guide import assess_guide
-    from cavin_pyro.criticism.recalibration import (
-        calibrate_f,
-        calibrate_guide,
-        load_calibration,
-        print_change,
-        write_calibrated,
-    )
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
@@ -32,22 +26,22 @@ def main(config: DictConfig) -> None:
     config.device = device.type
     with output_folder(config.output) as folder:
         check_same_run(folder, config, ignore=("output", "device"))
-        loaded, context = load_calibration(config)
+        loaded, context = recalibration.load_calibration(config)
         write_config(folder, config)
         measured: dict[str, Any] = {}
         sizes = {"windows": config.windows, "samples": config.samples}
         if "scales" in config.parts:
-            factor, before, after = calibrate_f(context, **sizes)
+            factor, before, after = recalibration.calibrate_f(context, **sizes)
             measured["scales"] = {"factor": factor, "before": before.values, "after": after.values}
             print(f"f's scales of centres are {factor:.3g} times what they were")
-            print_change(before, after)
+            recalibration.print_change(before, after)
         if "guide" in config.parts:
             before = assess_guide(context, **sizes)
-            losses = calibrate_guide(config, loaded, device)
+            losses = recalibration.calibrate_guide(config, loaded, device)
             after = assess_guide(context, **sizes)
             measured |= {"before": before.values, "after": after.values, "losses": losses}
-            print_change(before, after)
-        print(f"written: {write_calibrated(folder, config, loaded, measured)}")
+            recalibration.print_change(before, after)
+        print(f"written: {recalibration.write_calibrated(folder, config, loaded, measured)}")
 
 
 if __name__ == "__main__":

@@ -23,10 +23,8 @@ def main(config: DictConfig) -> None:
 
     if config.minimum_objects > config.maximum_objects:
         raise UserError(f"minimum_objects must be at most maximum_objects={config.maximum_objects}")
-    collection = replace(
-        collecting_world(config.env),
-        **{one.name: config[one.name] for one in fields(CollectionOptions)},
-    )
+    given = {one.name: config[one.name] for one in fields(CollectionOptions)}
+    collection = replace(collecting_world(config.env), **given)
     check_policy(collection)
     with output_folder(config.output) as folder:
         launcher = chosen_launcher(config)

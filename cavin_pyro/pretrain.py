@@ -35,17 +35,9 @@ def main(config: DictConfig) -> None:
         )
         check_same_run(folder, config, ignore=("data", "output", "device"))
         stored_config = write_config(folder, config)
-        losses = pretrain(
-            autoencoder,
-            clouds,
-            steps=config.steps,
-            batch_size=config.batch_size,
-            learning_rate=config.learning_rate,
-            seed=config.seed,
-            log=folder / "metrics.csv",
-            resume=folder / "resume.safetensors",
-            device=device,
-        )
+        options = {name: config[name] for name in ("steps", "batch_size", "learning_rate", "seed")}
+        log, resume = folder / "metrics.csv", folder / "resume.safetensors"
+        losses = pretrain(autoencoder, clouds, **options, log=log, resume=resume, device=device)
         record = {**provenance(), "clouds": len(clouds), "losses": losses}
         parts = {"geometry": autoencoder.encoder, "decoder": autoencoder.decoder}
         save(folder / "pointnet.safetensors", **parts, config=stored_config, provenance=record)

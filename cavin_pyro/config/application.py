@@ -33,9 +33,9 @@ else:
     DictConfig = Any
 
 RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "assets")  # docs/reliability.md
-_REFUSALS = ("ENOSPC", "EDQUOT", "EACCES", "EPERM", "EROFS", "EFBIG", "EIO", "ENAMETOOLONG")
 _TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST}
-_DISK_ERRORS = {getattr(errno, name) for name in _REFUSALS} | _TAKEN
+_DENIED = {errno.EACCES, errno.EPERM}
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG, *_DENIED, *_TAKEN}
 
 T = TypeVar("T")
 Figures = Mapping[str, Any]
@@ -68,7 +68,11 @@ def _run(name: str, body: Body) -> None:
     line = read_command_line(sys.argv[1:])
     from omegaconf import OmegaConf
 
-    config, choices = _compose(name, line)
+    from cavin_pyro.config.composition import composed, rewritten, sweeps
+
+    # Of a sweep, every run is checked before the first one begins.
+    every = sweeps(rewritten(line.overrides)) if line.multirun else [line.overrides]
+    config, choices = [composed(name, overrides, line.config_dir) for overrides in every][-1]
     if line.help or line.help_all:
         from cavin_pyro.config.help import help_page
 
@@ -131,10 +135,10 @@ def _refusal(error: OSError) -> str:
     name = error.filename
     if name and error.errno == errno.ENAMETOOLONG:
         return f"{name} is no file: {error.strerror}"
-    if name and error.errno in (errno.EACCES, errno.EPERM) and os.path.exists(name) and not os.access(name, os.R_OK):
+    if name and error.errno in _DENIED and os.path.exists(name) and not os.access(name, os.R_OK):
         return f"{name} cannot be read: {error.strerror}; change its permissions, or give another"
     where = f" at {name}" if name else ""
-    if error.errno in (errno.EISDIR, errno.ENOTDIR, errno.EEXIST):
+    if error.errno in _TAKEN:
         return f"something else is{where or ' where results go'} ({error.strerror}): move it away, or choose output=DIR"
     return f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR"
 
@@ -182,14 +186,6 @@ def _stop(line: str, status: int) -> NoReturn:
     line = re.sub(r"(\S{400})\S+", r"\1...", " ".join(line.split()))  # a number of 5,000 digits
     print(f"error: {line}", file=sys.stderr, flush=True)
     raise SystemExit(status)
-
-
-def _compose(name: str, line: argparse.Namespace) -> tuple[DictConfig, dict[str, str]]:
-    """Check the overrides of every run. Returns the configuration of the last one, and its presets by group."""
-    from cavin_pyro.config.composition import composed, rewritten, sweeps
-
-    every = sweeps(rewritten(line.overrides)) if line.multirun else [line.overrides]
-    return [composed(name, overrides, line.config_dir) for overrides in every][-1]
 
 
 def read_command_line(arguments: Sequence[str]) -> argparse.Namespace:

@@ -20,7 +20,7 @@ CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of
     "mpc": ("dynamics", "none"),
 }
 DEFAULT_CHECKPOINT = "cavin"
-CALIBRATED = ("guide", "scales")
+PAPER_TASKS = ["clearing", "insertion", "crossing"]
 SECTIONS = ("elbo", "guide", "prior", "predictive", "intervals", "subgoals")  # of the report of check
 COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of an episode
 ENV = {name: one.default for name, one in inspect.signature(PushingEnv).parameters.items()}
@@ -30,10 +30,11 @@ GENERATED, RANGES = GeneratedLayouts(), ObjectRanges()
 CHECKPOINT = f"checkpoint: a shipped one ({', '.join(CHECKPOINTS)}), or the path of one from train"
 DATA = "dataset folder from collect, or several: data=[data/one,data/two]"
 FOLDER = "folder for the results, in which an unfinished run resumes; by default one in runs/"
+CRITERION = "which violations end an episode: those of the paper's text, or of its code"
 HELD_OUT = "names of objects, [mug,banana]; training omits what shows one of them"
 PRECISION = "precision of the factors of matrix products; bfloat16 is TF32 on a GPU"
 TRUST = "modules of your own whose classes the checkpoint may name"
-REPRODUCE = "cavin_pyro.reproduction"  # where the choices of options are listed
+ENVS, REPRODUCE = "cavin_pyro.envs", "cavin_pyro.reproduction"  # where the choices of options are listed
 PRECISIONS = "cavin_pyro.config.device.MATMUL_PRECISIONS"
 
 
@@ -71,13 +72,11 @@ class RangesConfig:
 class WorldConfig:
     """The section `env`: robot, objects, camera and segmentation, by name or as a class of the user's own."""
 
-    robot: Any = option(ENV["robot"], "robot that pushes", choices="cavin_pyro.envs.robots.ROBOTS")
-    objects: Any = option(
-        ENV["object_set"], "set of objects", choices="cavin_pyro.envs.objects.object_sets.OBJECT_SETS"
-    )
-    camera: Any = option(ENV["camera"], "depth camera", choices="cavin_pyro.envs.sensors.CAMERAS")
+    robot: Any = option(ENV["robot"], "robot that pushes", choices=f"{ENVS}.robots.ROBOTS")
+    objects: Any = option(ENV["object_set"], "set of objects", choices=f"{ENVS}.objects.object_sets.OBJECT_SETS")
+    camera: Any = option(ENV["camera"], "depth camera", choices=f"{ENVS}.sensors.CAMERAS")
     segmentation: Any = option(
-        ENV["segmentation"], "segmentation of depth images", choices="cavin_pyro.envs.segmentation.SEGMENTERS"
+        ENV["segmentation"], "segmentation of depth images", choices=f"{ENVS}.segmentation.SEGMENTERS"
     )
     assets: str | None = option(None, "folder of meshes, for object sets and robots that need one")
     ranges: RangesConfig = field(default_factory=RangesConfig)
@@ -122,9 +121,7 @@ class TrainerConfig:
     steps: int = option(1_000_000, "gradient steps, at most", minimum=1)
     batch_size: int = option(64, "windows per step", minimum=1)
     learning_rate: float = option(1e-4, "learning rate of Adam", positive=True)
-    schedule: str = option(
-        "constant", "schedule of the learning rate; cosine ends at 1 %", choices=("constant", "cosine")
-    )
+    schedule: str = option("constant", "of the learning rate; cosine ends at 1 %", choices=("constant", "cosine"))
     batches: str = option("mixed", "bucketed: one number of objects in each", choices=("mixed", "bucketed"))
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
     cuda_graphs: bool = option(True, "on a GPU, replay each step's loss and gradients as one CUDA graph")
@@ -221,7 +218,7 @@ class CalibrateConfig(DeviceOptions):
     defaults: list[Any] = preset_defaults("")
     checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
     trust: list[str] = option([], TRUST)
-    parts: list[str] = option(["guide"], "what to calibrate", choices=CALIBRATED)
+    parts: list[str] = option(["guide"], "what to calibrate", choices=("guide", "scales"))
     data: Any = option("data/pushes", f"{DATA}; the model's training data")
     output: str | None = option(None, "folder for the checkpoint; by default one in runs/")
     seed: int = seed_option()
@@ -260,11 +257,7 @@ class SceneConfig(DeviceOptions):
     defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper")
     layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
     reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
-    criterion: str = option(
-        ENV["criterion"],
-        "which violations end an episode: those of the paper's text, or of its code",
-        choices="cavin_pyro.envs.tasks.reward.CRITERIA",
-    )
+    criterion: str = option(ENV["criterion"], CRITERION, choices=f"{ENVS}.tasks.reward.CRITERIA")
     objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
     planner: Any = None
@@ -314,9 +307,7 @@ class DemoConfig(SceneConfig):
     """Options of `python -m cavin_pyro.demo`."""
 
     output: str | None = option(None, "folder for the results, with a subfolder per task; by default runs/demo")
-    tasks: list[str] = option(
-        ["clearing", "insertion", "crossing"], "tasks to run", choices="cavin_pyro.envs.tasks.TASKS"
-    )
+    tasks: list[str] = option(PAPER_TASKS, "tasks to run", choices=f"{ENVS}.tasks.TASKS")
     seed: int = seed_option("seed of the scenes and of the planner", default=1)
 
 
@@ -332,7 +323,7 @@ class ReproduceConfig(DeviceOptions):
         choices=f"{REPRODUCE}.methods.METHODS",
     )
     planners: list[str] = option(["paper", "ours"], "kinds of planners", choices=f"{REPRODUCE}.cells.PLANNERS")
-    tasks: list[str] = option(["clearing", "insertion", "crossing"], "tasks", choices=f"{REPRODUCE}.sizes.TASKS")
+    tasks: list[str] = option(PAPER_TASKS, "tasks", choices=f"{REPRODUCE}.sizes.TASKS")
     objects: list[int] = option([1, 2, 3, 4, 5], "numbers of objects with sparse rewards, at most those of the scale")
     rewards: list[str] = option(["dense", "sparse"], "rewards of the tasks", choices=f"{REPRODUCE}.sizes.REWARDS")
     episodes: int | None = option(None, "episodes per cell of the top row; by default the scale's", minimum=1)

@@ -9,7 +9,6 @@ import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -60,21 +59,24 @@ def _word(value: Any) -> str:
 def composed(name: str, overrides: Sequence[str], config_dir: str | None = None) -> tuple[DictConfig, dict[str, str]]:
     """The configuration of a command, and the choice of each group of presets; `config_dir` has further presets.
 
-    Raises:
-        UserError: an unknown command, option or preset, an override that does not parse, or a value out of its range.
+    An unknown command, option or preset, an override that does not parse, or a value out of its range is a `UserError`.
     """
     if name not in COMMANDS:
         raise UserError(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
     register(name)
     words = [f"hydra.searchpath=['file://{Path(config_dir).resolve()}']"] if config_dir else []
     words += rewritten(overrides)
-    with _hydra():
-        try:
-            return _composed(name, words)
-        except UserError:
-            raise
-        except Exception as error:
-            raise UserError(_explained(name, words, error)) from error
+    running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None  # also within a sweep
+    try:
+        with hydra.initialize(version_base="1.3", config_path=None):
+            try:
+                return _composed(name, words)
+            except UserError:
+                raise
+            except Exception as error:
+                raise UserError(_explained(name, words, error)) from error
+    finally:
+        GlobalHydra.instance().hydra = running
 
 
 @functools.cache
@@ -131,12 +133,10 @@ def presets(group: str) -> list[str]:
 
 def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
     """The overrides of every run of a sweep (`-m`): all combinations of the values given."""
-    choices = [
-        [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
-        if one.is_sweep_override()
-        else [one.input_line or ""]
-        for one in map(_parsed, overrides)
-    ]
+    choices = []
+    for one in map(_parsed, overrides):
+        values = one.sweep_string_iterator() if one.is_sweep_override() else ()
+        choices.append([f"{one.get_key_element()}={value}" for value in values] or [one.input_line or ""])
     yield from map(list, itertools.product(*choices))
 
 
@@ -165,17 +165,6 @@ def rewritten(overrides: Sequence[str]) -> list[str]:
             word = f"{group}={value}"
         words.append(word)
     return words
-
-
-@contextmanager
-def _hydra() -> Iterator[None]:
-    """Hydra ready for composition, within a sweep as well as without one."""
-    running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
-    try:
-        with hydra.initialize(version_base="1.3", config_path=None):
-            yield
-    finally:
-        GlobalHydra.instance().hydra = running
 
 
 def _composed(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:

@@ -26,12 +26,14 @@ def choose_device(name: str) -> torch.device:
 
     `cuda` where torch can use no GPU is a `UserError`, which says why.
     """
-    missing = None if name == "cpu" else _missing()
+    if name == "cpu":
+        return torch.device(name)
+    missing = _missing()
     if name == "cuda" and missing:
         raise UserError(
             f"device=cuda, but {missing}: choose device=cpu, or device=auto, which takes a GPU where there is one"
         )
-    chosen = torch.device("cpu" if name == "cpu" or missing else "cuda")
+    chosen = torch.device("cpu" if missing else "cuda")
     if name == "auto":
         why = missing or torch.cuda.get_device_name(chosen)
         print(f"device=auto takes {chosen.type}: {why}", file=sys.stderr, flush=True)
@@ -52,11 +54,6 @@ def send(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type == "cuda" and tensor.device.type == "cpu":
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
-
-
-def free_memory(device: torch.device) -> int:
-    """Bytes that are free on a device other than the CPU."""
-    return int(torch.get_device_module(device).mem_get_info(device)[0])
 
 
 def set_matmul_precision(name: str) -> None:

@@ -154,10 +154,6 @@ def _text(value: Any) -> str:
 
 def _entry(option: str, meaning: str) -> list[str]:
     *long, option = re.findall(rf".{{1,{WIDTH - 4}}}(?:,|$)", option) if len(option) > WIDTH - 4 else [option]
-    return [f"  {part}" for part in long] + textwrap.wrap(
-        meaning,
-        WIDTH,
-        initial_indent=f"  {option}".ljust(INDENT - 1) + " ",
-        subsequent_indent=" " * INDENT,
-        break_long_words=False,
-    ) or [f"  {option}"]
+    first, rest = f"  {option}".ljust(INDENT - 1) + " ", " " * INDENT
+    told = textwrap.wrap(meaning, WIDTH, initial_indent=first, subsequent_indent=rest, break_long_words=False)
+    return [*(f"  {part}" for part in long), *(told or [f"  {option}"])]

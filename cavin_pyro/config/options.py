@@ -10,7 +10,6 @@ the signature of its constructor.
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
@@ -132,13 +131,9 @@ def check_value(name: str, value: Any, about: About) -> None:
             if entry not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")
         return
-    if about.positive:
-        allowed = 0 < value < float("inf")
-    else:
-        allowed = (about.minimum is None or value >= about.minimum) and (
-            about.maximum is None or value <= about.maximum
-        )
-    if not allowed:
+    low, high = about.minimum, about.maximum
+    inside = (low is None or value >= low) and (high is None or value <= high)
+    if not (0 < value < float("inf") if about.positive else inside):
         raise UserError(f"{name} must be {about.range}, not {shown(value)}")
 
 
@@ -227,12 +222,8 @@ def is_shown(one: inspect.Parameter) -> bool:
 def _part_of(default: Any) -> Any:
     """A default as configuration: a dataclass becomes a part of its own."""
     if is_dataclass(default):
-        module, name = type(default).__module__, type(default).__name__
-        package = module.partition(".")[0]
-        if getattr(importlib.import_module(package), name, None) is type(default):
-            module = package  # the shorter path, for users
         values = {one.name: getattr(default, one.name) for one in fields(default)}
-        return with_defaults({"_target_": f"{module}.{name}", **values})
+        return with_defaults({"_target_": f"{type(default).__module__}.{type(default).__name__}", **values})
     return list(default) if isinstance(default, tuple) else default
 
 

@@ -31,12 +31,7 @@ PAPER_DYNAMICS = {"_target_": "cavin_pyro.models.networks.dynamics.Dynamics"}
 
 
 def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
-    """Build the part that a configuration names.
-
-    Raises:
-        UserError: whatever its class raises, in one line: there is no such class, it takes no such argument, or it
-            refuses a value.
-    """
+    """Build the part that a configuration names; whatever its class raises becomes a `UserError` of one line."""
     if not config.get("_target_"):
         raise UserError(f"a part has no _target_, the class to build it from: {dict(config)}")
     try:
@@ -51,10 +46,7 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
 
 
 def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
-    """Raise a `UserError` for a number that is not finite, or a whole one that is too small or a slip.
-
-    Weights and margins may be small.
-    """
+    """Raise a `UserError` for a number that is not finite, or a whole one, of no weight or margin, out of range."""
     for name, value in config.items():
         option = f"{section}.{name!s}"
         if isinstance(value, Mapping | DictConfig):
@@ -80,52 +72,33 @@ def build_model(config: Config) -> Model:
 
     A model gets a prior for each of its codes, that is, for each of `effect_dimension` and `motion_dimension`
     that its section has: `model.prior` where that names a class, else the section `prior`. Without that section,
-    `model` itself has the parts, as `describe` writes it.
-
-    Raises:
-        UserError: a part that cannot be built, or a section without a required number.
+    `model` itself has the parts, as `describe` writes it. A part that cannot be built is a `UserError`.
     """
-    if "prior" not in config:
-        return _checked_model(build_part("model", config["model"]))
-    sizes = dict(config["model"])
-    own_prior = sizes.pop("prior", None) or {}
-    check_sizes("model", sizes)
-    of_model = bool(own_prior.get("_target_"))
-    parts = {
-        f"{kind}_prior": build_part(
-            "model.prior" if of_model else "prior",
-            own_prior if of_model else config["prior"],
-            dimension=sizes[f"{kind}_dimension"],
-            feature_dimension=sizes["feature_dimension"],
-            effect_dimension=sizes.get("effect_dimension") if kind == "motion" else None,
-        )
-        for kind in ("effect", "motion")
-        if f"{kind}_dimension" in sizes
-    }
-    given = {"feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
-    dynamics = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
-    scales = build_part("scales", config.get("scales") or FIXED_SCALES)
-    model = _checked_model(build_part("model", sizes, **parts, scales=scales, dynamics=dynamics))
-    if not parts and config["prior"]["_target_"] != STANDARD_PRIOR:
-        raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
-    return model
-
-
-def _checked_model(model: Any) -> Model:
+    sizes, parts, kinds = dict(config["model"]), dict[str, Any](), list[str]()
+    if "prior" in config:
+        own_prior = sizes.pop("prior", None) or {}
+        check_sizes("model", sizes)
+        section = "model.prior" if own_prior.get("_target_") else "prior"
+        given = {"feature_dimension": sizes["feature_dimension"]}
+        kinds = [kind for kind in ("effect", "motion") if f"{kind}_dimension" in sizes]
+        for kind in kinds:
+            given["effect_dimension"] = sizes.get("effect_dimension") if kind == "motion" else None
+            prior = own_prior if section == "model.prior" else config["prior"]
+            parts[f"{kind}_prior"] = build_part(section, prior, dimension=sizes[f"{kind}_dimension"], **given)
+        given = {"feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
+        parts["dynamics"] = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
+        parts["scales"] = build_part("scales", config.get("scales") or FIXED_SCALES)
+    model = build_part("model", sizes, **parts)
     if not isinstance(model, Model):
-        raise UserError(
-            f"model {type(model).__name__} is no model program: derive it from cavin_pyro.models.model.Model"
-        )
+        raise UserError(f"model {type(model).__name__} is no program: derive it from cavin_pyro.models.model.Model")
+    if "prior" in config and not kinds and config["prior"]["_target_"] != STANDARD_PRIOR:
+        raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
     return model
 
 
 @user_input("guide")
 def build_guide(config: Config, model: Model) -> Guide:
-    """The guide program of a model, from the section `guide`.
-
-    Raises:
-        UserError: a guide that cannot be built, or is incompatible; the message lists the compatible ones.
-    """
+    """The guide program of a model, from the section `guide`; a `UserError` about another one lists those that fit."""
     target, kind = config["guide"].get("_target_"), class_of(config["guide"])
     fits = getattr(kind, "fits", ())
     if kind is not None and model.name not in fits:
@@ -136,8 +109,7 @@ def build_guide(config: Config, model: Model) -> Guide:
             f"guide {target} does not fit model {type(model).__name__} (it fits {', '.join(fits) or 'none'}): "
             f"choose guide= from {choices}{'' if issubclass(kind, Guide) else other}"
         )
-    guide: Guide = build_part("guide", config["guide"], model)
-    return guide
+    return build_part("guide", config["guide"], model)
 
 
 def class_of(config: Config) -> Any:
@@ -162,9 +134,7 @@ def _guides() -> dict[str, type[Guide]]:
 def describe(*, model: Model, guide: Guide | None = None, geometry: Geometry | None = None) -> dict[str, Any]:
     """The sections `model`, `guide` and `geometry`, from which the same parts can be built.
 
-    Raises:
-        UserError: a part has an argument that no file can hold, or is of a class that no other program can import; or
-            the guide is another model's.
+    A part that no file can describe, or whose class no other program can import, is a `UserError`.
     """
     if guide is not None and guide.model is not model:
         raise UserError("the guide was built for another model: give guide.model, or build a guide for this one")

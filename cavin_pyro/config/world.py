@@ -45,11 +45,7 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:
-    """Object parameters' ranges, increasing and within `LIMITS`.
-
-    Raises:
-        UserError: assets that are not there, an unknown object, or another range.
-    """
+    """Object parameters' ranges; an unknown object, or a range outside of `LIMITS`, is a `UserError`."""
     ranges: Any = OmegaConf.to_container(env.ranges)
     objects = part_of("objects", env.objects, env.assets)
     every = tuple(dict.fromkeys(map(plain_name, objects.names)))
@@ -62,12 +58,10 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
         except ValueError as error:
             raise UserError(str(error).replace(":", f" in env.ranges.{name}:", 1)) from error
     for name, (least, most) in LIMITS.items():
-        given = ranges[name]
-        if given is None:
-            continue
-        if len(given) != 2 or not least <= given[0] <= given[1] <= most:
-            raise UserError(f"env.ranges.{name} must be low, then high, between {least:g} and {most:g}, not {given}")
-        ranges[name] = tuple(given)
+        if (given := ranges[name]) is not None:
+            if len(given) != 2 or not least <= given[0] <= given[1] <= most:
+                raise UserError(f"env.ranges.{name} must be low and high, from {least:g} to {most:g}, not {given}")
+            ranges[name] = tuple(given)
     return ObjectRanges(**ranges)
 
 
@@ -76,9 +70,7 @@ def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:
 
     An object set or a sensor of the user's is built; of robots and segmenters it is a factory, which gets the world
     (`cavin_pyro.envs.physics.PhysicsWorld`) or M, the most objects. A name of a camera or of a segmentation stays one.
-
-    Raises:
-        UserError: an unknown name, missing files, or a class that cannot be built or is no such part.
+    An unknown name, missing files, or a class that cannot be built is a `UserError`.
     """
     made: Any = value if isinstance(value, str) else partial(construct, dict(value))
     with user_input(f"env.{name}"):

@@ -66,11 +66,7 @@ def compare(one: Evaluation, other: Evaluation) -> Comparison:
 
 
 def earlier_rows(folder: Path, config: DictConfig) -> list[Row]:
-    """The episodes of another evaluation, whose scenes and rules must be those of `config`.
-
-    Raises:
-        UserError: there is no finished evaluation, it is damaged, or its scenes or rules differ.
-    """
+    """The episodes of another evaluation, whose scenes and rules must be those of `config`, or a `UserError`."""
     rows, theirs = _finished(folder)
     _check_same_scenes(flat_options(OmegaConf.to_container(config, resolve=True)), theirs, folder)
     return rows
@@ -88,19 +84,14 @@ def _finished(folder: Path) -> tuple[list[Row], Row]:
     try:
         rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["per_episode"]
         theirs = stored_options(folder / "config.yaml")
-    except FileNotFoundError as error:
-        raise UserError(
-            f"compare={folder} is no finished evaluation: {Path(error.filename).name} is missing"
-        ) from error
     except OSError as error:
-        raise UserError(
-            f"compare={folder} cannot be read ({error.strerror}): give the folder of an evaluation"
-        ) from error
+        name = Path(error.filename or folder).name
+        raise UserError(f"compare={folder} is no finished evaluation: {name}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, RecursionError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
-    if not isinstance(rows, list) or (wrong := next(filter(None, map(violation, rows)), None)):
-        why = "no list of episodes" if not isinstance(rows, list) else wrong
-        raise UserError(f"compare={folder} holds damaged results ({why}): evaluate it again")
+    wrong = next(filter(None, map(violation, rows)), None) if isinstance(rows, list) else "no list of episodes"
+    if wrong:
+        raise UserError(f"compare={folder} holds damaged results ({wrong}): evaluate it again")
     return rows, theirs
 
 

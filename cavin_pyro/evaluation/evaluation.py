@@ -104,11 +104,7 @@ def run_missing(config: DictConfig, folder: Path) -> list[Row]:
 
 
 def seeds_of(config: DictConfig) -> Sequence[int]:
-    """The seeds of an evaluation's episodes, or of those in its shard.
-
-    Raises:
-        UserError: the shard is not of the form i/n, or has no episode.
-    """
+    """The seeds of an evaluation's episodes, or of those in its shard; one without an episode is a `UserError`."""
     seeds = of_shard(range(config.seed, config.seed + config.episodes), config.shard)
     if not seeds:
         raise UserError(f"shard={config.shard} has none of {config.episodes} episodes: choose a smaller n")
@@ -118,8 +114,7 @@ def seeds_of(config: DictConfig) -> Sequence[int]:
 def merge(config: DictConfig, folder: Path) -> list[Row]:
     """Join the episodes of finished shards (`merge=[a,b]`), write them in the order of their seeds and return them.
 
-    Raises:
-        UserError: a folder holds no evaluation or one of other options, or episodes are missing.
+    A folder without an evaluation of the same options, or a missing episode, is a `UserError`.
     """
     rows: dict[int, Row] = {}
     for shard in map(Path, config.merge):
@@ -133,22 +128,21 @@ def merge(config: DictConfig, folder: Path) -> list[Row]:
             f"the folders of merge lack {len(missing)} of {len(seeds)} episodes, the first with seed {missing[0]}: "
             "give the folder of every shard, each finished"
         )
-    with atomic_write(folder / EPISODES_FILE) as temporary:
-        temporary.write_text("".join(json.dumps(rows[seed]) + "\n" for seed in seeds), encoding="utf-8")
-    return [rows[seed] for seed in seeds]
+    whole = [rows[seed] for seed in seeds]
+    _write(folder / EPISODES_FILE, whole)
+    return whole
 
 
 def begin(folder: Path) -> dict[int, Row]:
-    """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file.
-
-    Raises:
-        UserError: as `finished_episodes`.
-    """
-    path = folder / EPISODES_FILE
-    rows = finished_episodes(path)
-    with atomic_write(path) as temporary:
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")
+    """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file."""
+    rows = finished_episodes(folder / EPISODES_FILE)
+    _write(folder / EPISODES_FILE, rows.values())
     return rows
+
+
+def _write(path: Path, rows: Iterable[Row]) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
 
 
 def append(folder: Path, row: Row) -> None:
@@ -166,6 +160,7 @@ def episode_row(episode: Episode) -> Row:
     """One episode as a line of results."""
     distances = [transition.subgoal_distance for transition in episode.transitions]
     reached = [distance for distance in distances if math.isfinite(distance)]
+    shares = [record.share_reaching_goal for record in episode.plan_records]
     strict_outcome, strict_steps, strict_return = episode.strict()
     return {
         "seed": episode.seed,
@@ -180,13 +175,9 @@ def episode_row(episode: Episode) -> Row:
         "plans": len(episode.plan_records),
         "plans_reaching_goal": sum(bool(record.plan.expected_success.any()) for record in episode.plan_records),
         "subgoal_distance": float(np.mean(reached)) if reached else None,
-        "shares_reaching_goal": [_rounded(record.share_reaching_goal) for record in episode.plan_records],
+        "shares_reaching_goal": [None if share is None else round(share, 4) for share in shares],
         "planning_ms": [round(record.milliseconds, 2) for record in episode.plan_records],
     }
-
-
-def _rounded(share: float | None) -> float | None:
-    return None if share is None else round(share, 4)
 
 
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process
@@ -196,10 +187,8 @@ def run_jobs(jobs: Sequence[Job], workers: int | Launcher) -> Generator[tuple[in
     """Run episodes, one per job; yields a job's number and its row, in any order.
 
     A process keeps environment and planner until a job has another configuration, so jobs that share one should follow
-    one another. Close the iterator when leaving it early. `workers`: processes of this machine, or a launcher.
-
-    Raises:
-        WorkerError: a worker was killed or stopped.
+    one another. Close the iterator when leaving it early. `workers`: processes of this machine, or a launcher. A worker
+    that was killed or stopped is a `WorkerError`.
     """
     if not jobs:
         return

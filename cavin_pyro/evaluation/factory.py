@@ -35,6 +35,7 @@ from cavin_pyro.planning.searching import SearchingPlanner
 from cavin_pyro.storage.checkpoint import load
 
 CPU = torch.device("cpu")
+PARTS_OF_WORLD = ("objects", "camera", "segmentation", "robot")
 
 
 @dataclass(frozen=True)
@@ -59,21 +60,12 @@ class EpisodeRunner:
 
     def rollout(self, seed: int, **options: Any) -> Episode:
         """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`."""
-        usual = {
-            "pushes_per_plan": self.pushes_per_plan,
-            "push_decimals": self.push_decimals,
-            "reward": self.reward,
-            "device": self.device,
-        }
+        usual = {name: getattr(self, name) for name in ("pushes_per_plan", "push_decimals", "reward", "device")}
         return rollout(self.env, self.planner, self.geometry, seed=seed, **(usual | options))
 
 
 def check_options(config: DictConfig, device: torch.device) -> None:
-    """Check the options that need neither a checkpoint nor the simulator; `device`: as the option `device` chose it.
-
-    Raises:
-        UserError: a number or name out of its range, or options that exclude each other.
-    """
+    """Check the options that need neither a checkpoint nor the simulator; `device`: as the option `device` chose it."""
     part_of("robot", config.env.robot, config.env.assets)
     check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
     if device.type != "cpu" and config.get("launcher") == "ray":
@@ -96,11 +88,7 @@ def planner_name(config: DictConfig) -> str:
 
 
 def announce_objects(config: DictConfig) -> None:
-    """Say on standard error, before the first plan, that scenes have more objects than those of the model's training.
-
-    Raises:
-        UserError: a checkpoint that cannot be used.
-    """
+    """Say on standard error, before the first plan, that scenes have more objects than the model was trained with."""
     if config.planner.model_free:
         return
     trained_before = load(config.checkpoint, trust=list(config.trust))
@@ -130,22 +118,17 @@ def make_env(config: DictConfig | None = None, *, render: bool = False, **option
     config = compose("plan", **options) if config is None else config
     task, tiles = task_of(config)
     with user_input():
+        parts = {name: part_of(name, config.env[name], config.env.assets) for name in PARTS_OF_WORLD}
         return PushingEnv(
             task=task,
-            layout=config.layout,
             tiles=tiles,
             generated=GeneratedLayouts(**config.generated),
-            reward=config.reward,
-            criterion=config.criterion,
-            objects=config.objects,
             ranges=object_ranges(config.env),
-            object_set=part_of("objects", config.env.objects, config.env.assets),
+            object_set=parts.pop("objects"),
             assets=config.env.assets,
-            maximum_steps=config.maximum_steps,
-            camera=part_of("camera", config.env.camera),
-            segmentation=part_of("segmentation", config.env.segmentation),
             render_mode="rgb_array" if render else None,
-            robot=part_of("robot", config.env.robot, config.env.assets),
+            **{name: config[name] for name in ("layout", "reward", "criterion", "objects", "maximum_steps")},
+            **parts,
         )
 
 
@@ -201,11 +184,7 @@ def planner_of(config: DictConfig, model: Model | None, device: torch.device) ->
 
 @user_input("planner", "checkpoint", "task", "tiles", "env", "layout", "generated", "pushes_per_plan")
 def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
-    """Build an environment and a planner, and run episodes with them.
-
-    Raises:
-        UserError: as `check_options`, `load`, `make_env` and `make_planner`, or a layout without room for the objects.
-    """
+    """Build an environment and a planner, and run episodes with them; a layout without room is a `UserError`."""
     device = choose_device(config.device)
     check_options(config, device)
     set_matmul_precision(config.matmul_precision)
@@ -233,8 +212,7 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
 def episode_rewards(tasks: Sequence[Task], **options: Any) -> Callable[[Task], TaskReward]:
     """The reward of a task: one object for each of `tasks`, so that what it computes once serves all episodes.
 
-    Raises:
-        ValueError: as `TaskReward` does, of which `options` are.
+    `options`: of `TaskReward`.
     """
     known = {id(task): (task, TaskReward(task, **options)) for task in tasks}  # with its task, so that its id stays
 
@@ -248,9 +226,6 @@ def _additions(options: dict[str, Any], *, one_push: bool) -> list[Addition]:
     """Take the additions out of a planner's options, and build them.
 
     `planner.add` adds more, of which one replaces another of its class, and `planner.drop` leaves some out.
-
-    Raises:
-        UserError: one that is unknown or cannot be built.
     """
     listed, more, dropped = (list(options.pop(name, None) or []) for name in ("additions", "add", "drop"))
     unknown = [str(name) for name in (*listed, *more, *dropped) if isinstance(name, str) and name not in ADDITIONS]
@@ -272,9 +247,6 @@ def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
 
     `planner.optimizer._target_=my_lab.Mine` replaces the class and leaves `replacement`, an option of `Shooting`, which
     a class of the user's gets only if it takes it.
-
-    Raises:
-        UserError: one that cannot be built.
     """
     built = {}
     usual = {field.name for field in fields(Shooting)}
@@ -291,18 +263,10 @@ def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_planner(options: dict[str, Any], model: Model) -> None:
-    """Make sure that the model has what the planner asks for, and no code that the planner would not choose.
-
-    Raises:
-        UserError: it has not; the model that has is named.
-    """
+    """Make sure that the model has what the planner asks for, and no code that the planner would not choose."""
     planner = class_of(options)
-    violation = (
-        planner.requires.violation(model)
-        if isinstance(planner, type) and issubclass(planner, SearchingPlanner)
-        else None
-    )
-    if violation is not None:
+    searches = isinstance(planner, type) and issubclass(planner, SearchingPlanner)
+    if searches and (violation := planner.requires.violation(model)) is not None:
         wanted = planner.requires.model
         fitting = "|".join(name for name, (model_name, _) in CHECKPOINTS.items() if model_name == wanted)
         choice = f"choose checkpoint={fitting}, or " if fitting else "choose "

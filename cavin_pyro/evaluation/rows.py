@@ -63,8 +63,7 @@ def violation(row: Any) -> str | None:
 def finished_episodes(path: Path) -> dict[int, Row]:
     """The rows of a file of episodes by their seeds, without lines that were cut off; none if there is no file.
 
-    Raises:
-        UserError: a line is JSON but no episode, or another episode has its seed; or the file cannot be read.
+    A line that is JSON but no episode, or has the seed of another one, is a `UserError`.
     """
     rows: dict[int, Row] = {}
     if not path.exists():

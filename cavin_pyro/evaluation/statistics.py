@@ -9,6 +9,8 @@ import numpy as np
 from omegaconf import DictConfig
 from scipy.stats import binomtest
 
+from cavin_pyro.evaluation.rollout import OUTCOMES
+
 Rate = dict[str, float]
 
 
@@ -30,20 +32,14 @@ def mcnemar(one_alone: int, other_alone: int) -> float:
 
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Mean, median and 95th percentile."""
-    return {
-        "mean": float(np.mean(values)),
-        "median": float(np.median(values)),
-        "p95": float(np.percentile(values, 95)),
-    }
+    p95 = float(np.percentile(values, 95))
+    return {"mean": float(np.mean(values)), "median": float(np.median(values)), "p95": p95}
 
 
 def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The results of an evaluation from its episodes' rows, as written to `results.json`."""
     count = len(rows)
-    rates = {
-        name: wilson(sum(row["outcome"] == name for row in rows), count)
-        for name in ("success", "violation", "fall", "timeout")
-    }
+    rates = {name: wilson(sum(row["outcome"] == name for row in rows), count) for name in OUTCOMES}
     # An episode that ends before its first segment does has no distance, nor has a planner without subgoals.
     distances = [row["subgoal_distance"] for row in rows if row["subgoal_distance"] is not None]
     return {
@@ -60,7 +56,7 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def table(results: dict[str, Any], title: str) -> str:
     """The results as a table for people; rates in per cent with their intervals."""
     lines = [f"{title}, {counted(results['episodes'], 'episode', 'episodes')}", f"{'':16}{'rate':>8}   95 % interval"]
-    for name in ("success", "violation", "fall", "timeout"):
+    for name in OUTCOMES:
         rate = results[name]
         lines.append(f"{name:16}{100 * rate['rate']:7.1f} %  {100 * rate['low']:5.1f} to {100 * rate['high']:5.1f} %")
     lines.append(f"{'':16}{'mean':>8} {'median':>9} {'95th':>9}")

@@ -141,11 +141,7 @@ def _cluster(function: Callable[[Any], Any], address: str | None) -> Iterator[tu
 
 
 def chosen_launcher(config: DictConfig) -> Launcher:
-    """The launcher that the options `launcher`, `workers` and `address` name.
-
-    Raises:
-        UserError: an address that nothing would read.
-    """
+    """The launcher that the options `launcher`, `workers` and `address` name, or a `UserError`."""
     if config.address is not None and config.launcher != "ray":
         raise UserError(f"address={config.address} is of launcher=ray: add that, or leave address")
     return Launcher(config.launcher, config.workers, config.address)
@@ -157,11 +153,7 @@ def as_launcher(workers: int | Launcher) -> Launcher:
 
 
 def of_shard(items: Sequence[Job], shard: str) -> Sequence[Job]:
-    """Those of `i/n`: the i-th, counted from 1, and every n-th after it.
-
-    Raises:
-        UserError: it is not of that form.
-    """
+    """Those of `i/n`: the i-th, counted from 1, and every n-th after it; any other form is a `UserError`."""
     number, _, count = shard.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise UserError(f"shard must be i/n with 1 <= i <= n, such as 2/3, not {shard}")

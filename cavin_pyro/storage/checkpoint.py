@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import safetensors.torch
-import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor, nn
+from torch import Tensor, contiguous_format, nn
 
-from cavin_pyro.config.commands import CHECKPOINTS, DEFAULT_CHECKPOINT
+from cavin_pyro.config.commands import CHECKPOINTS
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model, construct, describe
 from cavin_pyro.guides.guide import Guide
@@ -55,22 +54,14 @@ class Checkpoint:
 
     @cached_property
     def model(self) -> Model:
-        """The model program with its trained parameters, in evaluation mode and without gradients.
-
-        Raises:
-            UserError: there is no model in the file, or one of another architecture.
-        """
+        """The model program with its trained parameters, in evaluation mode and without gradients, or a `UserError`."""
         if "model" not in self.config:
             raise UserError(f"checkpoint {self.path} holds no model: give one that train has written")
         return self._filled("model", build_model(self.config))
 
     @cached_property
     def guide(self) -> Guide:
-        """The guide of `model`, likewise.
-
-        Raises:
-            UserError: there is no guide in the file, or one that infers no other windows than those of its training.
-        """
+        """The guide of `model`, likewise; one that infers no other windows than those of its training is refused."""
         guide = build_guide(self.config, self.model) if "guide" in self.config else None
         if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in self.tensors)):
             raise UserError(f"checkpoint {self.path} holds no guide: give one that train has written")
@@ -84,11 +75,7 @@ class Checkpoint:
 
     @cached_property
     def geometry(self) -> Geometry:
-        """What turns an object's point cloud into its geometric feature, frozen: `pointnet`, or another class.
-
-        Raises:
-            UserError: there is none in the file.
-        """
+        """What turns an object's point cloud into its geometric feature, frozen: `pointnet`, or another class."""
         section = self.config.get("geometry") or {}
         if section.get("_target_", POINTNET) == POINTNET:
             return self.pointnet
@@ -96,11 +83,7 @@ class Checkpoint:
 
     @cached_property
     def pointnet(self) -> PointNet:
-        """The frozen PointNet of a pretraining run or of a whole checkpoint.
-
-        Raises:
-            UserError: there is none in the file.
-        """
+        """The frozen PointNet of a pretraining run or of a whole checkpoint; a `UserError` if there is none."""
         weight = self.tensors.get("pointnet.feature.weight")
         if weight is None:
             raise UserError(f"checkpoint {self.path} holds no PointNet: give one that pretrain or train has written")
@@ -111,11 +94,7 @@ class Checkpoint:
         return module.requires_grad_(False).eval()
 
     def load_into(self, part: str, module: nn.Module) -> None:
-        """Copy the weights of `part`, as `save` names it, into a module.
-
-        Raises:
-            UserError: the weights are of another architecture or type.
-        """
+        """Copy the weights of `part`, as `save` names it, into a module; another architecture is a `UserError`."""
         prefix = f"{_stored_name(part, module)}."
         weights = {name[len(prefix) :]: value for name, value in self.tensors.items() if name.startswith(prefix)}
         wanted = module.state_dict()
@@ -128,19 +107,16 @@ class Checkpoint:
                     f"file and {shapes[1]} in {type(module).__name__}: use the configuration that it was trained with"
                 )
             if have.dtype != want.dtype:
-                raise UserError(
-                    f"checkpoint {self.path} is damaged: {part}.{name} holds {_plain(have.dtype)}, not "
-                    f"{_plain(want.dtype)}"
-                )
+                types = f"{have.dtype}, not {want.dtype}".replace("torch.", "")
+                raise UserError(f"checkpoint {self.path} is damaged: {part}.{name} holds {types}")
         module.load_state_dict(weights)
 
 
 def checked_geometry(geometry: Any) -> Geometry:
     """What a section `geometry` has built; a `UserError` if it is something else."""
     if not isinstance(geometry, Geometry):
-        raise UserError(
-            f"geometry {type(geometry).__name__} is no Geometry: derive it from cavin_pyro.models.networks.geometry"
-        )
+        name = type(geometry).__name__
+        raise UserError(f"geometry {name} is no Geometry: derive it from cavin_pyro.models.networks.geometry")
     return geometry
 
 
@@ -173,7 +149,7 @@ def save(
         stored |= describe(model=model, guide=guide, geometry=geometry)
     parts = {"model": model, "guide": guide, "geometry": geometry, **others}
     tensors = {
-        f"{_stored_name(part, module)}.{name}": value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        f"{_stored_name(part, module)}.{name}": value.detach().cpu().clone(memory_format=contiguous_format)
         for part, module in parts.items()
         if module is not None
         for name, value in module.state_dict().items()
@@ -206,15 +182,14 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
     if isinstance(trust, str):  # a sequence too, of letters
         raise UserError(f'trust must be a list of modules, ["{trust}"] in Python, not "{trust}"')
     path = find_checkpoint(name_or_path)
-    header, tensors = _read(path)
+    header, tensors = read_checkpoint(path)
     try:
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
     except (KeyError, ValueError, RecursionError) as error:
         raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
-    if not isinstance(config, dict) or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
-        raise UserError(f"checkpoint {path} has a damaged header (its configuration has no sections)")
-    if not isinstance(provenance, dict):
-        raise UserError(f"checkpoint {path} has a damaged header (its provenance has no entries)")
+    whole = isinstance(config, dict) and isinstance(provenance, dict)
+    if not whole or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
+        raise UserError(f"checkpoint {path} has a damaged header (its configuration or provenance has no sections)")
     built = {section: config[section] for section in BUILT_SECTIONS if section in config}
     check_targets(built, path, trust)
     check_numbers(built, path, max((size for value in tensors.values() for size in value.shape), default=0))
@@ -222,11 +197,7 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
 
 
 def find_checkpoint(name: str | Path) -> Path:
-    """The file of a shipped checkpoint by its name, such as `cavin`, or of another by its path.
-
-    Raises:
-        UserError: there is neither; the names are listed.
-    """
+    """The file of a shipped checkpoint by its name, such as `cavin`, or of another by its path, or a `UserError`."""
     path = Path(name)
     if path.suffix or len(path.parts) > 1 or _is_file(path):
         return path
@@ -250,26 +221,8 @@ def shipped_folder() -> Path:
     return installed if installed.exists() and not checkout.exists() else checkout
 
 
-def default_checkpoint() -> Path:
-    """The checkpoint that commands load by default."""
-    return find_checkpoint(DEFAULT_CHECKPOINT)
-
-
-def verify_checkpoint(path: Path) -> None:
-    """Check that a file is a whole checkpoint with the weights that were saved, without building anything.
-
-    Raises:
-        UserError: it is not.
-    """
-    _read(path)
-
-
 def _is_file(path: Path) -> bool:
-    """Whether there is such a file; a name that is too long for one is none.
-
-    Raises:
-        UserError: it may not be looked for.
-    """
+    """Whether there is such a file; a name that is too long for one is none."""
     try:
         return path.is_file()
     except OSError as error:
@@ -278,8 +231,8 @@ def _is_file(path: Path) -> bool:
         raise UserError(f"checkpoint {path} cannot be read: {error.strerror}") from error
 
 
-def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """The header and the checked weights of a checkpoint."""
+def read_checkpoint(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """The header of a checkpoint, and its weights: those that were saved, all finite, or a `UserError`."""
     if not _is_file(path):
         raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
     try:
@@ -301,22 +254,14 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
         raise UserError(
             f"checkpoint {path} has format version {header.get('version')}, this program reads {FORMAT_VERSION}"
         )
-    _check_weights(tensors, header.get("sha256"), path)
-    return header, tensors
-
-
-def _check_weights(tensors: Mapping[str, Tensor], digest: str | None, path: Path) -> None:
-    """Check weights against the header's digest, which older checkpoints lack, and that they are numbers."""
+    digest = header.get("sha256")  # which older checkpoints lack
     if digest is not None and digest != tensors_digest(tensors):
         raise UserError(f"checkpoint {path} is damaged: its weights are not those that were saved (SHA-256)")
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise UserError(f"checkpoint {path} is damaged: {name} holds values that are not finite")
+    return header, tensors
 
 
 def _stored_name(part: str, module: nn.Module) -> str:
     return "pointnet" if part == "geometry" and isinstance(module, PointNet) else part
-
-
-def _plain(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")

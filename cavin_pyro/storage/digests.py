@@ -32,11 +32,7 @@ def read_manifest(folder: Path) -> dict[str, str]:
 
 
 def check_manifest(path: Path, folder: Path) -> None:
-    """Check a file that the manifest of this folder names.
-
-    Raises:
-        UserError: it is not the file that was shipped.
-    """
+    """Check that a file that the manifest of this folder names is the one that was shipped, or a `UserError`."""
     if not path.resolve().is_relative_to(folder.resolve()):
         return
     wanted = read_manifest(folder).get(path.resolve().relative_to(folder.resolve()).as_posix())

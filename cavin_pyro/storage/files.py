@@ -45,11 +45,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON.
-
-    Raises:
-        UserError: the file cannot be read or is not JSON.
-    """
+    """Read JSON; a `UserError` if the file cannot be read or holds something else."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -59,16 +55,9 @@ def read_json(path: Path) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """The SHA-256 of a file, read piece by piece: hexadecimal digits.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    digest = hashlib.sha256()
+    """The SHA-256 of a file, read piece by piece: hexadecimal digits."""
     with open(path, "rb") as file:
-        while piece := file.read(1 << 20):
-            digest.update(piece)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager
@@ -76,15 +65,14 @@ def output_folder(path: str | Path) -> Iterator[Path]:
     """Hold a folder for results: it exists, is writable and is locked, and what a killed run left half-written is gone.
 
     A folder that was made for this and is still empty at the end is deleted, and so is one that holds nothing but its
-    options when the command fails: a command that is refused, or that the memory does not allow, leaves nothing.
-
-    Raises:
-        UserError: the folder cannot be made or written to, or another process writes into it.
+    options when the command fails: a command that is refused, or that the memory does not allow, leaves nothing. A
+    `UserError` if the folder cannot be written, or another process writes into it.
     """
     folder = Path(path)
     with ExitStack() as held:
         try:
-            made = _make(folder)
+            made = [one for one in (folder, *folder.parents) if not one.exists()]  # the deepest first
+            folder.mkdir(parents=True, exist_ok=True)
             held.callback(_delete_empty, made)
             held.enter_context(folder_lock(folder))
             probe = folder / f".probe{OURS}{'0' * 8}{PARTIAL}"
@@ -123,13 +111,6 @@ def _is_ours(path: Path) -> bool:
     """Whether `atomic_write` made a file: users' own partial downloads may lie in the same folder."""
     name = re.fullmatch(rf"\..+{re.escape(OURS)}[0-9a-f]{{8}}{re.escape(PARTIAL)}(\.[^.]+)?", path.name)
     return name is not None and path.is_file() and not path.is_symlink()
-
-
-def _make(folder: Path) -> list[Path]:
-    """Make a folder; returns those that did not exist before, the deepest first."""
-    missing = [one for one in (folder, *folder.parents) if not one.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    return missing
 
 
 def _delete_empty(folders: list[Path]) -> None:

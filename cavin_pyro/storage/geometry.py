@@ -14,11 +14,7 @@ from cavin_pyro.storage.checkpoint import POINTNET, checked_geometry, load
 
 @user_input(*PARTS)
 def check_fit(model: Model, geometry: Geometry, objects: int | None = None) -> None:
-    """Check that a model takes these features, and says that it is trained on scenes of up to `objects`.
-
-    Raises:
-        UserError: it does not.
-    """
+    """Check that a model takes these features, and says that it is trained on scenes of up to `objects`."""
     name, features = type(geometry).__name__, geometry.feature_dimension
     wanted = model.dynamics.geometry
     if wanted is not None and not isinstance(geometry, wanted):
@@ -36,11 +32,7 @@ def check_fit(model: Model, geometry: Geometry, objects: int | None = None) -> N
 
 
 def chosen_geometry(config: Config) -> tuple[Geometry, dict[str, Any]]:
-    """The geometric features that the options of a training name, and their provenance.
-
-    Raises:
-        UserError: they cannot be built, or there is no PointNet where `pointnet` says, or it names one for nothing.
-    """
+    """The geometric features that the options of a training name, and their provenance."""
     if config["geometry"].get("_target_") != POINTNET:
         if config["pointnet"] != DEFAULT_CHECKPOINT:
             raise UserError(f"pointnet={config['pointnet']} is of geometry=pointnet: add that, or leave pointnet")

@@ -23,10 +23,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
     """Hold the lock of an existing folder; the same thread may take it again within.
 
     The operating system holds it for this process (flock) and frees it when the process ends, however it ends. Its file
-    `.lock` tells who holds it and is deleted at the end; one that a killed process left behind locks nothing.
-
-    Raises:
-        UserError: another process writes into the folder. It is named, and nothing was changed.
+    `.lock` tells who holds it and is deleted at the end; one that a killed process left behind locks nothing. Where
+    another process writes into the folder, a `UserError` names it, and nothing was changed.
     """
     path = folder.resolve() / LOCK_NAME
     # One object per path, which counts how often its thread took it: train takes the folder that its command holds.

@@ -27,11 +27,7 @@ def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
 def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...]) -> None:
     """Check that the run in a folder, if there is one, has this configuration.
 
-    Args:
-        ignore: options that may differ, as `section.name`.
-
-    Raises:
-        UserError: the earlier run had another configuration; the first option that differs is named.
+    `ignore`: options that may differ, as `section.name`. A `UserError` names the first other one that does.
     """
     path = folder / CONFIG_NAME
     if not path.exists() or holds_no_result(folder):
@@ -57,11 +53,7 @@ def stored_options(path: Path) -> dict[str, Any]:
 def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
     """Check that a run resumes with the data that it began with, in any folder; the first time, record them.
 
-    Args:
-        data: of each dataset, among other things, its number of `transitions` and the `fingerprint` of its content.
-
-    Raises:
-        UserError: the run in this folder began with other data, or its record of them cannot be read.
+    `data`: of each dataset, among other things, its number of `transitions` and the `fingerprint` of its content.
     """
     path = folder / "data.json"
     now = [{name: dataset[name] for name in ("transitions", "fingerprint")} for dataset in data]
@@ -75,7 +67,6 @@ def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _of_transitions(data: Any) -> str:
-    """What `data.json` holds, for an error line."""
     try:
         return " and ".join(f"{dataset['transitions']} transitions ({dataset['fingerprint']})" for dataset in data)
     except (TypeError, KeyError):

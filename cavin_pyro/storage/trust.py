@@ -22,12 +22,8 @@ DEEPEST = 20  # levels of a configuration; ours have four
 def check_targets(config: Any, path: Path, trust: Sequence[str], depth: int = 0) -> None:
     """Check the sections of a stored configuration from which parts are built; older names of classes become today's.
 
-    Args:
-        path: of the checkpoint, for error lines. trust: modules whose own classes may be named as well.
-
-    Raises:
-        UserError: a class of an untrusted module, anything else than a class, or an interpolation: `${...}` can read
-            the environment and make up sections that no check has seen.
+    A class of a module that is neither ours nor in `trust`, anything else than a class, or an interpolation is a
+    `UserError`: `${...}` can read the environment and make up sections that no check has seen.
     """
     if depth > DEEPEST:
         raise UserError(f"checkpoint {path} has a damaged header (its configuration is over {DEEPEST} levels deep)")
@@ -46,8 +42,7 @@ def check_targets(config: Any, path: Path, trust: Sequence[str], depth: int = 0)
 def check_numbers(config: Any, path: Path, largest: int, place: str = "") -> None:
     """Check that no number of a class of ours is far above the largest dimension of the weights, before one is built.
 
-    Raises:
-        UserError: one is: such layers would fill the memory.
+    Such layers would fill the memory.
     """
     if isinstance(config, dict) and _is_class_of(str(config.get("_target_", ANY)), OWN_MODULES):
         for name, value in config.items():
@@ -71,7 +66,8 @@ def _check_target(target: Any, path: Path, trust: Sequence[str]) -> None:
         return
     line = f"checkpoint {path} asks to run {target}, which is not part of this program"
     if trusted:
-        line += f": trust={_list(trusted)} allows the classes that are defined there, and {target} is none of them"
+        named = f"trust=[{','.join(trusted)}]"
+        line += f": {named} allows the classes that are defined there, and {target} is none of them"
     elif top.isidentifier() and top != str(target) and top not in NEVER_SUGGESTED:
         line += f": if you trust that module, pass 'trust=[{top}]'"
     raise UserError(line)
@@ -91,7 +87,3 @@ def _is_class_of(target: str, modules: Sequence[str]) -> bool:
 
 def _within(module: str, package: str) -> bool:
     return module == package or module.startswith(f"{package}.")
-
-
-def _list(names: Sequence[str]) -> str:
-    return f"[{','.join(names)}]"

@@ -26,11 +26,9 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
     `TraceEnum_ELBO` sites that are marked `infer={"enumerate": "parallel"}` need no guide. `window: [B]`, with B of at
     least 2, so that one of them can be masked. The random generator's state is restored afterwards.
 
-    Raises:
-        UserError: a code that the guide lacks or the model does not have, one outside of the model's plates, of another
-            shape, or counted where the model does not count it; or codes in another order than the model's, for a bound
-            whose divergences in closed form are those of the model's order; or a model that observes something where it
-            generates.
+    A `UserError` names a code that the guide lacks or the model does not have, one outside of the model's plates, of
+    another shape, or counted where the model does not count it; codes in another order than the model's, where
+    divergences in closed form need that; or what a model observes where it generates.
     """
     device = window.actions.device
     window = window._replace(sequence_mask=torch.arange(len(window.actions), device=device) == 0)
@@ -44,11 +42,8 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
             "obs=window.observed(...)"
         )
     name = f"guide {type(guide).__name__}"
-    enumerated = {
-        code: site
-        for code, site in wanted.items()
-        if site["infer"].get("enumerate") == "parallel" and code not in sampled
-    }
+    marked = {code for code, site in wanted.items() if site["infer"].get("enumerate") == "parallel"}
+    enumerated = marked - sampled.keys()
     if isinstance(elbo, TraceEnum_ELBO):
         wanted = {code: site for code, site in wanted.items() if code not in enumerated}
     elif enumerated:

@@ -133,6 +133,6 @@ def term_counts(names: Iterable[str], window: Window) -> dict[str, int]:
     }
 
 
-def first_nonfinite(terms: dict[str, Tensor]) -> str | None:
-    """Name of the first term that is not finite."""
-    return next((name for name, value in terms.items() if not bool(torch.isfinite(value).all())), None)
+def first_nonfinite(terms: Mapping[str, Tensor | float]) -> str | None:
+    """Name of the first term, a scalar, that is not finite."""
+    return next((name for name, value in terms.items() if not torch.as_tensor(value).isfinite()), None)

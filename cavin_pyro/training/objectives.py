@@ -7,16 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from pyro import poutine
-from pyro.infer import (
-    ELBO,
-    JitTrace_ELBO,
-    JitTraceEnum_ELBO,
-    JitTraceGraph_ELBO,
-    JitTraceMeanField_ELBO,
-    RenyiELBO,
-    Trace_ELBO,
-)
+from pyro import infer, poutine
+from pyro.infer import ELBO, RenyiELBO, Trace_ELBO
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
@@ -26,7 +18,7 @@ from cavin_pyro.models.state import Window
 from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
 
 CODES = ("effect_code", "motion_code")
-COMPILED = (JitTrace_ELBO, JitTraceEnum_ELBO, JitTraceGraph_ELBO, JitTraceMeanField_ELBO)
+COMPILED = (infer.JitTrace_ELBO, infer.JitTraceEnum_ELBO, infer.JitTraceGraph_ELBO, infer.JitTraceMeanField_ELBO)
 CENTER_UNIT = 0.005  # metres, a typical error of f after one push
 FEATURE_UNIT = 0.1  # of a vector of unit length
 SMOOTHING = 1e-6  # square metres, and of feature vectors; the distance has no gradient at 0
@@ -45,10 +37,8 @@ class Objective:
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: weight of each code's KL term, positive.
-        warm_up_steps: steps over which the weights of the codes' log densities (of prior and guide) grow from nearly
-            zero.
-        counterfactual_weight: weight of the published code's term, see `counterfactual_loss`. The validation loss,
-            which chooses the best checkpoint, does not contain it.
+        warm_up_steps: steps over which the weights of the codes' log densities, of prior and guide, grow from near 0.
+        counterfactual_weight: weight of the published code's term, see `counterfactual_loss`.
         rollout_weight: weight of the error where f reads its own predictions, see `rollout_loss`. The bound contains
             each push already, so a weight trades its density for the accuracy of rollouts.
 
@@ -106,10 +96,8 @@ class Objective:
     def check(self, model: Model, guide: Guide | None = None) -> None:
         """Check that a model, and a guide, are compatible with this objective.
 
-        Raises:
-            ValueError: the model generates no actions, but there is a counterfactual term; it has no codes, but there
-                are several particles; or the guide has parameters for each window, but the bound is none that takes
-                its auxiliary sites into account.
+        A `ValueError` says why they are not: no codes where particles or a counterfactual term need them, or a guide
+        with parameters for each window, whose auxiliary sites this bound leaves out.
         """
         if guide is not None and not guide.amortized and (type(self.elbo) is not Trace_ELBO or self.weighted):
             raise ValueError(
@@ -182,18 +170,13 @@ class _Weighted(Messenger):
 
 
 def as_objective(part: Objective | ELBO) -> Objective:
-    """An objective, also from a plain ELBO of Pyro's or a user's.
-
-    Raises:
-        ValueError: the part is neither.
-    """
-    if isinstance(part, Objective):
-        return part
+    """An objective, also from a plain ELBO of Pyro's or a user's; anything else is a `ValueError`."""
     if isinstance(part, ELBO):
         return Objective(part)
-    raise ValueError(
-        f"an objective is cavin_pyro.training.objectives.Objective or an ELBO of Pyro, not {type(part).__name__}"
-    )
+    if not isinstance(part, Objective):
+        name = type(part).__name__
+        raise ValueError(f"an objective is cavin_pyro.training.objectives.Objective or an ELBO of Pyro, not {name}")
+    return part
 
 
 def counterfactual_loss(model: Model, window: Window, codes: Mapping[str, Any]) -> Tensor:

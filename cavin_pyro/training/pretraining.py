@@ -32,7 +32,7 @@ def pretrain(
     learning_rate: float,
     seed: int,
     log: Path,
-    resume: Path | None = None,
+    resume: Path,
     device: torch.device = CPU,
 ) -> dict[str, float]:
     """Minimise the Chamfer distance between clouds and their reconstructions.
@@ -48,10 +48,7 @@ def pretrain(
 
     Returns:
         Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, the loss of one
-        average cloud for all.
-
-    Raises:
-        UserError: the loss is not finite, or the resume file is damaged or of other clouds.
+        average cloud for all. A loss that is not finite, or a damaged resume file, is a `UserError`.
     """
     generator = np.random.default_rng(seed)
     held_out = max(1, len(clouds) // 10)
@@ -61,7 +58,7 @@ def pretrain(
     rows: list[tuple[int, float, float]] = []
     begun, running, rate = 0, 0.0, learning_rate
     digest = hashlib.sha256(clouds.tobytes()).hexdigest()
-    if resume is not None and resume.exists():
+    if resume.exists():
         with resuming(resume) as (tensors, state):
             if state["clouds"] != digest:
                 raise ValueError("it was made with other clouds")
@@ -91,11 +88,10 @@ def pretrain(
                 rows.append((step, mean, _loss(autoencoder, validation)))
                 running = 0.0
                 bar.set_postfix(validation=f"{rows[-1][2]:.4f}")
-                if resume is not None:
-                    weights = {f"autoencoder.{name}": value for name, value in autoencoder.state_dict().items()}
-                    state = {"clouds": digest, "step": step, "rate": rate, "rows": rows}
-                    state["generator"] = generator.bit_generator.state
-                    write_resume(resume, {**weights, **optimizer_tensors(optimizer)}, state)
+                weights = {f"autoencoder.{name}": value for name, value in autoencoder.state_dict().items()}
+                state = {"clouds": digest, "step": step, "rate": rate, "rows": rows}
+                state["generator"] = generator.bit_generator.state
+                write_resume(resume, {**weights, **optimizer_tensors(optimizer)}, state)
     autoencoder.cpu()
     with atomic_write(log) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("step", "training", "validation"), *rows])

@@ -33,8 +33,7 @@ def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, 
 def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
     """Yield the tensors and the state of a resume file; whatever does not fit within the block is a damaged file.
 
-    Raises:
-        UserError: the file is truncated, changed or of another training.
+    A damaged file, or one of another training, is a `UserError`.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -69,11 +68,8 @@ def optimizer_tensors(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
 def load_optimizer(optimizer: torch.optim.Adam, tensors: Mapping[str, Tensor]) -> None:
     """Take over the moments that `optimizer_tensors` gave.
 
-    Weights that no gradient has reached (of a network that the model does not use) have none; theirs begin at zero.
-
-    Raises:
-        ValueError: a weight has only some of its moments, they have another shape, or belong to no weight; the line
-            names one.
+    Weights that no gradient has reached (of a network that the model does not use) have none; theirs begin at zero. A
+    `ValueError` names a moment that is missing, has another shape, or belongs to no weight.
     """
     moments: dict[int, dict[str, Tensor]] = {}
     for name, value in section(tensors, "adam").items():
@@ -84,10 +80,9 @@ def load_optimizer(optimizer: torch.optim.Adam, tensors: Mapping[str, Tensor]) -
         if not 0 <= number < len(parameters):
             raise ValueError(f"adam.{number} belongs to no weight")
         for entry in ENTRIES:
-            if entry not in entries:
-                raise ValueError(f"adam.{number}.{entry} is missing")
-            if entries[entry].shape != (() if entry == "step" else parameters[number].shape):
-                raise ValueError(f"adam.{number}.{entry} is of another shape")
+            shape = () if entry == "step" else parameters[number].shape
+            if entry not in entries or entries[entry].shape != shape:
+                raise ValueError(f"adam.{number}.{entry} is missing or of another shape")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 

@@ -15,25 +15,17 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from cavin_pyro.config.commands import TrainerConfig, WindowConfig
-from cavin_pyro.config.device import choose_device, free_memory
+from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured, shown
-from cavin_pyro.config.parts import (
-    Config,
-    amortized_guides,
-    build_guide,
-    build_model,
-    check_sizes,
-    construct,
-    describe,
-)
+from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, describe
 from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.storage.checkpoint import load, save, verify_checkpoint
+from cavin_pyro.storage.checkpoint import load, read_checkpoint, save
 from cavin_pyro.storage.files import file_digest, output_folder, write_json
 from cavin_pyro.storage.geometry import check_fit, chosen_geometry
 from cavin_pyro.storage.provenance import provenance as of_this_process
@@ -50,55 +42,40 @@ DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; th
 def train(config: DictConfig) -> Trainer:
     """Run a whole training, from its configuration to a folder with checkpoint and metrics.
 
-    Returns:
-        The run when it has ended.
-
-    Raises:
-        UserError: a configuration or data that cannot be used, or a loss that is not finite.
+    A configuration or data that cannot be used, or a loss that is not finite, is a `UserError`.
     """
     with output_folder(config.output) as folder:
-        return _train(config, folder)
-
-
-def _train(config: DictConfig, folder: Path) -> Trainer:
-    device = choose_device(config.device)
-    config.device = device.type
-    selection = configured(WindowConfig, config.windows, "windows")
-    torch.manual_seed(config.seed)
-    model = build_model(config)
-    guide = build_guide(config, model)
-    objective = build_objective(config, model)
-    geometry, origin = chosen_geometry(config)
-    data = data_folders(config.data)
-    with user_input():
-        objective.check(model, guide)
-    started = start_from(config, model, guide, geometry) if config.initial else {}
-    train_only(config.trained, model, guide)
-    _mirror_signs(config.trainer.reflect, geometry, guide)
-    check_same_run(folder, config, ignore=free(config.trainer.schedule))
-    check_fit(model, geometry, max(slots_of(read_metadata(folder)) for folder in data))
-    windows = load_windows(
-        data,
-        geometry,
-        selection,
-        segment_length=config.model.segment_length,
-        seed=config.seed,
-        skip_corrupt=config.skip_corrupt,
-        storage=folder,
-    )
-    return fit(
-        model,
-        guide,
-        windows,
-        objective=objective,
-        geometry=geometry,
-        output=folder,
-        config=config,
-        provenance={**training_provenance(data, origin, windows), **started},
-        seed=config.seed,
-        device=device.type,
-        **config.trainer,
-    )
+        config.device = choose_device(config.device).type
+        selection = configured(WindowConfig, config.windows, "windows")
+        torch.manual_seed(config.seed)
+        model = build_model(config)
+        guide = build_guide(config, model)
+        objective = build_objective(config, model, guide)
+        geometry, origin = chosen_geometry(config)
+        data = data_folders(config.data)
+        started = start_from(config, model, guide, geometry) if config.initial else {}
+        train_only(config.trained, model, guide)
+        _mirror_signs(config.trainer.reflect, geometry, guide)
+        check_same_run(folder, config, ignore=free(config.trainer.schedule))
+        check_fit(model, geometry, max(slots_of(read_metadata(one)) for one in data))
+        options = {name: config[name] for name in ("seed", "skip_corrupt")}
+        length = config.model.segment_length
+        windows = load_windows(data, geometry, selection, segment_length=length, storage=folder, **options)
+        record = {"data": [record for one in data for record in content_records(one)], **origin}
+        record |= {"training_windows": len(windows.training), "validation_windows": len(windows.validation)}
+        return fit(
+            model,
+            guide,
+            windows,
+            objective=objective,
+            geometry=geometry,
+            output=folder,
+            config=config,
+            provenance={**record, **started},
+            seed=config.seed,
+            device=config.device,
+            **config.trainer,
+        )
 
 
 def fit(
@@ -190,14 +167,13 @@ def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int,
     """Print which windows model and guide learn from."""
     if guide.amortized:
         print(f"{len(windows.training)} training windows, {len(windows.validation)} for validation{where}")
-    else:
-        count = len(fixed_windows(windows, batch_size, seed))
-        others = ", ".join(amortized_guides(model.name))
-        print(
-            f"{count} of {len(windows.training)} training windows (trainer.batch_size), for validation too{where}: "
-            f"guide {type(guide).__name__} has parameters for each window, which other batches cannot train; "
-            f"guides that infer any window: {others}"
-        )
+        return
+    print(
+        f"{len(fixed_windows(windows, batch_size, seed))} of {len(windows.training)} training windows "
+        f"(trainer.batch_size), for validation too{where}: "
+        f"guide {type(guide).__name__} has parameters for each window, which other batches cannot train; "
+        f"guides that infer any window: {', '.join(amortized_guides(model.name))}"
+    )
 
 
 def free(schedule: str) -> tuple[str, ...]:
@@ -206,11 +182,7 @@ def free(schedule: str) -> tuple[str, ...]:
 
 
 def data_folders(data: str | Sequence[str]) -> list[Path]:
-    """The option `data`: a folder, or a list of them.
-
-    Raises:
-        UserError: it is something else.
-    """
+    """The option `data`: a folder, or a list of them; anything else is a `UserError`."""
     folders = [data] if isinstance(data, str) else data
     listed = isinstance(folders, Sequence | ListConfig) and all(isinstance(one, str) and one for one in folders)
     if not listed or not folders:
@@ -218,29 +190,22 @@ def data_folders(data: str | Sequence[str]) -> list[Path]:
     return [Path(folder) for folder in folders]
 
 
-def build_objective(config: Config, model: Model) -> Objective:
-    """The objective, from the section `objective`.
-
-    Raises:
-        UserError: an objective that cannot be built, or that is incompatible with the model.
-    """
+def build_objective(config: Config, model: Model, guide: Guide | None = None) -> Objective:
+    """The objective, from the section `objective`; one that model or guide cannot have is a `UserError`."""
     section = config["objective"]
     check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
     with user_input("objective"):
         objective = as_objective(construct(section))
-        objective.check(model)
+        objective.check(model, guide)
     return objective
 
 
 def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometry) -> dict[str, Any]:
-    """Copy the weights of the checkpoint `config.initial` into model and guide, which must be of its architecture.
+    """Copy the weights of the checkpoint `config.initial` into model and guide; other parts are a `UserError`.
 
     Returns:
         Its digest and provenance, for that of the new one. What a calibration has found stays true where f alone is
         trained: neither the codes' priors nor what a guide reads depends on f.
-
-    Raises:
-        UserError: there is no such file, it holds other parts, or features of another geometry.
     """
     checkpoint = load(config.initial)
     checkpoint.load_into("model", model)
@@ -255,16 +220,10 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
 
 
 def train_only(names: Sequence[str], model: Model, guide: Guide) -> None:
-    """Leave the weights of all parts but these, of the model or `guide`, as they are; no names stand for all parts.
-
-    Raises:
-        UserError: a name is of no part.
-    """
-    candidates: dict[str, nn.Module] = {**dict(model.named_children()), "guide": guide}
-    parts = {name: part for name, part in candidates.items() if any(True for _ in part.parameters())}
-    for name in names:
-        if name not in parts:
-            raise UserError(f"trained has {name!r}, which is no part of this model: choose from {', '.join(parts)}")
+    """Leave the weights of all parts but these, of the model or `guide`, as they are; no names stand for all parts."""
+    parts = {name: part for name, part in (*model.named_children(), ("guide", guide)) if [*part.parameters()]}
+    if unknown := [name for name in names if name not in parts]:
+        raise UserError(f"trained has {unknown[0]!r}, which is no part of this model: choose from {', '.join(parts)}")
     for name, part in parts.items():
         part.requires_grad_(not names or name in names)
 
@@ -285,31 +244,17 @@ def place(windows: WindowTable, device: torch.device) -> str:
     """Move the windows to a device; returns what there is to say about where they lie."""
     if device.type == "cpu":
         return ""
-    kept = windows.move(device, int(DATA_SHARE * free_memory(device)))
+    free = torch.get_device_module(device).mem_get_info(device)[0]  # bytes
+    kept = windows.move(device, int(DATA_SHARE * int(free)))
     return ", all in the memory of the GPU" if kept else ", which are copied to the GPU batch by batch"
 
 
-def training_provenance(data: Sequence[Path], geometry: Mapping[str, Any], windows: WindowTable) -> dict[str, Any]:
-    """The provenance of a trained model: the run, its data and what `geometry` says of the geometric features."""
-    return {
-        **of_this_process(),
-        "data": [record for folder in data for record in content_records(folder)],
-        **geometry,
-        "training_windows": len(windows.training),
-        "validation_windows": len(windows.validation),
-    }
-
-
 def _keep_best(run: Trainer, path: Path, save: Callable[[int, dict[str, float]], None]) -> None:
-    """Make sure that a resumed run still has its best checkpoint, which a later validation need not surpass.
-
-    Raises:
-        UserError: it is gone or damaged, and the weights in the resume file are later ones.
-    """
+    """Make sure that a resumed run still has its best checkpoint, which a later validation need not surpass."""
     if not path.exists() and run.best_step == run.step:
         save(run.step, run.rows[-1])
     try:
-        verify_checkpoint(path)
+        read_checkpoint(path)
     except UserError as error:
         raise UserError(
             f"{path}, the best checkpoint of this run, of step {run.best_step}, is gone or damaged, and later weights "

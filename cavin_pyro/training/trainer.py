@@ -71,6 +71,7 @@ class Trainer:
     ) -> None:
         """`mirror_signs: [F]`, of geometric features: with them every other window is mirrored, at random."""
         self.model, self.guide, self.windows = model, guide, windows
+        self._programs = nn.ModuleDict({"model": model, "guide": guide})
         self.config = config = config or TrainerConfig()
         self.folder, self._save, self._seed = folder, save, seed
         # A guide that infers no other windows is fitted to one batch, for good.
@@ -91,8 +92,7 @@ class Trainer:
     def run(self) -> None:
         """Train until the steps are done or patience is lost; resumes from the resume file if it exists.
 
-        Raises:
-            UserError: a loss or gradient that is not finite (the term is named), or as `resume`.
+        A loss or gradient that is not finite is a `UserError` that names the term.
         """
         self.resume()
         self._check_programs()
@@ -143,13 +143,8 @@ class Trainer:
                 loss = self._captured(window)
             except RuntimeError as error:  # the base class of CUDA's errors
                 self._captured = None
-                why = (str(error).splitlines() or [repr(error)])[0]
-                print(
-                    f"from step {self.step} on, steps run eagerly, since the loss cannot be captured as a CUDA graph: "
-                    f"{why}",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                said = f"from step {self.step} on, steps run eagerly, since the loss cannot be captured as a CUDA graph"
+                print(f"{said}: {(str(error).splitlines() or [repr(error)])[0]}", file=sys.stderr, flush=True)
         if self._captured is None:
             self._optimizer.zero_grad(set_to_none=True)
             loss = self._loss(window, self.step) / len(window.sequence_mask)
@@ -163,7 +158,7 @@ class Trainer:
         """The metrics of a validation, which are also the last of `rows`."""
         terms, loss = self._validation_terms()
         if not math.isfinite(loss):
-            self._stop_at(next((name for name, value in terms.items() if not math.isfinite(value)), "loss"))
+            self._stop_at(first_nonfinite(terms) or "loss")
         row = {"step": float(self.step), "training_loss": training_loss, "validation_loss": loss}
         row |= {f"validation_{name}": value for name, value in terms.items()}
         row |= {"learning_rate": self.config.rate(self.step), "windows_per_second": windows_per_second}
@@ -214,8 +209,7 @@ class Trainer:
             "batches": self._batches.get_state(),
             "counters": torch.tensor([self.step, self.best, self.best_step, self.stale], dtype=torch.float64),
         }
-        for part, module in (("model", self.model), ("guide", self.guide)):
-            tensors |= {f"{part}.{name}": value for name, value in module.state_dict().items()}
+        tensors |= self._programs.state_dict()
         write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {})
 
     @property
@@ -240,15 +234,11 @@ class Trainer:
         )
 
     def resume(self) -> None:
-        """Take over the state in the resume file, if there is one.
-
-        Raises:
-            UserError: it is damaged, or `metrics.csv` does not belong to it.
-        """
+        """Take over the state in the resume file, if there is one; a damaged one, or its metrics, is a `UserError`."""
         if self.step or not self.resume_path.exists():
             return
         with resuming(self.resume_path) as (tensors, _):
-            for part, module in (("model", self.model), ("guide", self.guide)):
+            for part, module in self._programs.items():
                 module.load_state_dict(section(tensors, part))
             load_optimizer(self._optimizer, tensors)
             step, best, best_step, stale = tensors["counters"].tolist()
@@ -294,11 +284,7 @@ def unchecked_programs() -> Iterator[None]:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The metrics that a run has written so far.
-
-    Raises:
-        UserError: the file is missing, or holds something else.
-    """
+    """The metrics that a run has written so far; a `UserError` if there are none, or something else."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]

@@ -27,11 +27,7 @@ GOOD = {  # options that are valid and small; @name is a file or folder of `mate
 BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "planner.samples=0", "planner.samples=0: samples must be at least 1, not 0"),
     ("plan", "planner.horizon=10", "planner.horizon=10: horizon=10 is not divisible by the model's segment length T=3"),
-    (
-        "plan",
-        "planner.optimizer=cem planner.optimizer.iterations=0",
-        "planner.optimizer.iterations=0: iterations must be at least",
-    ),
+    ("plan", "planner.optimizer=cem planner.optimizer.iterations=0", "iterations=0: iterations must be at least"),
     ("plan", "planner.drop=[guidance]", "no such addition"),
     ("plan", "+planner.unknown=1", "planner.unknown=1: cavin_pyro.planning.CavinPlanner cannot be built: "),
     ("plan", "planner._target_=my_lab.Mine", "planner._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
@@ -46,17 +42,14 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),
     ("plan", "checkpoint=@untrusted", "asks to run numpy.save, which is not part of this program"),
     ("evaluate", "checkpoint=@flat", "FlatModel, which has no effect_prior"),
-    ("evaluate", "output=@used", "holds a run with"),
     ("evaluate", "address=host:6379", "address=host:6379 is of launcher=ray"),
     ("train", "model.width=0", "model.width must be at least 1, not 0"),
-    ("train", "model.width=1000000000", "model.width must be at most 1000000, not 1000000000"),
     ("train", "scales.center=0", "scales.center must be positive, not 0"),
     ("train", "scales.center=1e308", "scales.center=1e308: OverflowError"),
     ("train", "scales.feature=1e-300", "scales.feature=1e-300: ZeroDivisionError"),
     ("train", "dynamics.maximum_displacement=nan", "dynamics.maximum_displacement must be finite, not nan"),
     ("train", "dynamics._target_=torch.nn.Identity", "dynamics._target_=torch.nn.Identity: AttributeError"),
     ("train", "objective.elbo._target_=builtins.dict", "objective.elbo._target_=builtins.dict: AttributeError"),
-    ("evaluate", "planner._target_=builtins.dict", "planner._target_=builtins.dict: AttributeError"),
     ("check", "sizes.subgoals=3 sections=[subgoals]", "sizes.subgoals=3: Cannot assign int to dict"),
     ("check", "checkpoint=@checkpoint", "does not tell which windows its training held out (KeyError: 'windows')"),
     ("check", "checkpoint=@odd_seed", "does not tell which windows its training held out (ValueError: "),
@@ -65,7 +58,6 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("train", "data=@nothing", "python -m cavin_pyro.collect"),
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
     ("pretrain", "data=@old_data", "has format version 0, this program reads 1: collect it again"),
-    ("pretrain", "autoencoder._target_=my_lab.Mine", "autoencoder._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
     ("collect", "output=@pushes seed=4", "holds a dataset with"),
     ("collect", "motions=3", "motions=3 is of policy=model: add that, or leave motions"),
     *((command, "output=@checkpoint/below", "cannot be written (Not a directory)") for command in GOOD),
@@ -94,9 +86,6 @@ def material(
     write_metadata(folder / "old_data", {**read_metadata(data), "version": 0})
     shard = shard_path(shutil.copytree(data, folder / "corrupt_data"), 1)
     shard.write_bytes(shard.read_bytes()[:-2000])
-    (folder / "used").mkdir()
-    (folder / "used" / "config.yaml").write_text("seed: 17\n")
-    (folder / "used" / "results.json").write_text("{}")
     return folder
 
 

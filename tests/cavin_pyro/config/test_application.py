@@ -142,10 +142,8 @@ def test_whatever_is_raised_while_choices_are_read_is_bad_input_of_the_options_i
     head = "scales.center=1e308, planner/optimizer=cem: "
     said = ended(read(raising(OverflowError("too large"))), capsys, words=words)[1]
     assert said.startswith(f"{head}OverflowError: too large; --traceback ")
-    assert (
-        ended(read(raising(ValueError("center is wrong"))), capsys, words=words)[1]
-        == "scales.center=1e308: center is wrong"
-    )
+    said = ended(read(raising(ValueError("center is wrong"))), capsys, words=words)[1]
+    assert said == "scales.center=1e308: center is wrong"
     assert len(ended(read(raising(ValueError("1" * 5000))), capsys)[1]) < 500
 
 
@@ -219,17 +217,13 @@ def test_a_reader_that_stops_early_ends_a_command_silently() -> None:
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 
 
+IMPORTING = "from cavin_pyro.config.application import guarded; guarded(lambda: __import__('slow'))"
+PLANNING = "import cavin_pyro.plan as plan; plan.main()"
+
+
 @pytest.mark.parametrize(
     ("flags", "program", "status", "said"),
-    [
-        (
-            "",
-            "from cavin_pyro.config.application import guarded; guarded(lambda: __import__('slow'))",
-            130,
-            "interrupted",
-        ),
-        ("-OO", "import cavin_pyro.plan as plan; plan.main()", 2, "PYTHONOPTIMIZE=2"),
-    ],
+    [("", IMPORTING, 130, "interrupted"), ("-OO", PLANNING, 2, "PYTHONOPTIMIZE=2")],
 )
 def test_neither_an_interrupted_import_nor_stripped_docstrings_end_in_a_traceback(
     flags: str, program: str, status: int, said: str, tmp_path: Path

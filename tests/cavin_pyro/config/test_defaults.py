@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,13 +10,12 @@ import pytest
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
-from cavin_pyro.config.commands import COMMANDS, TrainerConfig, WindowConfig
+from cavin_pyro.config.commands import COMMANDS, WindowConfig
 from cavin_pyro.config.composition import PRESETS, compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import configured, constructor_options, options
 from cavin_pyro.config.parts import build_model, construct
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
-from cavin_pyro.envs.pushing import PushingEnv
 from cavin_pyro.planning import CavinPlanner
 
 PAPER = {  # Algorithm 1 as it is printed
@@ -49,12 +46,6 @@ def test_a_planner_without_options_is_that_of_the_paper(small: SimpleNamespace) 
     assert vars(ours.optimizer) == vars(theirs.optimizer)
 
 
-def test_training_without_options_is_that_of_the_command() -> None:
-    config = compose("train")
-    assert asdict(TrainerConfig()) == plain(config.trainer)
-    assert asdict(WindowConfig()) == plain(config.windows)
-
-
 def test_collecting_without_options_is_that_of_the_command() -> None:
     config = compose("collect")
     usual = CollectionConfig()
@@ -62,15 +53,6 @@ def test_collecting_without_options_is_that_of_the_command() -> None:
     shared = ("seed", "steps", "policy", "checkpoint", "motions", "intent_length", "perturbation_rate")
     for name in (*shared, "maximum_objects", "episodes_per_shard"):
         assert config[name] == getattr(usual, name)
-
-
-def test_an_environment_without_options_is_that_of_the_command() -> None:
-    config, defaults = compose("plan"), inspect.signature(PushingEnv).parameters
-    for name in ("layout", "reward", "objects", "maximum_steps"):
-        assert config[name] == defaults[name].default
-    for name in ("robot", "camera", "segmentation"):
-        assert config.env[name] == defaults[name].default
-    assert config.task._target_ == "cavin_pyro.envs.tasks.crossing.Crossing"
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS.rglob("*.yaml")), ids=lambda path: str(path.relative_to(PRESETS)))

@@ -11,7 +11,6 @@ from pyro.infer import Trace_ELBO
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model, construct
-from cavin_pyro.models.likelihoods import PredictedScales
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.outline import Outline
 from cavin_pyro.models.networks.pointnet import PointNet
@@ -53,22 +52,6 @@ def test_presets_of_priors_and_guides_build_what_a_checkpoint_builds_again(
         assert all(torch.equal(value, weights[name]) for name, value in module.state_dict().items())
 
 
-@pytest.mark.parametrize(
-    ("option", "said"),
-    [
-        ({"width": 0}, "^prior.width must be at least 1, not 0$"),
-        ({"transforms": -1}, "^prior.transforms must be at least 1, not -1$"),
-        ({"depth": 3}, "cavin_pyro.models.priors.flow.FlowPrior cannot be built: .*'depth'"),
-    ],
-)
-def test_options_that_a_prior_does_not_take_are_named(option: dict, said: str, small: SimpleNamespace) -> None:
-    config = small.config()
-    config["prior"] = {"_target_": "cavin_pyro.models.priors.flow.FlowPrior", **option}
-    with pytest.raises(UserError, match=said) as caught:
-        build_model(config)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNamespace) -> None:
     with pytest.raises(UserError) as caught:
         build_guide(small.config(), AnotherModel())
@@ -106,37 +89,43 @@ def test_an_objective_is_any_elbo_of_pyro(small: SimpleNamespace) -> None:
     assert objective.elbo.num_particles == 3
 
 
+FLOW, SCALES = "cavin_pyro.models.priors.flow.FlowPrior", "cavin_pyro.models.likelihoods.PredictedScales"
+CONTACT = "cavin_pyro.models.networks.contact.dynamics.ContactDynamics"
+
+
+@pytest.mark.parametrize(
+    ("section", "options", "said"),
+    [
+        ("prior", {"_target_": FLOW, "width": 0}, "^prior.width must be at least 1, not 0$"),
+        ("prior", {"_target_": FLOW, "transforms": -1}, "^prior.transforms must be at least 1, not -1$"),
+        ("prior", {"_target_": FLOW, "depth": 3}, f"{FLOW} cannot be built: .*'depth'"),
+        ("scales", {"_target_": SCALES}, "scales=predicted needs an f that predicts them: dynamics=contact"),
+        ("dynamics", {"_target_": CONTACT, "reach_margin": -1}, "reach_margin must be null or at least 0 metres"),
+        ("dynamics", {"_target_": CONTACT, "reach_margin": -0.01}, "^reach_margin must be null .*, not -0.01$"),
+    ],
+)
+def test_options_that_a_part_of_a_model_does_not_take_are_named(
+    section: str, options: dict, said: str, small: SimpleNamespace
+) -> None:
+    with pytest.raises(UserError, match=said) as caught:
+        build_model(small.config() | {section: options})
+    assert "\n" not in str(caught.value)
+
+
 def test_a_model_must_take_the_features_and_the_objects_that_there_are(small: SimpleNamespace) -> None:
-    model = build_model(small.config())
+    dynamics, scales = {"_target_": CONTACT, "object_width": 8}, {"_target_": SCALES}
+    model, contact = build_model(small.config()), build_model(small.config() | {"dynamics": dynamics, "scales": scales})
     check_fit(model, PointNet(), 5)
-    with pytest.raises(UserError, match="feature_dimension=64, but the PointNet's features have 32"):
-        check_fit(model, PointNet(32), 5)
-    with pytest.raises(UserError, match="maximum_objects=5, but datasets have room for 6"):
-        check_fit(model, PointNet(), 6)
-
-
-def test_an_f_that_reads_outlines_needs_them(small: SimpleNamespace) -> None:
-    config = small.config() | {
-        "dynamics": {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics", "object_width": 8}
-    }
-    model = build_model(config)
-    check_fit(model, Outline(), 5)
-    with pytest.raises(
-        UserError, match="ContactDynamics reads the features of Outline, not of PointNet: pass geometry=outline"
+    check_fit(contact, Outline(), 5)
+    for one, geometry, objects, said in (
+        (model, PointNet(32), 5, "feature_dimension=64, but the PointNet's features have 32"),
+        (model, PointNet(), 6, "maximum_objects=5, but datasets have room for 6"),
+        (
+            contact,
+            PointNet(),
+            5,
+            "ContactDynamics reads the features of Outline, not of PointNet: pass geometry=outline",
+        ),
     ):
-        check_fit(model, PointNet(), 5)
-
-
-def test_scales_that_f_predicts_need_an_f_that_does(small: SimpleNamespace) -> None:
-    config = small.config() | {"scales": {"_target_": "cavin_pyro.models.likelihoods.PredictedScales"}}
-    with pytest.raises(UserError, match="scales=predicted needs an f that predicts them: dynamics=contact"):
-        build_model(config)
-    contact = {"dynamics": {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics"}}
-    assert isinstance(build_model(config | contact).scales, PredictedScales)
-
-
-@pytest.mark.parametrize("margin", [-1, -0.01])
-def test_a_negative_reach_margin_is_named_with_what_would_be_right(small: SimpleNamespace, margin: float) -> None:
-    contact = {"_target_": "cavin_pyro.models.networks.contact.dynamics.ContactDynamics", "reach_margin": margin}
-    with pytest.raises(UserError, match=f"^reach_margin must be null or at least 0 metres, not {margin}$"):
-        build_model(small.config() | {"dynamics": contact})
+        with pytest.raises(UserError, match=said):
+            check_fit(one, geometry, objects)

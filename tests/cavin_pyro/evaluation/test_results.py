@@ -6,7 +6,6 @@ import json
 import math
 from math import comb
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -148,24 +147,3 @@ def test_damaged_results_are_not_compared_with(tmp_path: Path) -> None:
         (tmp_path / "results.json").write_text(json.dumps({"per_episode": rows}))
         with pytest.raises(UserError, match=r"holds damaged results \(.*\): evaluate it again"):
             earlier_rows(tmp_path, OmegaConf.create({}))
-
-
-def test_an_evaluation_is_compared_on_the_command_line(shell: SimpleNamespace, tmp_path: Path) -> None:
-    overrides = ["planner=random", "objects=1", "maximum_steps=2", "workers=1"]
-    evaluation = lambda *more: shell.run_command("evaluate", *overrides, *more, folder=tmp_path)  # noqa: E731
-    assert evaluation("episodes=2", "output=one").status == 0
-    answer = evaluation("episodes=3", "output=two", "compare=one")
-    assert answer.status == 0, answer.errors
-    assert "neither 2; exact McNemar test p = 1" in answer.output
-    found = json.loads((tmp_path / "two" / "results.json").read_text())["comparison"]
-    assert found == {"against": "one", "both": 0, "one_alone": 0, "other_alone": 0, "neither": 2, "p_value": 1.0}
-    for more, said in (
-        (
-            ["compare=one", "task=clearing"],
-            "compare=one has task._target_=cavin_pyro.envs.tasks.crossing.Crossing, not",
-        ),
-        (["compare=nowhere"], "compare=nowhere is no finished evaluation"),
-    ):
-        answer = evaluation("episodes=2", "output=three", *more)
-        assert answer.status == 2
-        assert said in answer.errors and answer.errors.count("\n") == 1

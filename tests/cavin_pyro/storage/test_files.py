@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import errno
-import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,17 +24,6 @@ def test_a_file_is_the_new_one_or_the_old_one_and_nothing_else_remains(
             raise ZeroDivisionError
     assert (path.read_bytes() if path.exists() else None) == (old if fails else b"new")
     assert set(path.parent.iterdir()) <= {path}
-
-
-def test_a_full_disk_says_which_file_it_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(source: Path, target: Path) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError) as caught, atomic_write(tmp_path / "results.csv") as temporary:
-        temporary.write_text("half")
-    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "results.csv"))
-    assert not list(tmp_path.iterdir())
 
 
 def test_json_is_read_as_it_was_written_or_named(tmp_path: Path) -> None:

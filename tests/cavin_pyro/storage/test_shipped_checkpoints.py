@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from cavin_pyro.models.networks.pointnet import PointNet
-from cavin_pyro.storage.checkpoint import default_checkpoint, load, shipped_folder
+from cavin_pyro.storage.checkpoint import load, shipped_folder
 from cavin_pyro.storage.digests import read_manifest, tensors_digest
 from cavin_pyro.storage.files import file_digest
 
-SHIPPED = sorted(default_checkpoint().parent.glob("*.safetensors"))
+SHIPPED = sorted(shipped_folder().glob("*.safetensors"))
 WEIGHTS = "8c3a642176f2c88dad9c37537a502455bfcc995c25ab1d64a3668d25c1d314e4"  # of all their digests and names
 
 

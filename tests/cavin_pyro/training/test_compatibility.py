@@ -65,9 +65,7 @@ def test_a_guide_may_infer_the_discrete_site_instead(kinds: KindsModel, window: 
     guide = InferredKindsGuide(kinds, width=8).double()
     check_compatibility(kinds, guide, window, Trace_ELBO())
     assert Objective(Trace_ELBO()).loss(kinds, guide)(window, 0).isfinite()
-    with pytest.raises(
-        UserError, match="KindsModel enumerates kind, which the guide lacks: choose objective.elbo._targ"
-    ):
+    with pytest.raises(UserError, match="KindsModel enumerates kind, which the guide lacks: choose objective.elbo"):
         check_compatibility(kinds, KindsGuide(kinds, width=8).double(), window, Trace_ELBO())
 
 
@@ -133,7 +131,5 @@ def test_another_order_than_the_models_has_other_divergences_and_is_refused(wind
     sampled, closed = (divergence(elbo, programs, window).item() for elbo in (Trace_ELBO, TraceMeanField_ELBO))
     assert abs(sampled - closed) > 5
     check_compatibility(*programs, window, Trace_ELBO())
-    with pytest.raises(
-        UserError, match="samples motion_code, effect_code in this order, the model effect_code, motion"
-    ):
+    with pytest.raises(UserError, match="samples motion_code, effect_code in this order, the model effect_code"):
         check_compatibility(*programs, window, TraceMeanField_ELBO())

@@ -108,8 +108,7 @@ def test_training_lowers_the_loss_and_reports_every_term(small: SimpleNamespace,
         names = next(csv.reader(file))
     sites = ["subgoal_centers", "subgoal_features", "actions", "next_centers", "next_features"]
     terms = [f"validation_nll_{site}" for site in sites] + [
-        "validation_kl_effect_code",
-        "validation_kl_motion_code",
+        f"validation_kl_{code}_code" for code in ("effect", "motion")
     ]
     assert {"step", "training_loss", "validation_loss", "learning_rate", "windows_per_second", *terms} == set(names)
     assert read_rows(tmp_path / "run" / "metrics.csv") == run.rows
@@ -170,11 +169,8 @@ def test_the_validation_loss_has_the_terms_of_the_model_and_not_the_counterfactu
     small: SimpleNamespace, tmp_path: Path
 ) -> None:
     losses = {}
-    for name, weights in {
-        "plain": {},
-        "counterfactual": {"counterfactual_weight": 2.0},
-        "rollout": {"rollout_weight": 2.0},
-    }.items():
+    for name in ("plain", "counterfactual", "rollout"):
+        weights = {} if name == "plain" else {f"{name}_weight": 2.0}
         run = trainer(small, tmp_path / name, objective=Objective(Trace_ELBO(), **weights))
         terms, losses[name] = run._validation_terms()
         assert ("rollout" in terms) == (name == "rollout")
@@ -220,17 +216,6 @@ def test_an_interrupted_run_resumes_as_if_it_had_not_been_interrupted(
     assert torch.equal(weights(resumed), weights(whole))
     assert without_speed(resumed.rows) == without_speed(whole.rows)
     assert (resumed.best, resumed.best_step, resumed.stale) == (whole.best, whole.best_step, whole.stale)
-
-
-def test_a_finished_run_is_not_run_again(small: SimpleNamespace, tmp_path: Path) -> None:
-    trainer(small, tmp_path / "run").run()
-
-    def fail(run: Trainer, step: int) -> None:
-        raise AssertionError("trained again")
-
-    again = trainer(small, tmp_path / "run", hook=fail)
-    again.run()
-    assert (again.step, len(again.rows)) == (8, 4)
 
 
 def poison(choose: Callable[[Trainer], Tensor]) -> Hook:
