@@ -207,7 +207,7 @@ def test_an_arm_gets_a_stick_and_meshes_of_its_own(site: Site, assets: Callable,
         (arm_archive(mesh="../../outside.STL"), "names a mesh where none can be: 'package://../../outside.STL'"),
         (packed({"x/sawyer_description/urdf/sawyer.urdf": b"<robot>"}), "sawyer.urdf cannot be read"),
     ],
-    ids=["too few joints", "a mesh outside", "cut short"],  # an archive holds the time, which would differ between workers
+    ids=["too few joints", "a mesh outside", "cut short"],  # an archive holds the time of its making
 )
 def test_another_arm_is_refused(archive: bytes, said: str, site: Site, assets: Callable, tmp_path: Path) -> None:
     site.put(SawyerRobot.pieces["arm"], archive)
