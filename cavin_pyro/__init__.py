@@ -24,11 +24,9 @@ _HOMES = {
     "compare": "evaluation.comparison",
     "evaluate": "evaluation.evaluation",
     "fit": "training.run",
-    "load": "storage.checkpoint",
-    "make_env": "evaluation.factory",
-    "make_planner": "evaluation.factory",
     "rollout": "evaluation.rollout",
-    "save": "storage.checkpoint",
+    **dict.fromkeys(("load", "save"), "storage.checkpoint"),
+    **dict.fromkeys(("make_env", "make_planner"), "evaluation.factory"),
 }
 
 

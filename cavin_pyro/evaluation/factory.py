@@ -210,10 +210,7 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
 
 
 def episode_rewards(tasks: Sequence[Task], **options: Any) -> Callable[[Task], TaskReward]:
-    """The reward of a task: one object for each of `tasks`, so that what it computes once serves all episodes.
-
-    `options`: of `TaskReward`.
-    """
+    """The reward of a task, by `options` of `TaskReward`: one object for each of `tasks`, which serves all episodes."""
     known = {id(task): (task, TaskReward(task, **options)) for task in tasks}  # with its task, so that its id stays
 
     def reward(task: Task) -> TaskReward:

@@ -40,10 +40,7 @@ def check_targets(config: Any, path: Path, trust: Sequence[str], depth: int = 0)
 
 
 def check_numbers(config: Any, path: Path, largest: int, place: str = "") -> None:
-    """Check that no number of a class of ours is far above the largest dimension of the weights, before one is built.
-
-    Such layers would fill the memory.
-    """
+    """Refuse a number of a class of ours far above the weights' largest dimension: the layer would fill the memory."""
     if isinstance(config, dict) and _is_class_of(str(config.get("_target_", ANY)), OWN_MODULES):
         for name, value in config.items():
             check_numbers(value, path, largest, f"{place}{name}.")

@@ -31,10 +31,7 @@ def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, 
 
 @contextmanager
 def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
-    """Yield the tensors and the state of a resume file; whatever does not fit within the block is a damaged file.
-
-    A damaged file, or one of another training, is a `UserError`.
-    """
+    """Yield a resume file's tensors and state; what does not fit within the block is a damaged file, a `UserError`."""
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}

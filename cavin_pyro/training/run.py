@@ -40,10 +40,7 @@ DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; th
 
 
 def train(config: DictConfig) -> Trainer:
-    """Run a whole training, from its configuration to a folder with checkpoint and metrics.
-
-    A configuration or data that cannot be used, or a loss that is not finite, is a `UserError`.
-    """
+    """Run a whole training, from its configuration to a folder with checkpoint and metrics, or to a `UserError`."""
     with output_folder(config.output) as folder:
         config.device = choose_device(config.device).type
         selection = configured(WindowConfig, config.windows, "windows")
