@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Callable
 from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from cavin_pyro.envs.goals import LARGEST, SHAPE_WEIGHT, Goal, assign, read_goal
 from cavin_pyro.envs.layouts import parse_task
 from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.pushing import PushingEnv
-from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.tasks import Outcome, TaskReward
 from cavin_pyro.envs.tasks.rearrange import LEAST_TOLERANCE, TOLERANCE, Rearrange
 from cavin_pyro.envs.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, TILE_SIDE, tile_center
@@ -83,30 +81,8 @@ def test_objects_that_look_the_same_take_the_shortest_ways_in_total(
     assert np.linalg.norm(np.array(found) - np.array(starts), axis=-1).sum() <= min(ways) + SHAPE_WEIGHT * 1e-5
 
 
-SHOWN = ((0.45, -0.20), (0.60, 0.25), (0.70, -0.05))
 FLAT = np.ones((212, 256))  # metres: an empty table
 CLOUDS = np.full((2, POINTS_PER_OBJECT, 3), 0.5, np.float32)
-
-
-@pytest.fixture
-def shown(scene: Scene, put: Callable) -> Scene:
-    """Three objects at `SHOWN`."""
-    names = ("sugar_box", "rubiks_cube", "potted_meat_can")
-    objects = [put(name, x, y) for name, (x, y) in zip(names, SHOWN, strict=True)]
-    scene.reset(objects, np.random.default_rng(0))
-    return scene
-
-
-@pytest.mark.parametrize("suffix", [".png", ".safetensors"])
-def test_a_saved_scene_shows_its_objects_where_they_are(suffix: str, shown: Scene, tmp_path: Path) -> None:
-    save_goal(tmp_path / f"goal{suffix}", shown)
-    goal = read_goal(tmp_path / f"goal{suffix}")
-    true = shown.observe().centers[:3]
-    assert goal.clouds.shape == (3, POINTS_PER_OBJECT, 3)
-    nearest = np.linalg.norm(goal.centers[:, None] - true[None], axis=-1)
-    assert sorted(nearest.argmin(axis=1)) == [0, 1, 2]
-    assert nearest.min(axis=1).max() < 0.015  # the segmentations differ on the sides of tall objects
-    np.testing.assert_array_equal(goal.centers, read_goal(str(tmp_path / f"goal{suffix}")).centers)
 
 
 def png(values: np.ndarray) -> bytes:
@@ -117,10 +93,8 @@ def png(values: np.ndarray) -> bytes:
 
 REFUSED = [
     ("goal.pt", pickle.dumps(FLAT), r"must be a file that ends in \.png or \.safetensors$"),
-    ("goal.png", png(np.zeros((212, 256), np.uint16)), r"no table in the depth image"),
     ("goal.png", png((1000 * FLAT).astype(np.uint16)), r"shows 0 objects on the table, and a scene holds 1 to 10$"),
     ("goal.png", png(np.zeros((212, 256), np.uint8)), r"16 bits of depth per pixel, in millimetres, not L$"),
-    ("goal.png", png(np.zeros((212, 255), np.uint16)), r"has 255 by 212 pixels, and the camera 256 by 212"),
     ("goal.png", png(np.zeros((1, 5000), np.uint16)), r"is over 2048 pixels wide or high$"),
     ("goal.png", png((1000 * FLAT).astype(np.uint16))[:-60], r"is damaged or no PNG"),
     ("goal.safetensors", b"\xff" * 64, r"is damaged or no safetensors file"),
@@ -153,11 +127,6 @@ def test_places_lie_on_the_tiles_and_apart(seed: int, count: int) -> None:
         assert min(offsets) <= TILE_SIDE / 2
     assert all(np.linalg.norm(np.subtract(*pair)) >= 0.1 for pair in combinations(places, 2))
     assert places == sample_places(REGION, count, 0.1, np.random.default_rng(seed))
-
-
-def test_places_for_which_there_is_no_room_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^no room for 3 places at least 0\.5 m apart in the region: add tiles"):
-        sample_places([(1, 2)], 3, 0.5, np.random.default_rng(0))
 
 
 LAYOUT = {"region": [(1, 3)], "target_start": [(1, 1)], "obstacle_start": [(1, 5)]}
@@ -232,11 +201,8 @@ def test_the_places_of_a_file_are_those_of_its_objects(suffix: str, tmp_path: Pa
     ("change", "message"),
     [
         ({"places": [3]}, r"places must be points in metres such as \[\[0\.5, 0\.1\], \[0\.4, -0\.2\]\], not \[3\]$"),
-        ({"places": [[0.1, 0.1]]}, r"places: \[0\.1, 0\.1\] is off the table, from \[0\.22, -0\.61\] to"),
         ({"places": [[0.5, 0.1]] * 11}, r"places must be at most 10 points, not 11$"),
-        ({"goal": [[1, 2]]}, r"goal must be the path of a file, not \[\[1, 2\]\]$"),
         ({"goal": "a.png", "places": [(0.5, 0.1)]}, r"goal a\.png and places both say .*: give one of them$"),
-        ({"clearance": -1}, r"clearance must be at least 0 metres, not -1$"),
     ],
 )
 def test_what_is_no_rearrangement_is_refused_in_one_line(change: dict[str, Any], message: str) -> None:

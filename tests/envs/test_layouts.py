@@ -63,16 +63,11 @@ def test_a_layout_is_read_from_a_file(tmp_path: Path, kind: type) -> None:
     ("task", "change", "message"),
     [
         ("crossing", {"region": [[2, 2], [2, 3], [5, 3]]}, r"region: tile \[5, 3\] is off the table"),
-        ("crossing", {"region": [[2, 2], [2, 4], [2, 2]]}, r"region: tile \[2, 2\] is listed twice"),
         ("crossing", {"goal": [[2.0, 2]]}, r"goal: a tile is two whole numbers such as \[2, 3\], not \[2.0, 2\]"),
-        ("crossing", {"goal": [2, 2]}, r"goal: a tile is two whole numbers .* not 2$"),
-        ("crossing", {"goal": 3}, r"goal must be a list of tiles such as .*, not 3$"),
         ("crossing", {"bridge": [[2, 2]]}, r"unknown key 'bridge', valid keys are task, region, goal, target_start"),
-        ("crossing", {"region": []}, r"region needs at least one tile"),
         ("crossing", {"goal": [[2, 4]]}, r"tile \[2, 4\] is both goal and target_start"),
         ("crossing", {"goal": [[3, 2]]}, r"goal tile \[3, 2\] is off the bridge, add it to region"),
         ("insertion", {"region": [[1, 3]]}, r"obstacle_start tile \[1, 3\] overlaps the restricted region"),
-        ("clearing", {}, r"unknown key 'goal', valid keys are task, region, target_start, obstacle_start$"),
         ("clearing", {"task": "crossing"}, r"is for task crossing: run it with task=crossing$"),
         ("crossing", {"task": "juggling"}, r"unknown task 'juggling', choose from clearing, crossing, "),
     ],
@@ -89,18 +84,13 @@ def test_files_that_are_no_layout_get_one_line(tmp_path: Path) -> None:
     path = write(tmp_path, {name: tiles for name, tiles in CROSSING.items() if name != "goal"})
     with pytest.raises(ValueError, match=r"mine\.yaml: the key 'goal' is missing$"):
         load_task("crossing", path)
-    for text in ("region: [[1, 2]", "\x00", "a: !!python/none"):
+    for text in ("region: [[1, 2]", "a: !!python/none"):
         with pytest.raises(ValueError, match=r"mine\.yaml is not YAML: ") as caught:
             load_task("crossing", write(tmp_path, text))
         assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match=r"mine\.yaml must hold the keys region, goal, target_start"):
-        load_task("crossing", write(tmp_path, "[[1, 2]]"))
-    choices = "0, 1, 2, random, generated or the path of a YAML file$"
     for layout in ("nowhere.yaml", -1, tmp_path):
-        with pytest.raises(ValueError, match=rf"cannot be read \(.*\): give {choices}"):
+        with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, random, generated or the path"):
             load_task("crossing", layout)
-    with pytest.raises(ValueError, match=rf"^unknown layout 3: choose {choices}"):
-        load_task("crossing", 3)
     with pytest.raises(ValueError, match=r"crossing_0\.yaml with overrides: goal tile \[4, 6\] is off the bridge"):
         load_task("crossing", 0, {"goal": [[4, 6]]})
     with pytest.raises(ValueError, match=r"^tiles replace fields of one layout: give layout=0, 1, 2 or a YAML file"):
@@ -219,8 +209,6 @@ def test_every_scene_has_its_own_layout_with_room_for_five_objects(task: str, ti
     ("task", "wanted", "problem"),
     [
         ("crossing", {"tiles": 3}, r"^generated\.tiles must be a whole number from 4 to 14, not 3$"),
-        ("crossing", {"shape": "round"}, r"^unknown generated\.shape 'round': choose from straight, l, u, s, winding"),
-        ("crossing", {"seed": -1}, r"^generated\.seed must be at least 0 or null, not -1$"),
         ("crossing", {"tiles": 8, "shape": "straight"}, r"^no bridge of 8 tiles .* choose generated\.shape=l, u, s, w"),
         ("insertion", {"tiles": 9}, r"^ways to a slot have 4 to 8 tiles and any shape: choose generated\.tiles=4 to 8"),
         ("gathering", {}, r"^task gathering has no generated layouts: give another layout, or another task$"),
@@ -304,8 +292,6 @@ def test_fields_with_defaults_may_be_left_out_of_a_layout_and_options_may_be_in_
     assert plain == Visit(places=[(0, 0)], target_start=[(1, 3)], obstacle_start=TileSet([(1, 5)]))
     assert (plain.shunned.tiles, plain.bonus, plain.name) == ((), 0.5, "visit")
     assert parse_task(Visit, {"places": [[0, 0]], "bonus": 2.0, **STARTS}).bonus == 2.0
-    with pytest.raises(ValueError, match=r"^layout: places needs at least one tile$"):
-        parse_task(Visit, {"places": [], **STARTS})
 
 
 def test_a_reward_is_the_sum_of_its_named_terms(tmp_path: Path) -> None:
@@ -327,21 +313,14 @@ def test_what_is_no_whole_task_is_refused() -> None:
 
     with pytest.raises(ValueError, match=r"^task Half lacks potential$"):
         load_task(Half)
-    with pytest.raises(ValueError, match=r"is no task: derive it from cavin_pyro\.envs\.tasks\.Task$"):
-        load_task(int)  # type: ignore[arg-type]
 
 
 def test_a_class_without_the_decoration_of_its_fields_is_refused() -> None:
     class Plain(Visit):
         wanted: int = 2
 
-    class Further(Visit):
-        def success(self, step: Step) -> Tensor:
-            return ~super().success(step)
-
     with pytest.raises(ValueError, match=r"^decorate Plain with @dataclass\(frozen=True, kw_only=True\)$"):
         load_task(Plain)
-    assert isinstance(parse_task(Further, {"places": [[0, 0]], **STARTS}), Further)  # it has no fields of its own
 
 
 @pytest.mark.parametrize(
@@ -349,10 +328,7 @@ def test_a_class_without_the_decoration_of_its_fields_is_refused() -> None:
     [
         ("success", Tensor.float, r"success must return bool \[\.\.\.\], here \[8, 6\], not torch.float32 \[8, 6\]"),
         ("success", lambda right: right[:, 0], r"success must return bool .*, not torch.bool \[8\]"),
-        ("success", lambda right: True, r"success must return bool .*, not bool$"),
-        ("published_violation", Tensor.float, r"published_violation must return bool .*, not torch.float32"),
         ("potential", lambda right: right.sum(-1, keepdim=True), r"potential must return metres .*\[8, 1\]"),
-        ("potential", lambda right: right > 0, r"potential must return metres .*, not torch.bool \[8, 7\]"),
     ],
 )
 def test_functions_of_a_users_task_are_checked_when_an_environment_is_built(

@@ -109,19 +109,6 @@ def test_a_handle_beside_a_body_is_part_of_it_and_a_like_thing_alone_is_an_objec
     assert [len(ClusterSegmenter().start(image, None)) for image in (together, apart)] == [2, 3]  # the target's place
 
 
-def test_objects_pushed_against_each_other_stay_two() -> None:
-    apart = table(CAMERA, (0.6, 0.0, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
-    touching = table(CAMERA, (0.6, 0.108, 0.04, 0.04), (0.6, 0.2, 0.03, 0.05))
-    both_moved = table(CAMERA, (0.6, 0.158, 0.04, 0.04), (0.6, 0.25, 0.03, 0.05))
-    segmenter = ClusterSegmenter()
-    segmenter.start(apart, pixel(apart, 0.6, 0.0))
-    for image, first, second in ((touching, 0.108, 0.2), (both_moved, 0.158, 0.25)):
-        found = segmenter.follow(image)
-        np.testing.assert_allclose(
-            [center(image, pixels)[:2] for pixels in found], [(0.6, first), (0.6, second)], atol=0.008
-        )
-
-
 def test_objects_that_touch_with_a_corner_come_apart_and_a_bent_one_does_not() -> None:
     map_of = np.zeros((60, 60), bool)
     map_of[10:25, 10:25] = map_of[24:40, 23:40] = True
