@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import re
-import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -155,9 +154,3 @@ def test_the_page_runs(page: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def _indented(script: str) -> str:
     return "".join(f"    {line}\n" if line else "\n" for line in script.splitlines())
-
-
-def test_what_does_not_run_is_still_in_the_documentation() -> None:
-    """A reason that no command needs any more goes."""
-    said = [shlex.join(line.tokens) for page in PAGES for line in commands(page)]
-    assert not [part for part in NOT_RUN if not any(part.strip() in one for one in said)]

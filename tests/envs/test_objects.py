@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from itertools import combinations
 from pathlib import Path
@@ -21,11 +20,7 @@ from hypothesis import strategies as st
 from cavin_pyro.envs.files import process_folder
 from cavin_pyro.envs.objects.object_sets import chosen, load_object_set
 from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectParameters, ObjectRanges, arrange, sample_objects
-from cavin_pyro.envs.objects.shapes import (
-    BUILTIN_NAMES,
-    Shape,
-    builtin_shape,
-)
+from cavin_pyro.envs.objects.shapes import Shape, builtin_shape
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
@@ -118,13 +113,6 @@ def scanned(tiny_assets: Path) -> Iterator[Scene]:
     world.close()
 
 
-@pytest.fixture(scope="module")
-def real(real_assets: Path) -> Iterator[Scene]:
-    world = Scene(object_set=load_object_set("ycb", real_assets))
-    yield world
-    world.close()
-
-
 def test_a_name_without_its_set_means_the_object_of_every_set(tiny_assets: Path) -> None:
     mixed = load_object_set("mixed", tiny_assets)
     assert chosen(["mug", "ycb/brick", "banana"], mixed) == ("mug", "ycb/mug", "ycb/brick", "banana")
@@ -191,14 +179,3 @@ def test_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path, m
     (tmp_path / (here + name)).mkdir()
     process_folder("meshes")
     assert (tmp_path / (here + name)).exists()  # another user's
-
-
-def test_the_real_objects_are_the_papers_ten(real: Scene, real_assets: Path) -> None:
-    objects = real.object_set
-    assert {name.removeprefix("ycb/") for name in objects.names} == set(BUILTIN_NAMES)
-    for name in BUILTIN_NAMES:
-        asset = objects.asset(f"ycb/{name}")
-        assert asset.mass == builtin_shape(name).mass
-        assert asset.radius == pytest.approx(builtin_shape(name).radius, rel=0.15)
-        inertia = ElementTree.parse(real_assets / "ycb" / f"{name}.urdf").find(".//inertia")
-        assert asset.inertia == tuple(float(inertia.attrib[axis]) for axis in ("ixx", "iyy", "izz"))

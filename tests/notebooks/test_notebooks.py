@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +39,6 @@ def read(path: Path) -> Any:
 
 def code_cells(notebook: Any) -> list[Any]:
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
-
-
-def test_notebooks_follow_a_workflow_and_each_leads_to_the_next() -> None:
-    names = [path.name for path in NOTEBOOKS]
-    assert [name[:2] for name in names] == [f"{number}_" for number in range(1, len(names) + 1)] and len(names) >= 5
-    for path, following in pairwise(NOTEBOOKS):
-        assert f"]({following.name})" in read(path).cells[-1].source
 
 
 @every_notebook

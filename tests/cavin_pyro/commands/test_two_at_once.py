@@ -29,10 +29,8 @@ def refusals(shell: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -
 def test_a_second_command_is_refused_in_one_line(command: str, refusals: SimpleNamespace) -> None:
     answer = refusals.ended[command]
     assert (answer.status, answer.output) == (2, ""), answer.errors
-    assert answer.complaints == [
-        f"error: {refusals.held} is being written by process {os.getpid()} on {socket.gethostname()}: "
-        "wait until it ends, stop it, or choose another folder with output=DIR"
-    ]
+    (line,) = answer.complaints
+    assert f"{refusals.held} is being written by process {os.getpid()} on {socket.gethostname()}" in line
 
 
 def test_a_refused_command_touches_nothing(refusals: SimpleNamespace) -> None:

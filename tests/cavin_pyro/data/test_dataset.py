@@ -88,10 +88,8 @@ SPOILT: dict[str, tuple[Callable[[Path, Arrays], Any], str]] = {
     "missing": (lambda path, arrays: path.unlink(), "it is missing"),
     "an array less": (lambda path, arrays: write_shard(path, {"mask": arrays["mask"]}), "object"),
     "fewer": (changed("actions", lambda one: one[1:]), r"actions has shape \[3, 6, 4\], not \[4, 6, 4\]"),
-    "too wide": (changed("mask", lambda one: np.pad(one, ((0, 0), (0, 1)))), r"mask has shape \[4, 6\], not \[4, 5\]"),
     "another type": (changed("actions", lambda one: one.astype(float)), "actions has type float64, not float32"),
     "not finite": (changed("actions", lambda one: one * np.nan), "actions has values outside of -1 to 1: nan to nan"),
-    "out of range": (changed("actions", lambda one: one + 2), "actions has values outside of -1 to 1"),
     "elsewhere": (linked, "actions is no array in this file"),
     "unpacks to 660 gigabytes": (bomb, r"centers has shape \[1000000000, 11, 5, 3\]"),
 }
@@ -146,20 +144,12 @@ def test_padding_adds_slots_without_objects(pushes: Path) -> None:
         ({"format": "photographs"}, "does not describe a dataset of this program"),
         ({"version": 2}, "has format version 2, this program reads 1: collect it again"),
         ({"shards": 0}, "is damaged: configuration or counts are missing"),
-        ({"configuration": {"steps": "6"}}, "maximum_objects must be whole numbers"),
         ({"configuration": {"steps": 6, "maximum_objects": 11}}, "must be whole numbers, the last 10 at most"),
-        ({"shape_names": [["mug"]]}, "shape_names must be a list of names"),
         ({"shards": 10**9}, "files have not 12 episodes"),
         ({"shards": 10**9, "episodes": 4 * 10**9}, "counts 1000000000 files of episodes, but 3 are there"),
-        ({"sources": [{"shards": 3}]}, "configuration or counts are missing"),
     ],
 )
 def test_metadata_that_cannot_be_are_refused_at_once(changes: dict, said: str, own_pushes: Path) -> None:
     write_metadata(own_pushes, {**read_metadata(own_pushes), **changes})
     with pytest.raises(UserError, match=said):
         list(iterate_shards(own_pushes, ("episode",), skip_corrupt=True))
-
-
-def test_a_folder_without_a_dataset_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"make one with python -m cavin_pyro.collect .* output="):
-        read_metadata(tmp_path)

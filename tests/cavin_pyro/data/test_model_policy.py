@@ -102,13 +102,5 @@ def test_a_collection_by_a_model_records_its_checkpoint(small: SimpleNamespace, 
 
 
 def test_a_checkpoint_that_cannot_choose_pushes_is_refused(small: SimpleNamespace) -> None:
-    for changes, said in (
-        ({"checkpoint": "cavin"}, "checkpoint=cavin is of policy=model: add that, or leave checkpoint"),
-        (
-            {"policy": "model", "checkpoint": "mpc"},
-            "needs a cascade, and checkpoint .* has model dynamics",
-        ),
-        ({"policy": "model", "checkpoint": "nothing"}, "unknown checkpoint 'nothing'"),
-    ):
-        with pytest.raises(UserError, match=said):
-            check_policy(replace(small.pushes, **changes))
+    with pytest.raises(UserError, match="needs a cascade, and checkpoint .* has model dynamics"):
+        check_policy(replace(small.pushes, policy="model", checkpoint="mpc"))

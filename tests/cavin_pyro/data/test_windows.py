@@ -177,9 +177,6 @@ def test_intact_shards_of_a_damaged_dataset_are_used_with_skip_corrupt(
     table = load_windows([folder], PointNet(), EVERY, skip_corrupt=True)
     assert len(table.starts) == 36
     assert capsys.readouterr().out.count("left out: shard") == 2
-    (folder / "episodes-00002.h5").unlink()
-    with pytest.raises(UserError, match="has no usable shard: collect it again"):
-        load_windows([folder], PointNet(), EVERY, skip_corrupt=True)
 
 
 def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
@@ -214,8 +211,6 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
     assert batch.states.mask.tolist() == mask[[4, 1]].tolist()
     assert batch.transition_mask.all() and batch.sequence_mask.all()
     assert table.batch(torch.tensor([1])).states.objects == 2
-    with pytest.raises(ValueError, match=r"^a batch needs at least one window$"):
-        table.batch(torch.tensor([], dtype=torch.int64))
     held_out = set(table.episodes[table.validation].tolist())
     assert len(held_out) == 1 and not held_out & set(table.episodes[table.training].tolist())
     assert sorted([*table.training.tolist(), *table.validation.tolist()]) == list(range(6))

@@ -132,12 +132,6 @@ def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch
         list(Launcher("ray").run(act, [("sleep", 0.0)]))
 
 
-def test_no_cluster_at_an_address_is_one_line() -> None:
-    pytest.importorskip("ray", reason="Ray is not installed: it comes with the extra ray")
-    with pytest.raises(UserError, match="no Ray cluster at address=127.0.0.1:1 "):
-        list(Launcher("ray", address="127.0.0.1:1").run(act, [("sleep", 0.0)]))
-
-
 def test_jobs_of_a_submitit_sweep_make_the_bytes_of_runs_alone(shell: SimpleNamespace, tmp_path: Path) -> None:
     pytest.importorskip("submitit", reason="submitit is not installed: it comes with the extra slurm")
     few = ("transitions=2", "steps=1", "episodes_per_shard=1", "workers=1")

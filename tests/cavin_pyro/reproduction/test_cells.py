@@ -105,12 +105,10 @@ def test_shards_share_the_trainings_without_overlap() -> None:
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("planners=[]", "planners must name at least one: choose from paper, ours"),
         ("tasks=[crossing]", "no cell of scale=minimal has these methods, planners, tasks, objects and rewards"),
         ("episodes=1001", "episodes must be at most 1000 with scale=minimal, not 1001"),
         ("objects=[6]", "objects has 6: choose from 1, 2, 3, 4, 5"),
         ("models=nowhere", "models=nowhere holds no cavin-0.safetensors"),
-        ("shard=3/2", "shard must be i/n"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_is_written(option: str, said: str) -> None:
