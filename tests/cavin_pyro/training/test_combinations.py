@@ -174,7 +174,7 @@ def test_the_balance_of_states_and_actions_is_a_positive_number() -> None:
     config = composed("single_latent", "single_latent")
     for weight in (0.0, -1.0):
         config.model.action_weight = weight
-        with pytest.raises(UserError, match="^model.action_weight must be a positive number"):
+        with pytest.raises(UserError, match="^action_weight must be a positive number"):
             building.build_model(config)
 
 
