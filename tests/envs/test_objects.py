@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from cavin_pyro.envs.files import process_folder
 from cavin_pyro.envs.objects.object_sets import chosen, load_object_set
 from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectParameters, ObjectRanges, arrange, sample_objects
-from cavin_pyro.envs.objects.shapes import Shape, builtin_shape
+from cavin_pyro.envs.objects.shapes import RANDOM_NAMES, Shape, builtin_shape, random_shape
+from cavin_pyro.envs.robots.robot import SETTLED_SPEED
 from cavin_pyro.envs.scene import Scene
 from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
 
@@ -68,6 +69,27 @@ def test_every_part_is_convex_and_watertight(name: str) -> None:
     for part in builtin_shape(name).parts:
         assert part.is_watertight and part.is_convex
         assert part.volume > 0
+
+
+SHAPES = [random_shape(name) for name in RANDOM_NAMES]
+
+
+def test_a_name_is_the_same_object_whatever_was_built_before() -> None:
+    again = random_shape.__wrapped__(RANDOM_NAMES[57])
+    for part, other in zip(again.parts, SHAPES[57].parts, strict=True):
+        np.testing.assert_array_equal(part.vertices, other.vertices)
+    assert again.mass == SHAPES[57].mass
+
+
+def test_random_objects_fall_come_to_rest_and_stay_on_the_table() -> None:
+    scene = Scene(object_set=load_object_set("random"))
+    generator = np.random.default_rng(0)
+    for _ in range(2):
+        scene.sample([WHOLE_TABLE] * 5, ObjectRanges(names=RANDOM_NAMES, clearance=0.12), generator)
+        truth = scene.ground_truth()
+        assert scene.world.fastest(scene.bodies) < SETTLED_SPEED
+        assert (truth.positions[:, 2] > 0.0).all()
+    scene.close()
 
 
 SEEDS = st.integers(0, 2**32 - 1)

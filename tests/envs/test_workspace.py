@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cavin_pyro.envs.tasks.tiles import TileSet
+from cavin_pyro.envs.tasks.tiles import TileSet, table_distance
 from cavin_pyro.envs.workspace import (
     MAXIMUM_MOTION,
     REACH_HIGH,
@@ -32,6 +32,12 @@ def test_pushes_start_and_end_within_reach(actions: np.ndarray) -> None:
     for point in push_endpoints(actions):
         assert point.shape == (3, 2)
         assert (point >= REACH_LOW).all() and (point <= REACH_HIGH).all()
+
+
+def test_the_corners_of_the_action_are_the_corners_of_the_reach() -> None:
+    start, end = push_endpoints(np.array([[-1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 0.5, -1.0]]))
+    np.testing.assert_allclose(start, [REACH_LOW, REACH_HIGH, (0.55, 0.0)])
+    np.testing.assert_allclose(end, [REACH_LOW, REACH_HIGH, (0.60, -0.1)])  # the first two are clipped to the box
 
 
 @settings(deadline=None)
@@ -94,3 +100,11 @@ def test_rounding_leaves_no_gap_between_neighbours(dtype: torch.dtype) -> None:
                 point[axis] = border + offset
                 assert union.contains(point)
                 assert union.signed_distance(point) < -0.1
+
+
+@settings(deadline=None)
+@given(X, Y)
+def test_the_distance_to_the_tables_edge_is_that_to_the_nearest_side(x: float, y: float) -> None:
+    sides = (x - 0.22, 0.98 - x, y + 0.61, 0.61 - y)
+    distance = table_distance(torch.tensor([x, y], dtype=torch.float64))
+    assert distance.item() == pytest.approx(min(sides), abs=1e-12)
