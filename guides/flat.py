@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pyro
 
-from cavin_pyro.guides.guide import Guide, MotionInference
+from cavin_pyro.guides.cascaded import MotionInference
+from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.flat import FlatModel
 from cavin_pyro.models.model import sequence_mask, windows_plate
 from cavin_pyro.models.state import Window

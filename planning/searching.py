@@ -16,13 +16,14 @@ from cavin_pyro.planning.additions import Addition, make_additions
 from cavin_pyro.planning.backends import make_backend
 from cavin_pyro.planning.checks import (
     NoFiniteCandidateError,
+    OptimizerError,
     check_choice,
     check_horizon,
     check_limits,
     check_positive,
     check_scenes,
 )
-from cavin_pyro.planning.optimizers import Optimizer, make_optimizer, search
+from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import (
     FixedShapes,
     ModelRequirements,
@@ -184,6 +185,18 @@ class SearchingPlanner:
         for addition in self.additions:
             value = getattr(addition, hook)(value, *arguments)
         return value
+
+
+def search(optimizer: Optimizer, problem: SearchProblem, samples: int) -> Candidates:
+    """All whole candidates `[B, n]` that the optimizer has evaluated.
+
+    Raises OptimizerError, naming the optimizer's class, for candidates of a wrong shape and if it has evaluated none.
+    """
+    try:
+        optimizer.optimize(problem, samples)
+        return problem.pop_candidates()
+    except OptimizerError as error:
+        raise OptimizerError(f"optimizer {type(optimizer).__name__}: {error}") from error
 
 
 def summary(candidates: Candidates, best: Tensor) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 
 from cavin_pyro.planning.checks import OptimizerError
-from cavin_pyro.planning.optimizers.base import Optimizer, samples_of_iteration, search
+from cavin_pyro.planning.optimizers.base import Optimizer, samples_of_iteration
 from cavin_pyro.planning.optimizers.cem import CEM, ICEM
 from cavin_pyro.planning.optimizers.evolution import Evolution
 from cavin_pyro.planning.optimizers.mppi import MPPI
@@ -25,7 +25,6 @@ __all__ = [
     "Optimizer",
     "Shooting",
     "make_optimizer",
-    "search",
 ]
 
 OPTIMIZERS: dict[str, type[Optimizer]] = {

@@ -7,8 +7,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from torch import Tensor
 
 from cavin_pyro.planning import records
-from cavin_pyro.planning.checks import OptimizerError
-from cavin_pyro.planning.rollout import Candidates, SearchProblem
+from cavin_pyro.planning.rollout import SearchProblem
 
 
 @runtime_checkable
@@ -23,18 +22,6 @@ class Optimizer(Protocol):
         only randomness to use. The planner chooses the best of all candidates that were evaluated, so this method
         returns nothing.
         """
-
-
-def search(optimizer: Optimizer, problem: SearchProblem, samples: int) -> Candidates:
-    """All whole candidates `[B, n]` that the optimizer has evaluated.
-
-    Raises OptimizerError, naming the optimizer's class, for candidates of a wrong shape and if it has evaluated none.
-    """
-    try:
-        optimizer.optimize(problem, samples)
-        return problem.pop_candidates()
-    except OptimizerError as error:
-        raise OptimizerError(f"optimizer {type(optimizer).__name__}: {error}") from error
 
 
 class Population(NamedTuple):

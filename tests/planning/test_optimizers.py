@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.planning import CavinPlanner
-from cavin_pyro.planning.optimizers import OPTIMIZERS, make_optimizer, search
+from cavin_pyro.planning.optimizers import OPTIMIZERS, make_optimizer
 from cavin_pyro.planning.optimizers.cem import coloured
 from cavin_pyro.planning.returns import CumulativeReward
 from cavin_pyro.planning.rollout import Candidates, SearchProblem
+from cavin_pyro.planning.searching import search
 
 TOP = (0.8, -0.6)
 SAMPLES = 512

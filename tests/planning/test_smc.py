@@ -12,11 +12,12 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
-from cavin_pyro.planning.optimizers import SMC, search
+from cavin_pyro.planning.optimizers import SMC
 from cavin_pyro.planning.optimizers.smc import active_returns
 from cavin_pyro.planning.protocol import Evidence, SegmentRollout
 from cavin_pyro.planning.returns import CumulativeReward
 from cavin_pyro.planning.rollout import Candidates, SearchProblem
+from cavin_pyro.planning.searching import search
 
 TOP = (0.8, -0.6)
 SEGMENTS = 3
