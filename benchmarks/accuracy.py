@@ -30,9 +30,9 @@ from pyro import poutine
 
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene, pushing_policy
 from cavin_pyro.data.features import cloud_features
-from cavin_pyro.envs.observation import Observation
 from cavin_pyro.envs.randomness import collection_streams
-from cavin_pyro.envs.scene import FALLEN, Scene
+from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.scene import FALLEN, Scene
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.checkpoint import load
 from cavin_pyro.storage.files import atomic_write

@@ -27,7 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.data.observed import observed_state
-from cavin_pyro.envs.tasks import TaskReward
+from cavin_pyro.envs.tabletop.tasks import TaskReward
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import MpcPlanner, Planner, PlanningModel, Reward

@@ -2,12 +2,14 @@
 
 import gymnasium
 
-from cavin_pyro.envs.tasks import TASKS
+from cavin_pyro.envs.tabletop.tasks import TASKS
 
 for _name in TASKS:
     gymnasium.register(
-        id=f"cavin/{_name.capitalize()}-v0", entry_point="cavin_pyro.envs.pushing:PushingEnv", kwargs={"task": _name}
+        id=f"cavin/{_name.capitalize()}-v0",
+        entry_point="cavin_pyro.envs.tabletop.pushing:PushingEnv",
+        kwargs={"task": _name},
     )
 gymnasium.register(
-    id="cavin/Pushing-v0", entry_point="cavin_pyro.envs.pushing:PushingEnv"
+    id="cavin/Pushing-v0", entry_point="cavin_pyro.envs.tabletop.pushing:PushingEnv"
 )  # with PushingEnv's arguments

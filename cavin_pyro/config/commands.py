@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cavin_pyro.config.options import option, preset_defaults, seed_option
-from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.pushing import PushingEnv
-from cavin_pyro.envs.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
-from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
+from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
+from cavin_pyro.envs.tabletop.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
+from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
 
 CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
     **dict.fromkeys(("cavin", "kinect", "held_out", "contact"), ("cascaded", "cascaded")),
@@ -34,7 +34,7 @@ CRITERION = "which violations end an episode: those of the paper's text, or of i
 HELD_OUT = "names of objects, [mug,banana]; training omits what shows one of them"
 PRECISION = "precision of the factors of matrix products; bfloat16 is TF32 on a GPU"
 TRUST = "modules of your own whose classes the checkpoint may name"
-ENVS, REPRODUCE = "cavin_pyro.envs", "cavin_pyro.reproduction"  # where the choices of options are listed
+ENVS, REPRODUCE = "cavin_pyro.envs.tabletop", "cavin_pyro.reproduction"  # where the choices of options are listed
 PRECISIONS = "cavin_pyro.config.device.MATMUL_PRECISIONS"
 
 

@@ -12,11 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import construct
-from cavin_pyro.envs.layouts import task_class
-from cavin_pyro.envs.objects.object_sets import chosen, load_object_set, plain_name
-from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.robots import robot_factory
-from cavin_pyro.envs.tasks import Task
+from cavin_pyro.envs.tabletop.layouts import task_class
+from cavin_pyro.envs.tabletop.objects.object_sets import chosen, load_object_set, plain_name
+from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
+from cavin_pyro.envs.tabletop.robots import robot_factory
+from cavin_pyro.envs.tabletop.tasks import Task
 
 LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
     "scale": (0.1, 10.0),
@@ -40,7 +40,7 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
         section: Any = OmegaConf.to_container(config.task)
         kind = get_class(section.pop("_target_"))
         if not issubclass(kind, Task):
-            raise ValueError(f"{kind.__name__} is no task: derive it from cavin_pyro.envs.tasks.Task")
+            raise ValueError(f"{kind.__name__} is no task: derive it from cavin_pyro.envs.tabletop.tasks.Task")
     return kind, tiles | {name: value for name, value in section.items() if value is not None}
 
 
@@ -66,10 +66,10 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
 
 
 def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:
-    """The part of the world that the option `env.<name>` names, ready for `cavin_pyro.envs.pushing.PushingEnv`.
+    """The part of the world that the option `env.<name>` names, ready for `PushingEnv`.
 
-    An object set or a sensor of the user's is built; of robots and segmenters it is a factory, which gets the world
-    (`cavin_pyro.envs.physics.PhysicsWorld`) or M, the most objects. A name of a camera or of a segmentation stays one.
+    An object set or a sensor of the user's is built; of robots and segmenters it is a factory, which gets
+    the `PhysicsWorld` or M, the most objects. A name of a camera or of a segmentation stays one.
     An unknown name, missing files, or a class that cannot be built is a `UserError`.
     """
     made: Any = value if isinstance(value, str) else partial(construct, dict(value))

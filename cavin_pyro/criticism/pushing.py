@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.criticism.windows import GeneratedWindow
-from cavin_pyro.envs.workspace import push_endpoints
+from cavin_pyro.envs.tabletop.workspace import push_endpoints
 
 MOVED = 0.01  # metres; an object that moves farther counts as moved
 CLOSE_PAIR_SHARE = 0.01  # of the real windows with two objects or more

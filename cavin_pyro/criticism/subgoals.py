@@ -24,9 +24,9 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
 from cavin_pyro.data.collection import clutter_area, open_scene
 from cavin_pyro.data.observed import observed_state
-from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.observation import Observation
-from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
+from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.returns import best_of, squared_distance

@@ -21,12 +21,12 @@ from cavin_pyro.config.world import object_ranges, part_of
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
-from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
-from cavin_pyro.envs.observation import Observation
-from cavin_pyro.envs.policy import HeuristicPushingPolicy
 from cavin_pyro.envs.randomness import collection_streams
-from cavin_pyro.envs.scene import PushReport, Scene
-from cavin_pyro.envs.workspace import POINTS_PER_OBJECT, object_slots
+from cavin_pyro.envs.tabletop.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
+from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy
+from cavin_pyro.envs.tabletop.scene import PushReport, Scene
+from cavin_pyro.envs.tabletop.workspace import POINTS_PER_OBJECT, object_slots
 from cavin_pyro.launching.launcher import Launcher, as_launcher
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry

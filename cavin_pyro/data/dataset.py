@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, object_slots
+from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, object_slots
 from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write_json
 
 FORMAT = "cavin_pyro episodes"

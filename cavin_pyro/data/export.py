@@ -19,7 +19,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.envs.workspace import POINTS_PER_OBJECT
+from cavin_pyro.envs.tabletop.workspace import POINTS_PER_OBJECT
 from cavin_pyro.storage.files import output_folder
 from cavin_pyro.storage.progress import progress_bar
 
@@ -101,7 +101,7 @@ def environment_of(metadata: Mapping[str, Any]) -> EnvSpec | None:
             return None
     return EnvSpec(
         id="cavin/Pushing-v0",
-        entry_point="cavin_pyro.envs.pushing:PushingEnv",  # which Gymnasium imports, so that nobody needs to
+        entry_point="cavin_pyro.envs.tabletop.pushing:PushingEnv",  # which Gymnasium imports, so that nobody needs to
         kwargs={
             "objects": made.get("maximum_objects", dataset.slots_of(metadata)),
             "maximum_steps": made["steps"],

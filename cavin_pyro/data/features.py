@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.envs.objects.object_sets import listed, plain_name
+from cavin_pyro.envs.tabletop.objects.object_sets import listed, plain_name
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.storage.files import clear_abandoned
 

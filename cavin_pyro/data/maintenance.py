@@ -14,7 +14,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import shown
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.envs.workspace import MAXIMUM_OBJECTS
+from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS
 from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
 

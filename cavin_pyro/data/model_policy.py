@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from cavin_pyro.config.device import one_thread
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.envs.observation import Observation
-from cavin_pyro.envs.policy import Intent
+from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.policy import Intent
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning.additions.touchdown import Touchdown

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW
+from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions.touchdown import ObservedPoints
@@ -22,7 +22,7 @@ def observed_state(
     """The planner's state, a batch of one, from an observation, without needless padding.
 
     Args:
-        observation: `centers`, `clouds` and `mask` of `cavin_pyro.envs.observation.Observation`, [M, ...].
+        observation: `centers`, `clouds` and `mask` of `cavin_pyro.envs.tabletop.observation.Observation`, [M, ...].
         device: of the state; `geometry` is on the CPU.
 
     Raises:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavin_pyro.data.dataset import Arrays, iterate_shards
-from cavin_pyro.envs.scene import MOVED
-from cavin_pyro.envs.workspace import OBJECT_SLOTS, TABLE_HIGH, TABLE_LOW, push_endpoints
+from cavin_pyro.envs.tabletop.scene import MOVED
+from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, TABLE_HIGH, TABLE_LOW, push_endpoints
 
 SEGMENT = 3  # pushes; T of the paper
 DISTANCES = np.linspace(0.0, 0.30, 61)  # metres, edges of the histograms; what is farther counts in the last bin

@@ -20,10 +20,10 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import About, check_value
 from cavin_pyro.config.parts import check_sizes, class_of, construct
 from cavin_pyro.config.world import object_ranges, part_of, task_of
-from cavin_pyro.envs.layouts import GENERATED
-from cavin_pyro.envs.pushing import PushingEnv
-from cavin_pyro.envs.tasks import GeneratedLayouts, Task, TaskReward
-from cavin_pyro.envs.workspace import OBJECT_SLOTS, PUSH_DECIMALS
+from cavin_pyro.envs.tabletop.layouts import GENERATED
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
+from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts, Task, TaskReward
+from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, PUSH_DECIMALS
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from cavin_pyro.config.commands import PlanConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.envs.objects.sampling import NoRoomError
-from cavin_pyro.envs.pushing import ObservationDict, PushingEnv
 from cavin_pyro.envs.randomness import planner_seed
-from cavin_pyro.envs.tasks import Task, TaskReward
-from cavin_pyro.envs.workspace import PUSH_DECIMALS, executed_push
+from cavin_pyro.envs.tabletop.objects.sampling import NoRoomError
+from cavin_pyro.envs.tabletop.pushing import ObservationDict, PushingEnv
+from cavin_pyro.envs.tabletop.tasks import Task, TaskReward
+from cavin_pyro.envs.tabletop.workspace import PUSH_DECIMALS, executed_push
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.robots.robot import STICK_URDF, WEIGHTLESS
+from cavin_pyro.envs.tabletop.robots.robot import STICK_URDF, WEIGHTLESS
 from cavin_pyro.fetching.install import Files, take
 from cavin_pyro.fetching.meshes import decimated, read_mesh
 

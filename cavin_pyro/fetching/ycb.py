@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.objects.shapes import RECIPES
+from cavin_pyro.envs.tabletop.objects.shapes import RECIPES
 from cavin_pyro.fetching import meshes
 from cavin_pyro.fetching.install import Files, take
 from cavin_pyro.storage.files import read_json, write_json

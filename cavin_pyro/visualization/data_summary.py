@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from cavin_pyro.data.summary import CELL, DISTANCES, SEGMENT, DataSummary
-from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
 
 ONE, SEVERAL = "#0072B2", "#D55E00"

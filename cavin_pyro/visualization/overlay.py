@@ -10,8 +10,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.tasks import Task
-from cavin_pyro.envs.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, push_endpoints, tile_center
+from cavin_pyro.envs.tabletop.tasks import Task
+from cavin_pyro.envs.tabletop.workspace import (
+    TABLE_CENTER,
+    TABLE_HIGH,
+    TABLE_LOW,
+    TILE_SIDE,
+    Tile,
+    push_endpoints,
+    tile_center,
+)
 from cavin_pyro.evaluation.rollout import PlanRecord
 
 Pixels = NDArray[np.float64]  # [..., 2]

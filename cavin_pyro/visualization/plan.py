@@ -20,11 +20,11 @@ from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.markings import PLACE_RADIUS
-from cavin_pyro.envs.scene import COLORS
-from cavin_pyro.envs.sensors.camera import Camera
-from cavin_pyro.envs.tasks import Task
-from cavin_pyro.envs.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.tabletop.markings import PLACE_RADIUS
+from cavin_pyro.envs.tabletop.scene import COLORS
+from cavin_pyro.envs.tabletop.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.tasks import Task
+from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord
 from cavin_pyro.visualization.overlay import (
     OBSTACLE_COLOR,

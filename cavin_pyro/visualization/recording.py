@@ -16,11 +16,11 @@ import rerun.blueprint as rrb
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.markings import PLACE_RADIUS
-from cavin_pyro.envs.pushing import ObservationDict, PushingEnv
-from cavin_pyro.envs.scene import COLORS
-from cavin_pyro.envs.tasks import Task
-from cavin_pyro.envs.workspace import TILE_SIDE, tile_center
+from cavin_pyro.envs.tabletop.markings import PLACE_RADIUS
+from cavin_pyro.envs.tabletop.pushing import ObservationDict, PushingEnv
+from cavin_pyro.envs.tabletop.scene import COLORS
+from cavin_pyro.envs.tabletop.tasks import Task
+from cavin_pyro.envs.tabletop.workspace import TILE_SIDE, tile_center
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.evaluation.statistics import counted
 from cavin_pyro.storage.files import atomic_write

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.goals import SUFFIXES, save_goal
-from cavin_pyro.envs.pushing import ObservationDict
-from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.tabletop.goals import SUFFIXES, save_goal
+from cavin_pyro.envs.tabletop.pushing import ObservationDict
+from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition

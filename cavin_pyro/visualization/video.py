@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from cavin_pyro.envs.pushing import VIDEO_SIZE, ObservationDict, PushingEnv
-from cavin_pyro.envs.tasks import Task
+from cavin_pyro.envs.tabletop.pushing import VIDEO_SIZE, ObservationDict, PushingEnv
+from cavin_pyro.envs.tabletop.tasks import Task
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_overlay, return_scale

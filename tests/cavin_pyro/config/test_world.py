@@ -10,10 +10,10 @@ from omegaconf import OmegaConf
 from cavin_pyro.config.composition import PRESETS, compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.world import object_ranges, task_of
-from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
-from cavin_pyro.envs.tasks import TASKS
-from cavin_pyro.envs.tasks.insertion import Insertion
+from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
+from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.tabletop.tasks import TASKS
+from cavin_pyro.envs.tabletop.tasks.insertion import Insertion
 
 PUBLISHED = ObjectRanges(mass=(1.0, 1.0), kilograms=(10.0, 10.0), friction=(0.8, 0.8), target=("mug",), drop_height=0.2)
 

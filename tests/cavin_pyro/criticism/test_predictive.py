@@ -15,7 +15,7 @@ from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.criticism.predictive import assess_predictive, compare, effect_size, replicate
 from cavin_pyro.criticism.pushing import Nearness, statistics_of
 from cavin_pyro.criticism.windows import GeneratedWindow, generated, observed, seeded
-from cavin_pyro.envs.workspace import normalised_push
+from cavin_pyro.envs.tabletop.workspace import normalised_push
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.state import State, Window
 

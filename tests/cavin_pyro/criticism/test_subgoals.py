@@ -26,9 +26,9 @@ from cavin_pyro.criticism.subgoals import (
     subgoal_rollouts,
 )
 from cavin_pyro.data.collection import CollectionConfig
-from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.policy import HeuristicPushingPolicy
-from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
+from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy
+from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.models.state import State
 

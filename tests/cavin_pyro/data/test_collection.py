@@ -14,9 +14,9 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.collection import collect, collect_episode, repair
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_metadata
 from cavin_pyro.data.summary import summarize_data
-from cavin_pyro.envs.objects.sampling import ObjectRanges
-from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
-from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
+from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.visualization.data_summary import draw_data
 
 

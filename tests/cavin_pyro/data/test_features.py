@@ -12,7 +12,7 @@ from cavin_pyro.data import features
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.features import cloud_features, geometry_fingerprint, sample_clouds, shard_features
 from cavin_pyro.data.observed import observed_state
-from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.models.networks.pointnet import PointNet
 
 

@@ -15,9 +15,9 @@ from cavin_pyro.data.collection import check_policy, collect
 from cavin_pyro.data.dataset import read_shard, shard_path
 from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
 from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.envs.objects.sampling import WHOLE_TABLE, ObjectRanges
-from cavin_pyro.envs.observation import Observation
-from cavin_pyro.envs.scene import Scene
+from cavin_pyro.envs.tabletop.objects.sampling import WHOLE_TABLE, ObjectRanges
+from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning.rollout import predict_states

@@ -6,7 +6,7 @@ import numpy as np
 
 from cavin_pyro.data.dataset import Arrays, read_metadata, read_shard, shard_path
 from cavin_pyro.data.summary import CELL, DISTANCES, DataSummary, summarize_data
-from cavin_pyro.envs.workspace import TABLE_LOW, normalised_push
+from cavin_pyro.envs.tabletop.workspace import TABLE_LOW, normalised_push
 
 PLACE = (0.50, 0.10)  # metres
 

@@ -14,8 +14,8 @@ import torch
 import cavin_pyro
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_state
-from cavin_pyro.envs.pushing import PushingEnv
-from cavin_pyro.envs.workspace import executed_push
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
+from cavin_pyro.envs.tabletop.workspace import executed_push
 from cavin_pyro.evaluation.evaluation import episode_row, run_missing
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, Episode, EpisodeCallback, PlanRecord, Transition

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from cavin_pyro.config.commands import WorldConfig
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import options
-from cavin_pyro.envs.tasks import TASKS
+from cavin_pyro.envs.tabletop.tasks import TASKS
 from cavin_pyro.evaluation.factory import make_runner
 from tests.real_assets import REAL_ASSETS
 

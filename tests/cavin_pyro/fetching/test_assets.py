@@ -18,9 +18,9 @@ import pytest
 import trimesh
 
 from cavin_pyro.assets import main
-from cavin_pyro.envs.objects.object_sets import load_object_set
-from cavin_pyro.envs.objects.shapes import BUILTIN_NAMES, RECIPES
-from cavin_pyro.envs.robots.robot import STICK_LENGTH
+from cavin_pyro.envs.tabletop.objects.object_sets import load_object_set
+from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES, RECIPES
+from cavin_pyro.envs.tabletop.robots.robot import STICK_LENGTH
 from cavin_pyro.fetching.meshes import closed, convex_parts
 from cavin_pyro.fetching.sawyer import COMMIT, PACKAGE, SawyerRobot
 from cavin_pyro.fetching.ycb import SCANS, YcbObjects

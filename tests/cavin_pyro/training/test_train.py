@@ -15,8 +15,8 @@ from torch import nn
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
-from cavin_pyro.envs.sensors.camera import Camera
-from cavin_pyro.envs.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.tabletop.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.guides.automatic import AutomaticGuide
 from cavin_pyro.guides.cascaded import CascadedGuide

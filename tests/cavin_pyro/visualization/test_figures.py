@@ -11,9 +11,9 @@ import torch
 from matplotlib import colors
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.layouts import load_task
-from cavin_pyro.envs.scene import COLORS
-from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.layouts import load_task
+from cavin_pyro.envs.tabletop.scene import COLORS
+from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord, Transition
 from cavin_pyro.models.networks.pointnet import PointNetAutoencoder
 from cavin_pyro.models.state import State

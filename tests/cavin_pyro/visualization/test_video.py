@@ -6,8 +6,8 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.pushing import VIDEO_SIZE, PushingEnv
-from cavin_pyro.envs.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.pushing import VIDEO_SIZE, PushingEnv
+from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.evaluation.rollout import rollout
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import RandomPlanner

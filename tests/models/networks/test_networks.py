@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.envs.robots.robot import STICK_RADIUS
-from cavin_pyro.envs.workspace import TABLE_CENTER as CENTER
+from cavin_pyro.envs.tabletop.robots.robot import STICK_RADIUS
+from cavin_pyro.envs.tabletop.workspace import TABLE_CENTER as CENTER
 from cavin_pyro.models.networks.contact.geometry import TOOL_RADIUS
 from cavin_pyro.models.networks.dynamics import (
     PUSH_RANGE,

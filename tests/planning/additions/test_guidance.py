@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cavin_pyro.envs.layouts import parse_task
-from cavin_pyro.envs.tasks import TaskReward
-from cavin_pyro.envs.workspace import tile_center
+from cavin_pyro.envs.tabletop.layouts import parse_task
+from cavin_pyro.envs.tabletop.tasks import TaskReward
+from cavin_pyro.envs.tabletop.workspace import tile_center
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner, CvaeMpcPlanner
 from cavin_pyro.planning.additions.guidance import GuidedReturn, GuidedTracking

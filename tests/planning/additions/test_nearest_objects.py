@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.envs.layouts import load_task
-from cavin_pyro.envs.tasks import TaskReward
+from cavin_pyro.envs.tabletop.layouts import load_task
+from cavin_pyro.envs.tabletop.tasks import TaskReward
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.additions import NearestObjects

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from cavin_pyro.data.observed import observed_points
-from cavin_pyro.envs.pushing import PushingEnv
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner, MpcPlanner
 from cavin_pyro.planning.additions import ObservedPoints, Touchdown

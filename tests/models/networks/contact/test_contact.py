@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cavin_pyro.envs.workspace import push_endpoints
+from cavin_pyro.envs.tabletop.workspace import push_endpoints
 from cavin_pyro.models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
 from cavin_pyro.models.networks.contact.geometry import (
     CARRIED,

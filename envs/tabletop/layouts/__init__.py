@@ -1,0 +1,189 @@
+"""Layouts: files that list the tiles of a task's fields.
+
+`TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout.
+
+    task: crossing            # optional
+    region: [[2, 2], [2, 3]]  # the fields of `cavin_pyro.envs.tabletop.tasks.crossing.Crossing`
+    goal: [[2, 2]]
+    target_start: [[2, 3]]
+    obstacle_start: [[1, 3]]
+
+Source of the layouts of the paper's three tasks: appendix "Task Details"; the published implementation.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import yaml
+
+from cavin_pyro.envs.tabletop.tasks import TASKS, GeneratedLayouts, Task
+from cavin_pyro.envs.tabletop.tasks.reach import check_reach
+from cavin_pyro.envs.tabletop.tasks.tiles import TileSet
+
+RANDOM, GENERATED = "random", "generated"
+_FOLDER = Path(__file__).parent
+
+
+def task_class(task: str | type[Task]) -> type[Task]:
+    """The class of a task, by its name; a class is returned unchanged.
+
+    Raises:
+        ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
+    """
+    if isinstance(task, str):
+        if task not in TASKS:
+            raise ValueError(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
+        return TASKS[task]
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        raise ValueError(f"{task!r} is no task: derive it from cavin_pyro.envs.tabletop.tasks.Task")
+    if task.__abstractmethods__:
+        raise ValueError(f"task {task.__name__} lacks {' and '.join(sorted(task.__abstractmethods__))}")
+    known = {field.name for field in fields(task)}
+    annotated = inspect.get_annotations(task)
+    if any(name not in known and "ClassVar" not in str(hint) for name, hint in annotated.items()):
+        raise ValueError(f"decorate {task.__name__} with @dataclass(frozen=True, kw_only=True)")
+    return task
+
+
+def layout_numbers(task: str | type[Task]) -> tuple[int, ...]:
+    """The layouts of a task in this folder."""
+    prefix = f"{task_class(task).name}_"
+    numbers = [path.stem.removeprefix(prefix) for path in _FOLDER.glob(f"{prefix}*.yaml")]
+    return tuple(sorted(int(number) for number in numbers if number.isdecimal()))
+
+
+def possible_tasks(
+    task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None
+) -> tuple[Task, ...]:
+    """A task in each of the layouts that an episode may have, equally likely: one, or several for `layout=random`.
+
+    Args:
+        task, layout, tiles: as in `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
+            in this folder. All get the fields of `tiles` that are no lists of tiles, such as `clearance`.
+
+    Raises:
+        ValueError: as `load_task`, or tiles for `layout=random`.
+    """
+    if layout != RANDOM:
+        return (load_task(task, layout, tiles),)
+    options, kind = _options(task, RANDOM, tiles), task_class(task)
+    sampled = tuple(replace(one, **options) for one in kind.random_layouts())
+    sampled = sampled or tuple(load_task(kind, number, options) for number in layout_numbers(kind))
+    if not sampled:
+        raise ValueError(f"task {kind.name} has no layouts to sample from: give layout=FILE.yaml, not random")
+    return sampled
+
+
+def generate_task(
+    task: str | type[Task],
+    wanted: GeneratedLayouts,
+    generator: np.random.Generator | None = None,
+    tiles: Mapping[str, Any] | None = None,
+) -> Task:
+    """A task in a generated layout: that of `wanted.seed`, or without one a new one.
+
+    Args:
+        generator: for a new one; None generates that of seed 0. tiles: fields that are no lists of tiles, as in
+            `possible_tasks`.
+
+    Raises:
+        ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
+    """
+    options = _options(task, GENERATED, tiles)
+    if wanted.seed is not None or generator is None:
+        generator = np.random.default_rng(wanted.seed or 0)
+    generated = task_class(task).generate(wanted, generator)
+    return replace(generated, **options) if options else generated
+
+
+def _options(task: str | type[Task], layout: str, tiles: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The fields given for a task in layouts that are sampled or generated, of which none may be a list of tiles."""
+    given = {name: value for name, value in (tiles or {}).items() if value is not None}
+    kinds = get_type_hints(task_class(task))
+    if any(kinds.get(name, TileSet) is TileSet for name in given):
+        numbers = ", ".join(map(str, layout_numbers(task)))
+        raise ValueError(f"tiles replace fields of one layout: give layout={numbers} or a YAML file, not {layout}")
+    return given
+
+
+def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None) -> Task:
+    """A task in one of its layouts, or in that of a YAML file.
+
+    Args:
+        task: a name in `TASKS`, or a class. layout: a number, or the path of a YAML file.
+        tiles: fields that replace those of the layout; None values are ignored.
+
+    Raises:
+        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, tiles that contradict the
+            task, or a start from which no pushes lead to the goal.
+    """
+    kind = task_class(task)
+    path = _path(kind, layout)
+    content = _read(path, kind)
+    declared = content.pop("task", kind.name)
+    if declared != kind.name:
+        if declared not in tuple(TASKS):
+            raise ValueError(f"layout {path}: unknown task {declared!r}, choose from {', '.join(TASKS)}")
+        raise ValueError(f"layout {path} is for task {declared}: run it with task={declared}")
+    overrides = {name: value for name, value in (tiles or {}).items() if value is not None}
+    where = f"layout {path} with overrides" if overrides else f"layout {path}"
+    made = parse_task(kind, content | overrides, where=where)
+    try:
+        if kind in TASKS.values():  # a user's task may need more than one object
+            check_reach(made)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    return made
+
+
+def parse_task(task: str | type[Task], content: Mapping[str, Any], *, where: str = "layout") -> Task:
+    """A task in the layout that `content`, lists of tiles by field, describes.
+
+    Raises:
+        ValueError: a key is unknown or missing, or tiles contradict the task; the message begins with `where`.
+    """
+    kind = task_class(task)
+    keys = kind.layout_keys()
+    unknown = sorted(set(content) - set(keys), key=str)
+    if unknown:
+        raise ValueError(f"{where}: unknown key {unknown[0]!r}, valid keys are {', '.join(('task', *keys))}")
+    missing = [name for name, required in keys.items() if required and name not in content]
+    if missing:
+        raise ValueError(f"{where}: the key {missing[0]!r} is missing")
+    try:
+        return kind(**content)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _path(kind: type[Task], layout: int | str | Path) -> Path:
+    name = str(layout)
+    if not name.isdecimal():
+        return Path(name)
+    if int(name) not in layout_numbers(kind):
+        raise ValueError(f"unknown layout {name}: choose {_choices(kind)}")
+    return _FOLDER / f"{kind.name}_{int(name)}.yaml"
+
+
+def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"layout {path} cannot be read ({error.strerror}): give {_choices(kind)}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"layout {path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"layout {path} must hold the keys {', '.join(kind.layout_keys())}")
+    return content
+
+
+def _choices(kind: type[Task]) -> str:
+    """`0, 1, 2, random or the path of a YAML file`, as far as the task has them."""
+    names = [*(str(number) for number in layout_numbers(kind)), RANDOM, GENERATED]
+    return f"{', '.join(names)} or the path of a YAML file" if len(names) > 2 else "the path of a YAML file"

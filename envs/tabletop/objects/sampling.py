@@ -1,0 +1,134 @@
+"""Sampling of objects: shapes, sizes, masses, friction and poses.
+
+Source: paper section 4.1 and the published implementation (what is randomised per object).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cavin_pyro.envs.tabletop.objects.object_sets import BUILTIN, ObjectSet, chosen
+from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
+
+ATTEMPTS = 400  # arrangements sampled before an area counts as too small
+
+
+class NoRoomError(ValueError):
+    """A layout has no room for the objects of a scene, at least of this one."""
+
+
+@dataclass(frozen=True)
+class ObjectRanges:
+    """Ranges from which object parameters are sampled, uniformly.
+
+    Attributes:
+        names: objects to choose from. scale: factor on size. mass: factor on the published mass.
+        friction: Coulomb coefficient against the table.
+        clearance: metres between neighbouring centres at the start.
+        kilograms: mass of every object, instead of the factor.
+        target: names for the first object, the target, instead of `names`.
+        drop_height: metres above the table from which centres fall, at least; 0 means just above the table.
+    """
+
+    names: tuple[str, ...] = BUILTIN_NAMES
+    scale: tuple[float, float] = (0.8, 1.2)
+    mass: tuple[float, float] = (0.5, 2.0)
+    friction: tuple[float, float] = (0.5, 0.9)
+    clearance: float = 0.15
+    kilograms: tuple[float, float] | None = None
+    target: tuple[str, ...] = ()
+    drop_height: float = 0.0
+
+
+@dataclass(frozen=True)
+class ObjectParameters:
+    """One sampled object: its shape and parameters, and the pose from which it is dropped.
+
+    Attributes:
+        name: in its set. scale: factor. mass: kilograms. friction: coefficient.
+        position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
+    """
+
+    name: str
+    scale: float
+    mass: float
+    friction: float
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+
+
+Area = Sequence[tuple[tuple[float, float], tuple[float, float]]]
+"""A union of rectangles, each ((low x, low y), (high x, high y)) in metres."""
+
+WHOLE_TABLE: Area = (((TABLE_LOW[0] + 0.1, TABLE_LOW[1] + 0.1), (TABLE_HIGH[0] - 0.1, TABLE_HIGH[1] - 0.1)),)
+
+
+def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Planar positions [M, 2] in metres, one in each area, no two closer than `clearance`.
+
+    Raises:
+        NoRoomError: no arrangement was found.
+    """
+    for _ in range(ATTEMPTS):
+        chosen: list[NDArray[np.float64]] = []
+        for area in areas:
+            points = [generator.uniform(*area[int(generator.integers(len(area)))]) for _ in range(20)]
+            free = [one for one in points if all(np.linalg.norm(one - other) >= clearance for other in chosen)]
+            if not free:
+                break
+            chosen.append(free[0])
+        if len(chosen) == len(areas):
+            return np.stack(chosen)
+    raise NoRoomError(
+        f"no room for {len(areas)} objects at least {clearance:g} m apart where the layout starts them: "
+        "use fewer objects, more start tiles, or a smaller env.ranges.clearance"
+    )
+
+
+def sample_objects(
+    areas: Sequence[Area],
+    ranges: ObjectRanges,
+    generator: np.random.Generator,
+    objects: ObjectSet = BUILTIN,
+) -> list[ObjectParameters]:
+    """Sample one object per area, in random orientation, above the table and clear of its neighbours.
+
+    Args:
+        areas: start area of each object; the first is the target. objects: the set of the names.
+
+    Raises:
+        NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
+    """
+    names = chosen(ranges.names, objects)
+    targets = chosen(ranges.target, objects) or names
+    positions = arrange(areas, ranges.clearance, generator)
+    orientations = Rotation.random(len(areas), random_state=generator).as_quat()
+    sampled: list[ObjectParameters] = []
+    circles: list[tuple[NDArray[np.float64], float, float]] = []  # planar centre, radius, top
+    for position, orientation in zip(positions, orientations, strict=True):
+        choices = names if sampled else targets
+        asset = objects.asset(choices[generator.integers(len(choices))])
+        scale = generator.uniform(*ranges.scale)
+        radius = scale * asset.radius
+        # Long neighbours may overlap in the plan view: the later one is then dropped from above the earlier one.
+        below = [top for center, other, top in circles if np.linalg.norm(position - center) < radius + other]
+        height = max(max([0.005, *(top + 0.005 for top in below)]) + radius, ranges.drop_height)
+        circles.append((position, radius, height + radius))
+        mass = generator.uniform(*(ranges.kilograms or ranges.mass))
+        sampled.append(
+            ObjectParameters(
+                name=asset.name,
+                scale=float(scale),
+                mass=float(mass if ranges.kilograms else asset.mass * mass),
+                friction=float(generator.uniform(*ranges.friction)),
+                position=(float(position[0]), float(position[1]), float(height)),
+                orientation=tuple(float(value) for value in orientation),  # type: ignore[arg-type]
+            )
+        )
+    return sampled

@@ -1,0 +1,243 @@
+"""The Gymnasium environment: a scene, a task's reward, and the end of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cavin_pyro.envs.randomness import GOAL, LAYOUT, named_stream
+from cavin_pyro.envs.tabletop.layouts import GENERATED, generate_task, possible_tasks
+from cavin_pyro.envs.tabletop.objects.object_sets import ObjectSet, load_object_set, plain_name
+from cavin_pyro.envs.tabletop.objects.sampling import Area, ObjectRanges
+from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.physics import Uncopied
+from cavin_pyro.envs.tabletop.robots import RobotFactory
+from cavin_pyro.envs.tabletop.scene import Scene
+from cavin_pyro.envs.tabletop.segmentation import SegmenterFactory
+from cavin_pyro.envs.tabletop.sensors import DepthSensor
+from cavin_pyro.envs.tabletop.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
+from cavin_pyro.envs.tabletop.tasks.task import check_functions
+from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, object_slots, tile_center
+
+EPISODE_STEPS = 60
+TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
+OBSTACLE_JITTER = TILE_SIDE / 2  # metres; obstacles start anywhere on their tiles
+VIDEO_SIZE = (512, 424)  # pixels
+
+ObservationDict = dict[str, NDArray[Any]]
+
+
+class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
+    """Push objects on a table until a task's goal is reached, observed by a depth camera from above.
+
+    Observation: `clouds` [M, 256, 3] metres, `centers` [M, 3] metres, `mask` [M] (known objects, object 0 is
+    the target), `visible` [M] (objects in the current image). M is 5, or `objects` if there are more.
+    Action: one push (x, y, dx, dy) in [-1, 1].
+
+    `info` of a reset: `steps`, which is 0, and the episode's `task` in its layout and with its goal. `info` of a step:
+    `steps` so far, `unsafe` and `ineffective` pushes, `stopped` (why the robot ended the push early: "unreachable", not
+    begun; "blocked" by an obstacle; contact with the "table"; "" if it did not), `success`, `violation`, `fall`,
+    `terms`, the named terms of the reward, and `strict`, the same step by `criterion="strict"`: `success`, `violation`,
+    `fall` and `reward`. An episode terminates at success, violation or fall, and is truncated
+    after `maximum_steps`.
+
+    Args:
+        task, layout, tiles: see `possible_tasks` in `envs.tabletop.layouts`; `tiles` replaces fields of the layout.
+            `layout="random"` is sampled at every reset. A `Task` object has its own layout.
+        generated: what is wanted of `layout="generated"`, which is generated at every reset, unless it has a seed.
+        reward: dense or sparse. criterion: what ends an episode as a violation, see `TaskReward`. Scenes and
+            observations do not depend on it.
+        objects: how many, 1 to 10. ranges: object parameters, or a mapping of them, which JSON can hold.
+        robot: one of `cavin_pyro.envs.tabletop.robots.ROBOTS`, or a factory of robots.
+        object_set: a key of `cavin_pyro.envs.tabletop.objects.object_sets.OBJECT_SETS`, or a set.
+        camera, segmentation: see `cavin_pyro.envs.tabletop.scene.Scene`.
+        assets: folder of meshes, for robots and sets that need one.
+        maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table, and the
+            objects' places.
+
+    Raises:
+        ValueError: an argument is out of its range, a function of the user's task returns another type or shape than
+            `Task` documents, the layout has no room for the objects, or the robot's files are missing.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        *,
+        task: str | type[Task] | Task = "crossing",
+        layout: int | str | Path = 0,
+        tiles: Mapping[str, Any] | None = None,
+        generated: GeneratedLayouts | None = None,
+        reward: str = "sparse",
+        criterion: str = "strict",
+        objects: int = 3,
+        ranges: ObjectRanges | Mapping[str, Any] | None = None,
+        object_set: str | ObjectSet = "builtin",
+        assets: str | Path | None = None,
+        maximum_steps: int = EPISODE_STEPS,
+        camera: str | Camera | DepthSensor = "ideal",
+        segmentation: str | SegmenterFactory = "mask",
+        render_mode: str | None = None,
+        show_tiles: bool = True,
+        robot: str | RobotFactory = "stick",
+    ) -> None:
+        if objects not in range(1, MAXIMUM_OBJECTS + 1):
+            raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
+        if maximum_steps < 1:
+            raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        if not isinstance(show_tiles, bool):
+            raise ValueError(f"show_tiles must be True or False, not {show_tiles!r}")
+        if isinstance(task, Task) and (layout != 0 or tiles):
+            raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
+        self._generate: Callable[[np.random.Generator], Task] | None = None
+        if isinstance(task, Task):
+            self.tasks: tuple[Task, ...] = (task,)
+        elif layout == GENERATED:
+            wanted = generated or GeneratedLayouts()
+            self.tasks = (generate_task(task, wanted, None, tiles),)
+            self._generate = partial(generate_task, task, wanted, tiles=tiles)
+        else:
+            self.tasks = possible_tasks(task, layout, tiles)
+        if type(self.tasks[0]) not in TASKS.values():
+            check_functions(self.tasks[0], int(objects))
+        self._rules = reward, criterion
+        self._begin(self.tasks[0])
+        self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
+        self.show_tiles = show_tiles
+        available = load_object_set(object_set, assets)
+        named = ranges or {"names": tuple(dict.fromkeys(map(plain_name, available.names)))}
+        self.ranges = ObjectRanges(**named) if isinstance(named, Mapping) else named
+        slots = object_slots(self.objects)
+        self.scene = Scene(
+            camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets, slots=slots
+        )
+        shape = (slots, POINTS_PER_OBJECT, 3)
+        # Gymnasium declares that a Dict space's elements are spaces.
+        self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
+            {
+                "clouds": gymnasium.spaces.Box(-10.0, 10.0, shape, np.float32),
+                "centers": gymnasium.spaces.Box(-10.0, 10.0, (slots, 3), np.float32),
+                "mask": gymnasium.spaces.MultiBinary(slots),
+                "visible": gymnasium.spaces.MultiBinary(slots),
+            }
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self._observation: Observation | None = None
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObservationDict, dict[str, Any]]:
+        """Sample a layout, and a scene in which the episode has not already ended.
+
+        Args:
+            options: `layout`, the number of one of the environment's `tasks`, instead of a random one.
+
+        Raises:
+            ValueError: the layout has no room for the objects, or there is no layout of that number.
+        """
+        super().reset(seed=seed)
+        (scene_generator,) = self.np_random.spawn(1)
+        sampled = int(named_stream(scene_generator, LAYOUT).integers(len(self.tasks)))
+        number = (options or {}).get("layout", sampled)
+        if number not in range(len(self.tasks)):
+            raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
+        if self._generate is not None:
+            self.tasks = (self._generate(named_stream(scene_generator, LAYOUT)),)
+        self._begin(self.tasks[number])
+        target = _areas(self.task.target_start, TARGET_JITTER)
+        obstacle = _areas(self.task.obstacle_start, OBSTACLE_JITTER)
+        areas = [target, *[obstacle] * (self.objects - 1)]
+        can_start = partial(self._can_start, self.task, named_stream(scene_generator, GOAL))
+        self._observation = self.scene.sample(areas, self.ranges, scene_generator, acceptable=can_start)
+        self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
+        self.scene.places = self.task.object_places() if self.show_tiles else ()
+        self._steps = 0
+        return _as_dict(self._observation), {"steps": 0, "task": self.task}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
+        """Push, wait until the objects rest, observe them, and compute the reward.
+
+        Raises:
+            ValueError: the action is not four finite numbers.
+            RuntimeError: called before `reset`.
+        """
+        if self._observation is None:
+            raise RuntimeError("call reset() before step()")
+        report = self.scene.push(np.asarray(action))
+        observation = self.scene.observe()
+        outcome = _judged(self.reward, self._observation, observation, fallen=report.fallen)
+        strict = _judged(self._strict_reward, self._observation, observation, fallen=report.fallen)
+        terms = {name: float(term) for name, term in outcome.terms.items()}
+        self._observation = observation
+        self._steps += 1
+        info = {
+            "steps": self._steps,
+            "unsafe": report.unsafe,
+            "ineffective": report.ineffective,
+            "stopped": report.stopped,
+            **_ends(outcome),
+            "terms": terms,
+            "strict": {**_ends(strict), "reward": sum(float(term) for term in strict.terms.values())},
+        }
+        terminated = bool(outcome.success | outcome.failure)
+        truncated = not terminated and self._steps >= self.maximum_steps
+        return _as_dict(observation), sum(terms.values()), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a colour image of the table [424, 512, 3] in mode rgb_array."""
+        if self.render_mode != "rgb_array":
+            return None
+        return self.scene.photograph(self.scene.camera.resized(*VIDEO_SIZE))
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self.scene.close()
+
+    def _begin(self, task: Task) -> None:
+        """Use a task and its rewards."""
+        reward, criterion = self._rules
+        self.task, self.reward = task, TaskReward(task, reward=reward, criterion=criterion)
+        self._strict_reward = TaskReward(task, reward=reward)
+
+    def _can_start(self, layout: Task, generator: np.random.Generator, observation: Observation) -> bool:
+        """Take the task of the episode that would begin so; whether it has not already ended."""
+        task = layout.of_episode(observation, generator)
+        if task is not layout:
+            self._begin(task)
+        outcome = _judged(self._strict_reward, observation, observation)
+        return not bool(outcome.success | outcome.failure)
+
+
+def _judged(reward: TaskReward, before: Observation, after: Observation, *, fallen: bool = False) -> Outcome:
+    previous, centers = (torch.from_numpy(one.centers) for one in (before, after))
+    return reward(previous, centers, torch.from_numpy(after.mask), fallen=fallen)
+
+
+def _ends(outcome: Outcome) -> dict[str, bool]:
+    return {name: bool(getattr(outcome, name)) for name in ("success", "violation", "fall")}
+
+
+def _areas(tiles: TileSet, jitter: float) -> Area:
+    centers = [tile_center(tile) for tile in tiles]
+    return [((x - jitter, y - jitter), (x + jitter, y + jitter)) for x, y in centers]
+
+
+def _as_dict(observation: Observation) -> ObservationDict:
+    return {
+        "clouds": observation.clouds.copy(),  # a copy: changes by the caller must not affect the next step's reward
+        "centers": observation.centers.copy(),
+        "mask": observation.mask.astype(np.int8),
+        "visible": observation.visible.astype(np.int8),
+    }

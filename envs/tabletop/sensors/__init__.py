@@ -1,0 +1,34 @@
+"""Depth cameras by name."""
+
+from __future__ import annotations
+
+from cavin_pyro.envs.tabletop.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.sensors.kinect2 import Kinect2
+from cavin_pyro.envs.tabletop.sensors.sensor import (
+    DepthImage,
+    DepthSensor,
+    IdealSensor,
+    Renderer,
+    Rendering,
+    SensorFactory,
+)
+
+CAMERAS: dict[str, SensorFactory] = {"ideal": IdealSensor, "kinect2": Kinect2}
+
+
+def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:
+    """The sensor of that name, an ideal one for a camera's geometry, or the given sensor.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if isinstance(camera, Camera):
+        return IdealSensor(camera)
+    if not isinstance(camera, str):
+        return camera
+    if camera not in CAMERAS:
+        raise ValueError(f"unknown camera {camera!r}: choose from {', '.join(CAMERAS)}")
+    return CAMERAS[camera]()
+
+
+__all__ = ["CAMERAS", "DepthImage", "DepthSensor", "IdealSensor", "Kinect2", "Renderer", "Rendering", "sensor_of"]
