@@ -108,7 +108,7 @@ def _rate_after(step: int, rate: float, steps: int) -> float:
 
 
 def _augment(clouds: NDArray[np.float32], generator: np.random.Generator) -> Tensor:
-    turns = Rotation.from_euler("z", generator.uniform(-np.pi, np.pi, size=len(clouds))).as_matrix()
+    turns = Rotation.from_euler("z", generator.uniform(-np.pi, np.pi, size=(len(clouds), 1))).as_matrix()
     scale = generator.uniform(0.8, 1.25, size=(len(clouds), 1, 1))
     return torch.from_numpy((scale * clouds @ turns).astype(np.float32))
 

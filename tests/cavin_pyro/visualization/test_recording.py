@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,11 @@ def folder(rerun: Any, checkpoint_file: Path, tmp_path_factory: pytest.TempPathF
 
 
 def test_a_recording_holds_the_world_the_observations_and_the_plans(rerun: Any, folder: Path) -> None:
-    recording = rerun.dataframe.load_recording(folder / "episode.rrd")
+    path = folder / "episode.rrd"
+    if hasattr(rerun, "dataframe"):
+        recording = rerun.dataframe.load_recording(path)
+    else:  # later versions
+        recording = importlib.import_module("rerun.chunk").RrdReader(path).store()
     found = {(column.entity_path, column.component) for column in recording.schema().component_columns()}
     for name in ("target", "obstacle_1"):
         assert (f"/world/objects/{name}", "Transform3D:translation") in found
