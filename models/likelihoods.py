@@ -122,8 +122,8 @@ class LearnedScales(Scales, Part):
 
 
 def _check_positive(name: str, value: float) -> None:
-    if not 0 < value < float("inf"):
-        raise ValueError(f"scales.{name} must be positive, not {value:g}")
+    if not 1e-12 < value < 1e12:  # beyond, its square or a density overflows
+        raise ValueError(f"scales.{name} must be between 1e-12 and 1e12, not {value:g}")
 
 
 class Isotropic(TorchDistribution):

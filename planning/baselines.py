@@ -243,14 +243,12 @@ class RandomPlanner:
     ) -> Plan:
         """Sample `[B, T, 4]` pushes for the scenes `state: [B]`; without prediction or choice.
 
-        Raises ValueError unless there is one generator per environment.
+        Raises ValueError unless there are scenes, with a generator for each.
         """
         check_scenes(state, generators)
         environments, objects = state.mask.shape
         empty = state.centers.new_empty
-        actions = empty(0, self.segment_length, 4)
-        if environments:
-            actions = 2 * uniform_each((self.segment_length, 4), generators, state.centers.device) - 1
+        actions = 2 * uniform_each((self.segment_length, 4), generators, state.centers.device) - 1
         return Plan(
             actions=actions,
             planned_actions=actions,

@@ -79,9 +79,9 @@ def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
 def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
     """Raise ValueError unless `state` is a batch `[B]` with one generator per environment, on the CPU or its device."""
     centers = state.centers
-    if centers.ndim != 3 or centers.shape[-1] != 3 or state.mask.shape != centers.shape[:-1]:
+    if centers.ndim != 3 or centers.shape[-1] != 3 or state.mask.shape != centers.shape[:-1] or not len(centers):
         raise ValueError(
-            "a planner takes states with centers [B, M, 3] and mask [B, M], "
+            "a planner takes states of at least one scene, with centers [B, M, 3] and mask [B, M], "
             f"not {list(centers.shape)} and {list(state.mask.shape)}"
         )
     if state.features.ndim != 3 or state.features.shape[:-1] != centers.shape[:-1]:

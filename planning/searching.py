@@ -118,14 +118,14 @@ class SearchingPlanner:
             observed: what else the world shows, for additions: a named tuple of tensors `[B, ...]`.
 
         Raises:
-            ValueError: a state that is not a batch of scenes, another number of generators than B, or an environment
-                without a finite candidate, which is named.
+            ValueError: a state that is not a batch of at least one scene, another number of generators than B, or an
+                environment without a finite candidate, which is named.
         """
         check_scenes(state, generators)
         size, plans, reward = ENVIRONMENTS_ON_PROCESSOR, [], as_reward(reward)
         if state.centers.device.type != "cpu":
             size = max(1, PLANS_ON_ACCELERATOR // self.samples)
-        for start in range(0, max(len(generators), 1), size):
+        for start in range(0, len(generators), size):
             chunk = slice(start, start + size)
             seen = observed and records.apply(observed, itemgetter(chunk))
             try:

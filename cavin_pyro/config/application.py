@@ -132,7 +132,7 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
 
 def _refusal(error: OSError) -> str:
     """What the file system refused, for an error line; only a file that is there can have been an input."""
-    name = error.filename
+    name = error.filename2 or error.filename  # of a renaming, the target
     if name and error.errno == errno.ENAMETOOLONG:
         return f"{name} is no file: {error.strerror}"
     if name and error.errno in _DENIED and os.path.exists(name) and not os.access(name, os.R_OK):

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from pyro.infer import TraceEnum_ELBO
 from torch import Tensor
 
 from cavin_pyro.config.commands import WindowConfig
@@ -27,6 +28,7 @@ from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.geometry import check_fit
 from cavin_pyro.storage.provenance import provenance
+from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.run import data_folders
 
 # Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
@@ -127,6 +129,8 @@ def load_trained(config: DictConfig, name: str, accept: Accept | None = None) ->
     table = load_windows(
         folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
     )
+    # What the file says of its parts may be such that they can be built and not run.
+    check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
     return Loaded(checkpoint, selection, table, folders)
 
 
@@ -214,8 +218,10 @@ def trained_windows(checkpoint: Checkpoint) -> tuple[WindowConfig, int, int]:
         stored = checkpoint.config["windows"]
         # A default in place of a value that lacks would hold out other windows.
         windows = configured(WindowConfig, {**stored, **{name: stored[name] for name in ALWAYS_STORED}}, "windows")
-        return windows, int(checkpoint.config["model"]["segment_length"]), int(checkpoint.config["seed"])
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        seed = int(checkpoint.config["seed"])
+        np.random.SeedSequence(seed)  # which takes no negative one
+        return windows, int(checkpoint.config["model"]["segment_length"]), seed
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, UserError) as error:
         raise UserError(
             f"checkpoint {checkpoint.path} does not tell which windows its training held out ("
             f"{type(error).__name__}: {one_line(error)}): give one that train has written"

@@ -9,7 +9,8 @@ from __future__ import annotations
 import errno
 import json
 import sysconfig
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -57,16 +58,20 @@ class Checkpoint:
         """The model program with its trained parameters, in evaluation mode and without gradients, or a `UserError`."""
         if "model" not in self.config:
             raise UserError(f"checkpoint {self.path} holds no model: give one that train has written")
-        return self._filled("model", build_model(self.config))
+        with self._named():
+            built = build_model(self.config)
+        return self._filled("model", built)
 
     @cached_property
     def guide(self) -> Guide:
         """The guide of `model`, likewise; one that infers no other windows than those of its training is refused."""
-        guide = build_guide(self.config, self.model) if "guide" in self.config else None
+        model = self.model
+        with self._named():
+            guide = build_guide(self.config, model) if "guide" in self.config else None
         if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in self.tensors)):
             raise UserError(f"checkpoint {self.path} holds no guide: give one that train has written")
         if not guide.amortized:
-            others = ", ".join(amortized_guides(self.model.name))
+            others = ", ".join(amortized_guides(model.name))
             raise UserError(
                 f"checkpoint {self.path} has guide {type(guide).__name__}, with parameters for windows of its training "
                 f"alone: train with guide= one of {others}, which infer any window"
@@ -88,6 +93,14 @@ class Checkpoint:
         if weight is None:
             raise UserError(f"checkpoint {self.path} holds no PointNet: give one that pretrain or train has written")
         return self._filled("pointnet", PointNet(feature_dimension=len(weight)))
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Name the file in what is wrong with its configuration, which the user may never have seen."""
+        try:
+            yield
+        except UserError as error:
+            raise UserError(f"checkpoint {self.path}: {error}") from error
 
     def _filled(self, part: str, module: Module) -> Module:
         self.load_into(part, module)

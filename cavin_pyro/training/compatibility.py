@@ -28,7 +28,7 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
 
     A `UserError` names a code that the guide lacks or the model does not have, one outside of the model's plates, of
     another shape, or counted where the model does not count it; codes in another order than the model's, where
-    divergences in closed form need that; or what a model observes where it generates.
+    divergences in closed form need that; what a model observes where it generates; or a density that is not finite.
     """
     device = window.actions.device
     window = window._replace(sequence_mask=torch.arange(len(window.actions), device=device) == 0)
@@ -79,9 +79,12 @@ def check_compatibility(model: Model, guide: nn.Module, window: Window, elbo: EL
 
 
 def _codes(program: nn.Module, window: Window) -> Sites:
-    """Sampled sites by name, with their log densities."""
+    """Sampled sites by name, with their log densities, all of which are finite."""
     trace = poutine.trace(program).get_trace(window)
     trace.compute_log_prob()
+    for name, site in sampled_sites(trace).items():
+        if not site["log_prob"].isfinite().all():
+            raise UserError(f"{type(program).__name__} gives {name} a density that is not finite: look at its options")
     return latent_sites(trace)
 
 

@@ -92,8 +92,8 @@ class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     ) -> None:
         if objects not in range(1, MAXIMUM_OBJECTS + 1):
             raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
-        if maximum_steps < 1:
-            raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
+        if maximum_steps not in range(1, 10**9):
+            raise ValueError(f"maximum_steps must be a whole number of at least 1, not {maximum_steps}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         if not isinstance(show_tiles, bool):

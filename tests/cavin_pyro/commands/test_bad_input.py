@@ -39,12 +39,12 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("evaluate", "checkpoint=@flat", "FlatModel, which has no effect_prior"),
     ("evaluate", "address=host:6379", "address=host:6379 is of launcher=ray"),
     ("train", "model.width=0", "model.width must be at least 1, not 0"),
-    ("train", "scales.center=1e308", "scales.center=1e308: OverflowError"),
+    ("train", "scales.center=1e308", "scales.center must be between 1e-12 and 1e12, not 1e+308"),
     ("train", "dynamics.maximum_displacement=nan", "dynamics.maximum_displacement must be finite, not nan"),
     ("train", "objective.elbo._target_=builtins.dict", "objective.elbo._target_=builtins.dict: AttributeError"),
     ("check", "sizes.subgoals=3 sections=[subgoals]", "sizes.subgoals=3: Cannot assign int to dict"),
     ("check", "checkpoint=@checkpoint", "does not tell which windows its training held out (KeyError: 'windows')"),
-    ("check", "checkpoint=@odd_seed", "does not tell which windows its training held out (ValueError: "),
+    ("check", "checkpoint=@far_scale", "far_scale: scales.center must be between 1e-12 and 1e12, not 1e+308"),
     ("train", "guide=flat", "guide cavin_pyro.guides.flat.FlatGuide does not fit model CascadedModel"),
     ("train", "data=@nothing", "python -m cavin_pyro.collect"),
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
@@ -66,8 +66,8 @@ def material(
     with safe_open(good, framework="pt") as file:
         header = {name: value for name, value in file.metadata().items() if name != "sha256"}
     config = json.loads(header["config"])
-    for name, seed in (("trained", 0), ("odd_seed", "x")):
-        told = json.dumps({**config, "windows": WINDOWS, "seed": seed})
+    for name, scales in (("trained", config["scales"]), ("far_scale", {**config["scales"], "center": 1e308})):
+        told = json.dumps({**config, "windows": WINDOWS, "seed": 0, "scales": scales})
         save_file(load_file(good), folder / name, metadata={**header, "config": told})
     config["model"]["scales"] = {"_target_": "numpy.save", "_args_": ["written.npy", 0]}
     save_file(load_file(good), folder / "untrusted", metadata={**header, "config": json.dumps(config)})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -144,7 +145,11 @@ def test_checkpoints_that_cannot_be_checked_are_refused_with_the_reason(small: S
     for what, kept in ((without_guide, config), (parts, unnamed)):
         with pytest.raises(UserError, match="holds no guide: give one that train has written"):
             assert saved(what, kept).guide
-    for wrong in ({}, {"windows": WINDOWS}, {"windows": {}, "seed": 0}, {"windows": 3, "seed": 0}):
+    for wrong in (
+        *({}, {"windows": WINDOWS}, {"windows": {}, "seed": 0}, {"windows": 3, "seed": 0}),
+        *({"windows": WINDOWS, "seed": seed} for seed in ("x", -1, math.inf, math.nan)),
+        {"windows": {**WINDOWS, "held_out_objects": [[]]}, "seed": 0},
+    ):
         with pytest.raises(UserError, match="does not tell which windows its training held out"):
             trained_windows(saved(parts, {**config, **wrong}))
     told = trained_windows(saved(parts, {**config, "windows": WINDOWS, "seed": 7}))

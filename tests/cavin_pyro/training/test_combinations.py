@@ -199,3 +199,6 @@ def test_model_and_guide_are_checked_by_their_sites(few: Window) -> None:
     model = building.build_model(composed("cascaded", "cascaded"))
     with pytest.raises(UserError, match="samples effect_code, more, motion_code, but the codes of model Cascaded"):
         check_compatibility(model, WithMore(model, width=8), few, Trace_ELBO())
+    model.dynamics.change.maximum_displacement = 1e30
+    with pytest.raises(UserError, match="CascadedModel gives next_centers a density that is not finite"):
+        check_compatibility(model, building.build_guide(composed("cascaded", "cascaded"), model), few, Trace_ELBO())

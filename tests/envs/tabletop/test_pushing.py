@@ -207,7 +207,7 @@ def test_the_same_seed_and_actions_give_the_same_episode(make: Make) -> None:
     ("options", "message"),
     [
         ({"objects": 11}, r"^objects must be a whole number from 1 to 10, not 11$"),
-        ({"maximum_steps": 0}, r"^maximum_steps must be at least 1, not 0$"),
+        ({"maximum_steps": 2.5}, r"^maximum_steps must be a whole number of at least 1, not 2.5$"),
         ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
         ({"camera": "webcam"}, r"^unknown camera 'webcam': choose from ideal, kinect2$"),
         ({"segmentation": "guess"}, r"^unknown segmentation 'guess': choose from mask, clusters$"),
