@@ -77,13 +77,15 @@ def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
 
 
 def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
-    """Raise ValueError unless `state` is a batch `[B]` with one generator per environment, on the CPU or its device."""
+    """Raise ValueError unless `state` is a batch `[B]` each with an object and a generator of its own."""
     centers = state.centers
     if centers.ndim != 3 or centers.shape[-1] != 3 or state.mask.shape != centers.shape[:-1] or not len(centers):
         raise ValueError(
             "a planner takes states of at least one scene, with centers [B, M, 3] and mask [B, M], "
             f"not {list(centers.shape)} and {list(state.mask.shape)}"
         )
+    if not state.mask.any(-1).all():
+        raise ValueError("a planner takes scenes of at least one object, and the mask of one has none")
     if state.features.ndim != 3 or state.features.shape[:-1] != centers.shape[:-1]:
         raise ValueError(
             f"a planner takes states with features [B, M, F], not {list(state.features.shape)} for centers "
@@ -97,9 +99,3 @@ def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
         raise ValueError(f"one generator per environment: {len(centers)} needed, {len(generators)} given")
     if len({id(generator) for generator in generators}) != len(generators):
         raise ValueError("one generator per environment: the same generator was given twice")
-    for index, generator in enumerate(generators):
-        if generator.device.type not in ("cpu", centers.device.type):
-            raise ValueError(
-                f"generator {index} is on {generator.device.type}, the state on {centers.device.type}: "
-                "make it with torch.Generator()"
-            )

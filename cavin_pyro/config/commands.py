@@ -261,7 +261,7 @@ class SceneConfig(DeviceOptions):
     objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
     planner: Any = None
-    pushes_per_plan: int | None = option(1, "executed pushes per plan; null executes all T (Algorithm 1, line 11)")
+    pushes_per_plan: int | None = option(1, "executed pushes per plan; null: all T (Algorithm 1, line 11)", minimum=1)
     push_decimals: int | None = option(PUSH_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
     margin: float = option(0.02, "margin of the planner's reward", unit="metres", minimum=0, maximum=TILE_SIDE / 2)
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)

@@ -130,7 +130,8 @@ def load_trained(config: DictConfig, name: str, accept: Accept | None = None) ->
         folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
     )
     # What the file says of its parts may be such that they can be built and not run.
-    check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
+    with checkpoint.named():
+        check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
     return Loaded(checkpoint, selection, table, folders)
 
 

@@ -136,6 +136,18 @@ def find_damage(path: Path, names: Iterable[str] | None, metadata: Mapping[str, 
                     yield f"array {name}: {str(error).splitlines()[0]}"
     except UNREADABLE as error:
         yield str(error).splitlines()[0] if path.exists() else "it is missing"
+    else:
+        yield from _contradictions(arrays, metadata)
+
+
+def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str]:
+    """Contradictions between readable arrays of a shard and the metadata."""
+    if {"length", "actions"} <= set(arrays) and (arrays["length"] > arrays["actions"].shape[1]).any():
+        yield f"array length: {arrays['length'].max()} pushes in an episode of {arrays['actions'].shape[1]}"
+    if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= len(metadata["shape_names"]):
+        yield f"array shape: object {arrays['shape'].max()} of {len(metadata['shape_names'])} in metadata.json"
+    if {"mask", "visible"} <= set(arrays) and (arrays["visible"] & ~arrays["mask"][:, None]).any():
+        yield "array visible: an object that mask denies is visible"
 
 
 def check_file(file: h5py.File, configuration: Mapping[str, Any]) -> None:

@@ -106,7 +106,7 @@ def find_defects(folder: Path) -> Iterator[str]:
     with progress_bar("verifying", total=metadata["shards"], unit="file") as bar:
         for number, source in enumerate(dataset.source_of_shards(metadata)):
             path, arrays = dataset.shard_path(folder, number), Arrays()
-            found = [*dataset.find_damage(path, dataset.ARRAYS, metadata, arrays), *_contradictions(arrays, metadata)]
+            found = [*dataset.find_damage(path, dataset.ARRAYS, metadata, arrays)]
             if "episode" in arrays and (repetition := dataset.repeated_episode(known, source, arrays["episode"])):
                 found.append(f"it {repetition}")
             yield from (f"{path}: {defect}" for defect in found)
@@ -122,16 +122,6 @@ def find_defects(folder: Path) -> Iterator[str]:
             bar.update()
     if len(lengths) == metadata["shards"] and sum(lengths) != metadata["transitions"]:
         yield f"{folder / 'metadata.json'}: counts {metadata['transitions']} transitions, the files have {sum(lengths)}"
-
-
-def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str]:
-    """Contradictions between readable arrays of a shard and the metadata."""
-    if {"length", "actions"} <= set(arrays) and (arrays["length"] > arrays["actions"].shape[1]).any():
-        yield f"array length: {arrays['length'].max()} pushes in an episode of {arrays['actions'].shape[1]}"
-    if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= len(metadata["shape_names"]):
-        yield f"array shape: object {arrays['shape'].max()} of {len(metadata['shape_names'])} in metadata.json"
-    if {"mask", "visible"} <= set(arrays) and (arrays["visible"] & ~arrays["mask"][:, None]).any():
-        yield "array visible: an object that mask denies is visible"
 
 
 def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:

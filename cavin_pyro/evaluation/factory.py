@@ -89,7 +89,7 @@ def planner_name(config: DictConfig) -> str:
 
 def announce_objects(config: DictConfig) -> None:
     """Say on standard error, before the first plan, that scenes have more objects than the model was trained with."""
-    if config.planner.model_free:
+    if config.planner.get("model_free"):
         return
     trained_before = load(config.checkpoint, trust=list(config.trust))
     path, model = trained_before.path, trained_before.config["model"]
@@ -166,7 +166,7 @@ def planner_of(config: DictConfig, model: Model | None, device: torch.device) ->
     """The planner of a configuration; for `model` and errors see `make_planner`."""
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
-    if options.pop("model_free"):
+    if options.pop("model_free", False):
         with user_input("planner"):
             return construct(options)
     if model is None:
@@ -195,7 +195,7 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
             reward = episode_rewards(env.tasks, reward=config.reward, margin=config.margin, device=device)
         trained = load(config.checkpoint, trust=list(config.trust))
         geometry = trained.geometry  # on the CPU, so that states are the same for every device
-        planner = planner_of(config, None if config.planner.model_free else trained.model, device)
+        planner = planner_of(config, None if config.planner.get("model_free") else trained.model, device)
         if config.pushes_per_plan is not None:
             check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
         with user_input():  # fails now, not in a later episode, if some layout has no room for the objects

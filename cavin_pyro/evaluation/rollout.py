@@ -212,6 +212,8 @@ def rollout(
         for callback in callbacks:
             callback.on_plan(record)
         actions = plan.actions[0].numpy()
+        if not 1 <= (len(actions) if pushes_per_plan is None else pushes_per_plan) <= len(actions):
+            raise UserError(f"pushes_per_plan must be between 1 and {len(actions)}, not {pushes_per_plan}")
         for number, action in enumerate(actions[:pushes_per_plan]):
             action = executed_push(action, push_decimals)
             observation, earned, terminated, truncated, info = env.step(action)

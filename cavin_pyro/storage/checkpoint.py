@@ -58,7 +58,7 @@ class Checkpoint:
         """The model program with its trained parameters, in evaluation mode and without gradients, or a `UserError`."""
         if "model" not in self.config:
             raise UserError(f"checkpoint {self.path} holds no model: give one that train has written")
-        with self._named():
+        with self.named():
             built = build_model(self.config)
         return self._filled("model", built)
 
@@ -66,7 +66,7 @@ class Checkpoint:
     def guide(self) -> Guide:
         """The guide of `model`, likewise; one that infers no other windows than those of its training is refused."""
         model = self.model
-        with self._named():
+        with self.named():
             guide = build_guide(self.config, model) if "guide" in self.config else None
         if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in self.tensors)):
             raise UserError(f"checkpoint {self.path} holds no guide: give one that train has written")
@@ -95,7 +95,7 @@ class Checkpoint:
         return self._filled("pointnet", PointNet(feature_dimension=len(weight)))
 
     @contextmanager
-    def _named(self) -> Iterator[None]:
+    def named(self) -> Iterator[None]:
         """Name the file in what is wrong with its configuration, which the user may never have seen."""
         try:
             yield

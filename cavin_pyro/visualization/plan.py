@@ -178,12 +178,7 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     Args:
         episode: its plans hold photographs and clouds, or an empty table is drawn.
         camera: that took the photographs, in any resolution; None draws maps from above instead, with the clouds.
-
-    Raises:
-        ValueError: the episode holds no plan.
     """
-    if not episode.plan_records:
-        raise ValueError("the episode holds no plan to draw: run it first")
     count = len(episode.plan_records)
     chosen = np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)  # the first and the last among them
     plan_records = [episode.plan_records[index] for index in chosen]

@@ -86,12 +86,9 @@ def check_goal(path: str | None) -> None:
 
 
 def write_goal(path: str, scene: Scene) -> None:
-    """Write a scene as it is now to a file for `task.goal`, atomically; a UserError: it cannot be written."""
-    try:
-        with atomic_write(Path(path)) as temporary:
-            save_goal(temporary, scene)
-    except OSError as error:
-        raise UserError(f"save_goal={path} cannot be written: {error.strerror}") from error
+    """Write a scene as it is now to a file for `task.goal`, atomically."""
+    with atomic_write(Path(path)) as temporary:
+        save_goal(temporary, scene)
 
 
 def render_episode(

@@ -35,10 +35,8 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
     """The loss and each term of the objective over training steps.
 
     `rows`: of a run's metrics.csv, with keys `step`, `training_loss`, `validation_loss` and `validation_<term>`; empty
-    cells are skipped. A ValueError: there is no row.
+    cells are skipped.
     """
-    if not rows:
-        raise ValueError("there is no row of metrics to draw: train first")
     terms = [key for key in rows[0] if key.startswith("validation_") and key != "validation_loss"]
     panels = {"loss": {name: (color, _curve(rows, f"{name}_loss")) for name, color in COLORS.items()}}
     panels |= {term: {"validation": (COLORS["validation"], _curve(rows, term))} for term in terms}
@@ -49,10 +47,8 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
 def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: NDArray[np.float32]) -> None:
     """Clouds and their reconstructions, from above and from the side.
 
-    `clouds`: [8, 256, 3] metres from their centres, or another number of them. A ValueError: there is no cloud.
+    `clouds`: [8, 256, 3] metres from their centres, or another number of them.
     """
-    if len(clouds) == 0:
-        raise ValueError("there is no cloud to draw: give at least one [256, 3]")
     reconstructed = autoencoder(torch.from_numpy(np.ascontiguousarray(clouds, dtype=np.float32))).numpy()
     figure = Figure(figsize=(0.8 + 1.6 * len(clouds), 4.1), dpi=DOTS_PER_INCH, layout="constrained")
     axes = figure.subplots(2, len(clouds), squeeze=False, sharex=True, sharey=True)

@@ -32,12 +32,7 @@ class ObjectMixturePrior(LearnedPrior):
     """
 
     def __init__(self, *, width: int = 32, components: int = 4, **shared: Any) -> None:
-        """`components`: number of Gaussians per object. `shared`: the arguments of `LearnedPrior`.
-
-        Raises `ValueError` for fewer than one component.
-        """
-        if components < 1:
-            raise ValueError(f"components must be at least 1, not {components}")
+        """`components`: number of Gaussians per object. `shared`: the arguments of `LearnedPrior`."""
         super().__init__(width=width, **shared)
         dimension, self.components = self.dimension, components
         self.own = nn.Linear(width, width)

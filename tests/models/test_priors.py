@@ -170,5 +170,3 @@ def test_padding_is_never_chosen_and_no_objects_give_numbers(random_state: Calla
     torch.testing.assert_close(weights.sum(-1), torch.ones(50))
     empty = prior(random_state(3, objects=4, real=0))
     assert empty.log_prob(torch.zeros(3, 2)).isfinite().all() and empty.sample().isfinite().all()
-    with pytest.raises(ValueError, match="components must be at least 1, not 0"):
-        ObjectMixturePrior(components=0)

@@ -201,6 +201,7 @@ GOOD = State(torch.zeros(2, 3, 3), torch.zeros(2, 3, 64), torch.ones(2, 3, dtype
         ({"features": GOOD.features[:1]}, r"features \[B, M, F\], not \[1, 3, 64\] for centers \[2, 3, 3\]"),
         ({"mask": GOOD.mask[:1]}, r"mask \[B, M\], not \[2, 3, 3\] and \[1, 3\]"),
         ({"centers": GOOD.centers[:0], "mask": GOOD.mask[:0]}, r"of at least one scene, .*, not \[0, 3, 3\] and"),
+        ({"mask": GOOD.mask & torch.tensor([[True], [False]])}, "scenes of at least one object, and the mask of one"),
     ],
 )
 def test_states_of_the_wrong_kind_are_refused(changes: dict, said: str) -> None:

@@ -58,8 +58,6 @@ class GeneratedLayouts:
             raise ValueError(f"unknown generated.shape {self.shape!r}: choose from {', '.join((*SHAPES, ANY_SHAPE))}")
         if self.obstacles not in OBSTACLES:
             raise ValueError(f"unknown generated.obstacles {self.obstacles!r}: choose {' or '.join(OBSTACLES)}")
-        if self.seed is not None and self.seed < 0:
-            raise ValueError(f"generated.seed must be at least 0 or null, not {self.seed}")
 
     def sample(self, what: str, by_shape: Mapping[str, Sequence[Choice]], generator: np.random.Generator) -> Choice:
         """One of the choices of the wanted shape; of any shape, all shapes that there are are equally likely.

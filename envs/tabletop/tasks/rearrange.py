@@ -58,8 +58,6 @@ class Rearrange(Task):
         object.__setattr__(self, "places", places)
         if places and self.goal is not None:
             raise ValueError(f"goal {self.goal} and places both say where the objects go: give one of them")
-        if not isinstance(self.goal, str | None):
-            raise ValueError(f"goal must be the path of a file, not {self.goal!r}")
         if not (isinstance(self.clearance, int | float) and self.clearance >= 0.0):
             raise ValueError(f"clearance must be at least 0 metres, not {self.clearance!r}")
         if not places:

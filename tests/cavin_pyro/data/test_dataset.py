@@ -90,6 +90,7 @@ SPOILT: dict[str, tuple[Callable[[Path, Arrays], Any], str]] = {
     "fewer": (changed("actions", lambda one: one[1:]), r"actions has shape \[3, 6, 4\], not \[4, 6, 4\]"),
     "another type": (changed("actions", lambda one: one.astype(float)), "actions has type float64, not float32"),
     "not finite": (changed("actions", lambda one: one * np.nan), "actions has values outside of -1 to 1: nan to nan"),
+    "longer": (changed("length", lambda one: one + 7), "array length: 13 pushes in an episode of 6"),
     "elsewhere": (linked, "actions is no array in this file"),
     "unpacks to 660 gigabytes": (bomb, r"centers has shape \[1000000000, 11, 5, 3\]"),
 }
@@ -103,10 +104,10 @@ def test_a_shard_that_does_not_fit_is_named_and_can_be_skipped(
     path = shard_path(own_pushes, 1)
     change(path, read_shard(path))
     with pytest.raises(UserError, match=rf"^shard .*episodes-00001\.h5 is missing or corrupt \(.*({said})") as refused:
-        list(iterate_shards(own_pushes, ("actions", "mask")))
+        list(iterate_shards(own_pushes, ("actions", "length", "mask")))
     assert "\n" not in str(refused.value) and "repair=true" in str(refused.value)
     assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)  # from another process
-    kept = [number for number, _ in iterate_shards(own_pushes, ("actions", "mask"), skip_corrupt=True)]
+    kept = [number for number, _ in iterate_shards(own_pushes, ("actions", "length", "mask"), skip_corrupt=True)]
     assert kept == [0, 2]
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(f"left out: shard {path}") and "repair" not in line

@@ -149,6 +149,12 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
         np.testing.assert_array_equal(episode.reached(record), [transition.centers for transition in made])
 
 
+@pytest.mark.parametrize("pushes", [0, 4])
+def test_as_many_pushes_of_a_plan_are_made_as_there_are(env: PushingEnv, pushes: int) -> None:
+    with pytest.raises(UserError, match=f"pushes_per_plan must be between 1 and 3, not {pushes}"):
+        rollout(env, Still(3), PointNet(), seed=0, pushes_per_plan=pushes)
+
+
 def test_the_planner_gets_the_observed_points_without_needless_padding(env: PushingEnv) -> None:
     pointnet = PointNet()
     observation, _ = env.reset(seed=0)
