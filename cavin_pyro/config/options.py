@@ -62,7 +62,7 @@ class About:
         """The numbers that are allowed, in words."""
         unit = f" {self.unit}" if self.unit else ""
         if self.positive:
-            return "a positive number"
+            return "a positive number below 1e30"  # torch counts in float32
         if self.maximum is None:
             return f"at least {self.minimum:g}{unit}"
         return f"between {self.minimum:.10g} and {self.maximum:.10g}{unit}"
@@ -133,7 +133,7 @@ def check_value(name: str, value: Any, about: About) -> None:
         return
     low, high = about.minimum, about.maximum
     inside = (low is None or value >= low) and (high is None or value <= high)
-    if not (0 < value < float("inf") if about.positive else inside):
+    if not (0 < value < 1e30 if about.positive else inside):
         raise UserError(f"{name} must be {about.range}, not {shown(value)}")
 
 

@@ -50,14 +50,17 @@ def check_export(file: str | None) -> Path | None:
     """The option `export`, before anything is computed.
 
     Raises:
-        UserError: not a .nc file. OSError: a folder that cannot be made.
+        UserError: not a .nc file, or a folder that cannot be made.
     """
     if file is None:
         return None
     path = Path(file)
     if path.suffix != ".nc" or path.is_dir():
         raise UserError(f"export={file} must name a netCDF file: give it the ending .nc")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"export={file} cannot be written ({error.strerror}): choose another file") from error
     return path
 
 

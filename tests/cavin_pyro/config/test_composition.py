@@ -121,7 +121,7 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("seed=${oc.decode:'-1'}", "seed must be between 0 and 4294967295, not -1"),
     ("margin=inf", "margin must be between 0 and 0.075 metres, not inf"),
     ("evaluate workers=0", "workers must be between 1 and 1024, not 0"),
-    ("train trainer.learning_rate=0", "trainer.learning_rate must be a positive number, not 0"),
+    ("train trainer.learning_rate=0", "trainer.learning_rate must be a positive number below 1e30, not 0"),
     ("pln seed=0", "unknown command 'pln': choose from collect, "),
 ]
 

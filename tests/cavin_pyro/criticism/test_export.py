@@ -65,6 +65,9 @@ def test_a_bad_file_is_one_line_and_nothing_is_left_of_one_that_cannot_be_writte
     assert check_export(None) is None
     with pytest.raises(UserError, match=r"^export=samples.json must name a netCDF file: give it the ending .nc$"):
         check_export("samples.json")
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot be written"):
+        check_export(str(tmp_path / "file" / "samples.nc"))
 
     def full(*arguments: Any, **options: Any) -> None:
         raise OSError(28, "No space left on device")
@@ -72,4 +75,4 @@ def test_a_bad_file_is_one_line_and_nothing_is_left_of_one_that_cannot_be_writte
     monkeypatch.setattr(arviz().InferenceData, "to_netcdf", full)
     with pytest.raises(OSError, match="No space left"):
         write_samples(cascade, tmp_path / "samples.nc", ABOUT, windows=2, samples=2)
-    assert [path.name for path in tmp_path.iterdir()] == []
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
