@@ -19,6 +19,7 @@ import torch
 from pyro.infer import Trace_ELBO
 from torch import Tensor, nn
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.networks.layers import SCALE_FLOOR
@@ -50,18 +51,19 @@ def hand_written_loss(model: CascadedModel, guide: CascadedGuide, window: Window
     q_h, q_g = guide.effect_inference, guide.motion_inference
     c_mean, c_scale = moments(q_h, (first, last))
     c = c_mean + c_scale * torch.randn_like(c_mean)
-    z_mean, z_scale = moments(q_g, (encoded[:, 0], first.mask, window.actions, c))
+    z_mean, z_scale = moments(q_g, (encoded[:, 0], first, window.actions, c))
     z = z_mean + z_scale * torch.randn_like(z_mean)
 
     effect = model.meta_dynamics.effect(encoded[:, 0], c)
     subgoal = model.meta_dynamics(first, effect)
-    pushes = model.action_generator(effect, first.mask, z)
+    pushes = model.action_generator(effect, first, z)
     outcome = model.dynamics(before, encoded, window.actions)
 
     real = first.mask & last.mask
     sequence = kl(c_mean, c_scale, c) + kl(z_mean, z_scale, z)
     sequence = sequence + state_loss(subgoal, last, real, scales.center, scales.feature).sum(-1)
-    action_scale = pushes.new_tensor((scales.start, scales.start, scales.motion, scales.motion))
+    start, motion = scales.action
+    action_scale = pushes.new_tensor((start, start, motion, motion))
     error = ((window.actions - pushes) / action_scale).square()
     sequence = sequence + (0.5 * error + action_scale.log() + 0.5 * math.log(2 * math.pi)).sum((-2, -1))
     counted = before.mask & after.mask & window.transition_mask.unsqueeze(-1)
@@ -118,7 +120,7 @@ def main() -> None:
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     for count in [int(argument) for argument in sys.argv[1:]] or [64, 256, 512]:
         torch.manual_seed(0)
-        model = CascadedModel()
+        model = CascadedModel(space=SPACE)
         guide, window = CascadedGuide(model), random_windows(count)
         bound = Objective(Trace_ELBO(max_plate_nesting=1)).loss(model, guide)
         torch.manual_seed(1)

@@ -12,11 +12,9 @@ from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.networks.dynamics import EffectTrunk
 from cavin_pyro.models.networks.layers import (
-    POSITION_UNIT,
     GaussianCode,
     ObjectPool,
     fully_connected,
-    relative_positions,
 )
 from cavin_pyro.models.state import State, Window
 
@@ -57,75 +55,81 @@ class CascadedGuide(Guide):
 
         with windows_plate(window), sequence_mask(window):
             effect_code = pyro.sample("effect_code", self.effect_inference(first, last, window.actions))
-            motion = self.motion_inference(encoded[:, 0], first.mask, window.actions, effect_code)
+            motion = self.motion_inference(encoded[:, 0], first, window.actions, effect_code)
             pyro.sample("motion_code", motion)
 
 
-def push_features(width: int) -> nn.Sequential:
-    """FC of each push, concatenated over T: `[..., T, 4] -> [..., T * width]`."""
-    return nn.Sequential(fully_connected(4, width), nn.Flatten(-2))
+def action_features(model: Model, width: int) -> nn.Sequential:
+    """FC of each action, concatenated over T: `[..., T, A] -> [..., T * width]`."""
+    return nn.Sequential(fully_connected(model.space.actions, width), nn.Flatten(-2))
 
 
 class EffectInference(nn.Module):
     """q_h(c | s, s'): the effect between s and s'; with `reads_actions`, q(c | s, s', a).
 
-    Per object two FC on (s, s' - s), centers and features; masked sum over objects; FC of each push, concatenated over
-    T, with `reads_actions`; FC; Gaussian.
+    Per object two FC on (s, s' - s), centers and features; masked sum over objects; FC of each action, concatenated
+    over T, with `reads_actions`; FC; Gaussian.
     """
 
     def __init__(self, model: Model, *, width: int = 64, reads_actions: bool = False) -> None:
         """For a `model` with an effect code. `width`: of all layers."""
         super().__init__()
-        inputs = 2 * (3 + model.feature_dimension)
+        self.space = space = model.space
+        inputs = space.inputs + space.positions + 2 * model.feature_dimension
         self.objects = nn.Sequential(fully_connected(inputs, width), fully_connected(width, width))
-        self.pushes = push_features(width) if reads_actions else None
+        self.pushes = action_features(model, width) if reads_actions else None
         self.scene = fully_connected(width + model.segment_length * width if reads_actions else width, width)
         self.code: nn.Module = GaussianCode(model.effect_dimension, width=width)
 
     def forward(self, state: State, subgoal: State, actions: Tensor | None = None) -> TorchDistribution:
-        """`state, subgoal: [...]`, `actions: [..., T, 4]` -> batch `[...]`; counts objects that are real in both."""
+        """`state, subgoal: [...]`, `actions: [..., T, A]` -> batch `[...]`; counts objects that are real in both."""
+        space = self.space
         parts = (
-            relative_positions(state.centers),
+            space.describe(state, space.locate(state)),
             state.features,
-            (subgoal.centers - state.centers) / POSITION_UNIT,
-            subgoal.features - state.features,
+            space.turn((subgoal.centers - state.centers) / space.length, state),
+            space.turn(subgoal.features - state.features, state),
         )
         real = (state.mask & subgoal.mask).unsqueeze(-1)
         pooled = (self.objects(torch.cat(parts, -1)) * real).sum(-2)
         if self.pushes is not None:
-            pooled = torch.cat((pooled, self.pushes(actions)), -1)
+            assert actions is not None
+            pooled = torch.cat((pooled, self.pushes(space.turn_actions(actions, state))), -1)
         return self.code(self.scene(pooled))
 
 
 class MotionInference(nn.Module):
     """q_g(z | s, a, c): the motion behind the actions; without `reads_effect`, q(z | s, a), which ignores the code.
 
-    (s, c) pooled as in the action generator; FC of each push, concatenated over T; FC of both; Gaussian.
+    (s, c) pooled as in the action generator; FC of each action, concatenated over T; FC of both; Gaussian.
     """
 
     def __init__(self, model: Model, *, width: int = 64, reads_effect: bool = True) -> None:
         """For a `model` with a motion code. `width`: of all layers."""
         super().__init__()
+        self.space = model.space
         code = model.effect_dimension if reads_effect else None
         self.trunk = EffectTrunk(code, width=width, encoder_width=model.width)
         self.pool = ObjectPool(width)
-        self.pushes = push_features(width)
+        self.pushes = action_features(model, width)
         self.from_pushes = nn.Linear(model.segment_length * width, width)
         self.from_pooled = nn.Linear(width, width, bias=False)
         self.code: nn.Module = GaussianCode(model.motion_dimension, width=width)
 
     def forward(
-        self, encoded: Tensor, mask: Tensor, actions: Tensor, effect_code: Tensor | None = None
+        self, encoded: Tensor, state: State, actions: Tensor, effect_code: Tensor | None = None
     ) -> TorchDistribution:
         """Leading dimensions broadcast.
 
         Args:
             encoded: `[..., M, 3 * model.width]`, features of s from the model's `StateEncoder`.
-            mask: `[..., M]` of s.
-            actions: `[..., T, 4]`.
+            state: s, `[...]`.
+            actions: `[..., T, A]`.
             effect_code: `[..., C]`.
         """
-        pooled = self.pool(self.trunk(encoded, effect_code), mask)
-        # A linear layer on (pooled, pushes), in two parts, because only the first varies with the code.
-        feature = (self.from_pooled(pooled) + self.from_pushes(self.pushes(actions))).relu()
+        pooled = self.pool(self.trunk(encoded, effect_code), state.mask)
+        # A linear layer on (pooled, actions), in two parts, because only the first varies with the code.
+        feature = (
+            self.from_pooled(pooled) + self.from_pushes(self.pushes(self.space.turn_actions(actions, state)))
+        ).relu()
         return self.code(feature)

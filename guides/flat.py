@@ -28,4 +28,4 @@ class FlatGuide(Guide):
         """`window: [B]`."""
         encoded = self.model.encode(window)
         with windows_plate(window), sequence_mask(window):
-            pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first.mask, window.actions))
+            pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first, window.actions))

@@ -21,12 +21,12 @@ class CascadedModel(Model):
     c ~ p(c | s)                     # effect_code
     s' ~ h(s' | s, c)                # subgoal_centers, subgoal_features
     z ~ p(z | s, c)                  # motion_code
-    a ~ g(a | s, c, z)               # actions, T pushes
+    a ~ g(a | s, c, z)               # actions, T of them
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
     `sequence_mask` masks the first four lines, `transition_mask` masks pair t of the last. A term counts the objects
     that are real in both of its states. Padding must be finite and is otherwise ignored. Of an initial window the last
-    line samples one push after the other, at next_centers_1, next_features_1 and so on, and h and f count s's objects.
+    line samples one step after the other, at next_centers_1, next_features_1 and so on, and h and f count s's objects.
     """
 
     name = "cascaded"
@@ -54,10 +54,13 @@ class CascadedModel(Model):
         self.effect_dimension = effect_dimension
         self.motion_dimension = motion_dimension
         self.meta_dynamics = MetaDynamics(
-            effect_dimension=effect_dimension, feature_dimension=self.feature_dimension, width=self.width
+            self.space,
+            effect_dimension=effect_dimension,
+            feature_dimension=self.feature_dimension,
+            width=self.width,
         )
         self.action_generator = ActionGenerator(
-            segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width
+            self.space, segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width
         )
         self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
         self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
@@ -78,7 +81,7 @@ class CascadedModel(Model):
 
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first, effect_code))
 
-                mean = self.action_generator(effect, first.mask, motion_code)
+                mean = self.action_generator(effect, first, motion_code)
                 actions = pyro.sample("actions", self.scales.actions(mean), obs=window.observed(window.actions))
 
             for step in self.transitions(window, encoded, actions):
@@ -95,10 +98,10 @@ class CascadedModel(Model):
         return self.prior_of_motions(state, effect_code)
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
-        """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T pushes ahead."""
+        """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T actions ahead."""
         return self.meta_dynamics(state, self.meta_dynamics.effect(self.encoder(state), effect_code))
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
-        """Mean of g: `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]` -> `[..., T, 4]`."""
+        """Mean of g: `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]` -> `[..., T, A]`."""
         effect = self.meta_dynamics.effect(self.encoder(state), effect_code)
-        return self.action_generator(effect, state.mask, motion_code)
+        return self.action_generator(effect, state, motion_code)

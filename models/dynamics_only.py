@@ -9,7 +9,7 @@ from cavin_pyro.models.state import Window
 
 
 class DynamicsModel(Model):
-    """Outcomes of given pushes a_0, ..., a_T-1, for each window with states s_0, ..., s_T.
+    """Outcomes of given actions a_0, ..., a_T-1, for each window with states s_0, ..., s_T.
 
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 

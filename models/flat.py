@@ -19,7 +19,7 @@ class FlatModel(Model):
     """Motions and their outcomes, for each window with states s = s_0, ..., s_T.
 
     z ~ p(z | s)                     # motion_code
-    a ~ g(a | s, z)                  # actions, T pushes
+    a ~ g(a | s, z)                  # actions, T of them
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
     Masks are as in `CascadedModel`, and so are the networks, without h and the layers that read c.
@@ -40,7 +40,7 @@ class FlatModel(Model):
         self.motion_dimension = motion_dimension
         self.trunk = EffectTrunk(None, width=self.width, encoder_width=self.width)
         self.action_generator = ActionGenerator(
-            segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width
+            self.space, segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width
         )
         self.prior_of_motions = motion_prior or StandardPrior(dimension=motion_dimension)
 
@@ -52,7 +52,7 @@ class FlatModel(Model):
             with sequence_mask(window):
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first))
 
-                mean = self.action_generator(self.trunk(encoded[:, 0]), first.mask, motion_code)
+                mean = self.action_generator(self.trunk(encoded[:, 0]), first, motion_code)
                 actions = pyro.sample("actions", self.scales.actions(mean), obs=window.observed(window.actions))
 
             for step in self.transitions(window, encoded, actions):
@@ -65,5 +65,5 @@ class FlatModel(Model):
         return self.prior_of_motions(state)
 
     def actions(self, state: State, effect_code: Tensor | None = None, *, motion_code: Tensor) -> Tensor:
-        """Mean of g: `state: [...]`, `motion_code: [..., Z]` -> `[..., T, 4]`; the effect code is ignored."""
-        return self.action_generator(self.trunk(self.encoder(state)), state.mask, motion_code)
+        """Mean of g: `state: [...]`, `motion_code: [..., Z]` -> `[..., T, A]`; the effect code is ignored."""
+        return self.action_generator(self.trunk(self.encoder(state)), state, motion_code)

@@ -13,32 +13,31 @@ from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 
 from cavin_pyro.models.part import Part
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
 Self = TypeVar("Self", bound="Isotropic")
 
 
 class Scales:
-    """Base class of likelihood scales: the likelihoods around the networks' means, from four standard deviations.
+    """Base class of likelihood scales: the likelihoods around the networks' means, from standard deviations.
 
-    center: standard deviation of an object's centre, in metres.
-    feature: standard deviation of each number of a geometric feature, whose length is 1.
-    start: standard deviation of a push's start, in normalised units (1 is half the reachable box).
-    motion: standard deviation of a push's motion, in normalised units (1 is the longest push along an axis).
+    space: of the world. center: of a position, in the world's unit. feature: of each number of a feature. action: of
+    the numbers of each part of an action, normalised.
     """
 
+    space: Space
     center: float | Tensor
     feature: float | Tensor
-    start: float | Tensor
-    motion: float | Tensor
+    action: Sequence[float | Tensor]
 
     def centers(
         self, mean: State, mask: Tensor, *, event_dims: int = 1, predicted: Tensor | None = None
     ) -> TorchDistribution:
-        """Observed centers around `mean`: event `[M, 3]`, or `[T, M, 3]` for `event_dims=2`.
+        """Observed centers around `mean`: event `[M, P]`, or `[T, M, P]` for `event_dims=2`.
 
         `mask: [..., M]`: objects that count; others (padding) do not contribute. `predicted: [..., M, 2]`, scales of
-        centres (metres) and features that the network of the mean predicts; only `PredictedScales` reads them.
+        centres and features that the network of the mean predicts; only `PredictedScales` reads them.
         """
         scale = None if predicted is None else predicted[..., 0]
         return self._around(mean.centers, self.center, scale, of_centers=True).mask(mask).to_event(event_dims)
@@ -56,40 +55,38 @@ class Scales:
         return IsotropicNormal(mean, scale)
 
     def actions(self, mean: Tensor) -> TorchDistribution:
-        """Pushes around `mean: [..., T, 4]`: event `[T, 4]`."""
+        """Actions around `mean: [..., T, A]`: event `[T, A]`."""
         # Filled where the means are: a copy from the CPU would let a GPU wait in every step.
-        start, motion = (
-            scale if isinstance(scale, Tensor) else mean.new_full((), scale) for scale in (self.start, self.motion)
-        )
-        return distributions.Normal(mean, torch.stack((start, start, motion, motion))).to_event(2)
+        parts = [scale if isinstance(scale, Tensor) else mean.new_full((), scale) for scale in self.action]
+        sizes = zip(parts, self.space.action_sizes, strict=True)
+        return distributions.Normal(mean, torch.stack([part for part, size in sizes for _ in range(size)])).to_event(2)
 
 
 @dataclass(frozen=True)
 class LikelihoodScales(Scales):
     """Fixed standard deviations, instead of loss weights (the paper's choice and the default).
 
-    For their units see `Scales`.
+    For their units see `Scales`; None takes the space's. Raises `ValueError` for one that is not positive.
     """
 
-    center: float = 0.01  # metres
-    feature: float = 0.1  # of a vector of unit length
-    start: float = 0.077  # normalised
-    motion: float = 0.245  # normalised
+    space: Space
+    center: float | Tensor = None  # type: ignore[assignment]
+    feature: float | Tensor = None  # type: ignore[assignment]
+    action: Sequence[float | Tensor] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Raises `ValueError` for one that is not positive."""
-        for name, value in vars(self).items():
-            _check_positive(name, value)
+        for name, value in _filled(self.space, self.center, self.feature, self.action).items():
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True)
 class PredictedScales(LikelihoodScales):
-    """Scales of f that depend on state and push, predicted by its network, with heavy tails; fixed ones for h and g.
+    """Scales of f that depend on state and action, predicted by its network, with heavy tails; fixed ones for h and g.
 
-    f's likelihoods are Student's t around its means: most outcomes are nearly certain, and some objects topple or roll.
+    f's likelihoods are Student's t around its means: most outcomes are nearly certain, and a few are not.
 
     degrees_of_freedom: of Student's t; fewer give heavier tails.
-    height_ratio: scale of a centre's height over that of its place on the table.
+    height_ratio: scale of a centre's last number, its height, over that of the others.
     """
 
     degrees_of_freedom: float = 3.0
@@ -107,23 +104,40 @@ class LearnedScales(Scales, Part):
     """Learned standard deviations, shared by f and h, and by all windows. For their units see `Scales`."""
 
     def __init__(
-        self, *, center: float = 0.01, feature: float = 0.1, start: float = 0.077, motion: float = 0.245
+        self,
+        space: Space,
+        *,
+        center: float | None = None,
+        feature: float | None = None,
+        action: Sequence[float] | None = None,
     ) -> None:
-        """Initial values. Raises `ValueError` for one that is not positive."""
+        """Initial values; None takes the space's. Raises `ValueError` for one that is not positive."""
         super().__init__()
-        for name, value in (("center", center), ("feature", feature), ("start", start), ("motion", motion)):
-            _check_positive(name, value)
+        self.space = space
+        initial = _filled(space, center, feature, action)
+        parts = zip(space.action_names, initial.pop("action"), strict=True)
+        for name, value in (*initial.items(), *parts):
             self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(value).log()))
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("center", "feature", "start", "motion"):
+        if name == "action":
+            return [self.get_parameter(f"log_{part}").exp() for part in self.space.action_names]
+        if name in ("center", "feature"):
             return self.get_parameter(f"log_{name}").exp()
         return super().__getattr__(name)
 
 
-def _check_positive(name: str, value: float) -> None:
-    if not 1e-12 < value < 1e12:  # beyond, its square or a density overflows
-        raise ValueError(f"scales.{name} must be between 1e-12 and 1e12, not {value:g}")
+def _filled(space: Space, center: Any, feature: Any, action: Any) -> dict[str, Any]:
+    """The standard deviations by name, those of the space where one is None."""
+    center = space.center_scale if center is None else center
+    feature = space.feature_scale if feature is None else feature
+    parts = tuple(space.action_scales if action is None else action)
+    if len(parts) != len(space.action_sizes):
+        raise ValueError(f"scales.action needs {len(space.action_sizes)} numbers, not {len(parts)}")
+    for name, value in (("center", center), ("feature", feature), *[("action", part) for part in parts]):
+        if not 1e-12 < value < 1e12:  # beyond, its square or a density overflows
+            raise ValueError(f"scales.{name} must be between 1e-12 and 1e12, not {value:g}")
+    return {"center": center, "feature": feature, "action": parts}
 
 
 class Isotropic(TorchDistribution):
@@ -189,9 +203,9 @@ class IsotropicStudentT(Isotropic):
     """Multivariate t with shape matrix scale^2 I, `scale: [...]`; for positions, the height's with a `ratio`.
 
     Equal to `pyro.distributions.MultivariateStudentT(df, loc, scale * eye(D))`, without its matrices. Its heavy tails
-    suit pushes, most of whose outcomes are nearly certain, while some end with an object that rolls or topples. With a
-    `ratio` the last of three components, z, has that times the scale of x and y: a push along the table hardly changes
-    heights, and one scale for all three would be too narrow for x and y.
+    suit outcomes most of which are nearly certain, while some end with an object that rolls or topples. With a `ratio`
+    the last of three components, z, has that times the scale of x and y: what moves along a plane hardly changes its
+    height, and one scale for all three would be too narrow for x and y.
     """
 
     scale: Tensor

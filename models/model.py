@@ -13,9 +13,10 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
-from cavin_pyro.models.networks.dynamics import Dynamics, PushOutcome
-from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes, unit
+from cavin_pyro.models.networks.dynamics import Dynamics, Outcome
+from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes
 from cavin_pyro.models.part import Part
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
 
 
@@ -46,9 +47,9 @@ class Model(Program):
     "effect_code"   `effect_prior(state)`                         p(c | s), batch `[...]`, event `[C]`
                     `subgoal(state, effect_code)`                 mean of h, `State [...]`
     "motion_code"   `motion_prior(state, effect_code)`            p(z | s, c), batch `[...]`, event `[Z]`
-    one or both     `actions(state, effect_code, motion_code)`    mean of g, `[..., T, 4]`
+    one or both     `actions(state, effect_code, motion_code)`    mean of g, `[..., T, A]`
 
-    with `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]`, `action: [..., 4]`, whose leading
+    with `state: [...]`, `effect_code: [..., C]`, `motion_code: [..., Z]`, `action: [..., A]`, whose leading
     dimensions broadcast. A model without one of the codes accepts the argument and ignores it.
     """
 
@@ -66,24 +67,26 @@ class Model(Program):
     def __init__(
         self,
         *,
+        space: Space,
         segment_length: int = 3,
         feature_dimension: int = 64,
         width: int = 64,
         maximum_objects: int = 5,
         neighbours: int | None = None,
         scales: Scales | None = None,
-        dynamics: PushOutcome | None = None,
+        dynamics: Outcome | None = None,
     ) -> None:
         """The dimensions and parts that all models share.
 
         Args:
-            segment_length: T, pushes of a segment.
+            space: of the world: dimensions, units and ranges.
+            segment_length: T, actions of a segment.
             feature_dimension: F, numbers of an object's geometric feature.
             width: width of all layers.
             maximum_objects: most objects in a scene of the training; other scenes may have more.
             neighbours: how many other objects, the nearest, enter each sum over other objects; None takes
                 `maximum_objects - 1`, which are all others in the scenes of the training, as in the paper.
-            scales: of the likelihoods; by default `LikelihoodScales()`.
+            scales: of the likelihoods; by default the space's, `LikelihoodScales`.
             dynamics: f; by default the paper's, `Dynamics`.
 
         Raises:
@@ -91,14 +94,16 @@ class Model(Program):
         """
         super().__init__()
         self._encoding: tuple[Window, Tensor] | None = None
+        self.space = space
         self.segment_length = segment_length
         self.feature_dimension = feature_dimension
         self.width = width
         self.maximum_objects = maximum_objects
         self.neighbours = maximum_objects - 1 if neighbours is None else neighbours
-        self.scales = scales or LikelihoodScales()
-        self.encoder = StateEncoder(feature_dimension=feature_dimension, width=width, neighbours=self.neighbours)
-        self.dynamics: PushOutcome = dynamics or Dynamics(feature_dimension=feature_dimension, width=width)
+        self.scales = scales or LikelihoodScales(space)
+        sizes = {"feature_dimension": feature_dimension, "width": width}
+        self.encoder = StateEncoder(space, neighbours=self.neighbours, **sizes)
+        self.dynamics: Outcome = dynamics or Dynamics(space, **sizes)
         self.dynamics.neighbours = self.neighbours
         if isinstance(self.scales, PredictedScales) and not self.dynamics.predicts_scales:
             raise ValueError("scales=predicted needs an f that predicts them: dynamics=contact")
@@ -109,7 +114,7 @@ class Model(Program):
         return fixed_shapes()
 
     def next_state(self, state: State, action: Tensor) -> State:
-        """Mean of f: `state: [...]`, `action: [..., 4]` -> the state after one push."""
+        """Mean of f: `state: [...]`, `action: [..., A]` -> the state after one action."""
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
     def encode(self, window: Window) -> Tensor:
@@ -125,7 +130,7 @@ class Model(Program):
             raise ValueError(f"windows come as one batch [B]; got leading dimensions {[*window.batch_shape]}")
         if window.segment_length != self.segment_length:
             raise ValueError(
-                f"window has {window.segment_length} pushes; this model was made for {self.segment_length}"
+                f"window has {window.segment_length} actions; this model was made for {self.segment_length}"
             )
         all_steps = window.whole and self.dynamics.reads_encoding
         return self.encoder(window.states.step(slice(0, -1) if all_steps else slice(0, 1)))
@@ -148,12 +153,12 @@ class Model(Program):
         self(window.initial)
 
     def transitions(self, window: Window, encoded: Tensor, actions: Tensor) -> Iterator[DynamicsStep]:
-        """f's likelihoods for `window: [B]`, encoded by `encode`, and `actions: [..., B, T, 4]` (paper, equation 1).
+        """f's likelihoods for `window: [B]`, encoded by `encode`, and `actions: [..., B, T, A]` (paper, equation 1).
 
-        Of a whole window one, for all T pushes at once: events `[T, M, 3]` and `[T, M, F]`. It counts the transitions
-        in `transition_mask`, with the objects that are real before and after the push. Of an initial window T, push by
-        push: events `[M, 3]` and `[M, F]`. f reads the `sampled` state of each before the next, its features scaled to
-        unit length, like observed ones.
+        Of a whole window one, for all T actions at once: events `[T, M, P]` and `[T, M, F]`. It counts the transitions
+        in `transition_mask`, with the objects that are real before and after the action. Of an initial window T, one
+        after the other: events `[M, P]` and `[M, F]`. f reads the `sampled` state of each before the next, its features
+        projected, such as to unit length, like observed ones.
         """
         if window.whole:
             before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
@@ -162,13 +167,13 @@ class Model(Program):
             yield DynamicsStep("", *self._likelihoods(mean, counted, scales, 2), after.centers, after.features)
             return
         state = window.first
-        for push, action in enumerate(actions.unbind(-2), start=1):
+        for number, action in enumerate(actions.unbind(-2), start=1):
             features = self.encoder(state) if self.dynamics.reads_encoding else None
             mean, scales = self.dynamics.outcome(state, features, action)
-            step = DynamicsStep(f"_{push}", *self._likelihoods(mean, state.mask, scales, 1))
+            step = DynamicsStep(f"_{number}", *self._likelihoods(mean, state.mask, scales, 1))
             yield step
             centers, sampled = step.sampled
-            state = State(centers, unit(sampled), state.mask.expand(centers.shape[:-1]))
+            state = State(centers, self.space.project(sampled), state.mask.expand(centers.shape[:-1]))
 
     def _likelihoods(
         self, mean: State, counted: Tensor, scales: Tensor | None, event_dims: int
@@ -181,7 +186,7 @@ class Model(Program):
 
 @dataclass
 class DynamicsStep:
-    """f's likelihoods of all pushes of a window, or of one: for the sites next_centers and next_features.
+    """f's likelihoods of all steps of a window, or of one: for the sites next_centers and next_features.
 
     suffix: of the sites' names: none, or _1, ..., _T. observed_centers, observed_features: None if they are sampled.
     sampled: centres and features, for the program to set before it asks for the next transition.

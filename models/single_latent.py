@@ -22,7 +22,7 @@ class SingleLatentModel(Model):
 
     c ~ p(c | s)                     # effect_code
     s' ~ h(s' | s, c)                # subgoal_centers, subgoal_features
-    a ~ g(a | s, c)                  # actions, T pushes; log-density times action_weight
+    a ~ g(a | s, c)                  # actions, T of them; log-density times action_weight
     s_t+1 ~ f(s_t+1 | s_t, a_t)      # next_centers, next_features, for t = 0, ..., T - 1
 
     Masks are as in `CascadedModel`, and so are the networks, without the layers that read z.
@@ -44,9 +44,9 @@ class SingleLatentModel(Model):
         Args:
             effect_dimension: C, numbers of an effect code.
             effect_prior: p(c | s); by default N(0, I).
-            action_weight: factor on the log-density of the pushes, which balances the two reconstructions. The paper
+            action_weight: factor on the log-density of the actions, which balances the two reconstructions. The paper
                 tunes it with care (section 4.2): up to a constant, a weight w divides the standard deviations of the
-                pushes by sqrt(w). The objective is a bound on the evidence only with 1.
+                actions by sqrt(w). The objective is a bound on the evidence only with 1.
             shared: the arguments of `Model`.
 
         Raises:
@@ -58,10 +58,13 @@ class SingleLatentModel(Model):
         self.effect_dimension = effect_dimension
         self.action_weight = action_weight
         self.meta_dynamics = MetaDynamics(
-            effect_dimension=effect_dimension, feature_dimension=self.feature_dimension, width=self.width
+            self.space,
+            effect_dimension=effect_dimension,
+            feature_dimension=self.feature_dimension,
+            width=self.width,
         )
         self.action_generator = ActionGenerator(
-            segment_length=self.segment_length, motion_dimension=None, width=self.width
+            self.space, segment_length=self.segment_length, motion_dimension=None, width=self.width
         )
         self.prior_of_effects = effect_prior or StandardPrior(dimension=effect_dimension)
 
@@ -79,7 +82,7 @@ class SingleLatentModel(Model):
                 pyro.sample("subgoal_centers", self.scales.centers(goal, real), obs=window.observed(last.centers))
                 pyro.sample("subgoal_features", self.scales.features(goal, real), obs=window.observed(last.features))
 
-                mean = self.action_generator(effect, first.mask)
+                mean = self.action_generator(effect, first)
                 with poutine.scale(scale=self.action_weight):
                     actions = pyro.sample("actions", self.scales.actions(mean), obs=window.observed(window.actions))
 
@@ -93,9 +96,9 @@ class SingleLatentModel(Model):
         return self.prior_of_effects(state)
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:
-        """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T pushes ahead."""
+        """Mean of h: `state: [...]`, `effect_code: [..., C]` -> the state T actions ahead."""
         return self.meta_dynamics(state, self.meta_dynamics.effect(self.encoder(state), effect_code))
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor | None = None) -> Tensor:
-        """Mean of g: `state: [...]`, `effect_code: [..., C]` -> `[..., T, 4]`; the motion code is ignored."""
-        return self.action_generator(self.meta_dynamics.effect(self.encoder(state), effect_code), state.mask)
+        """Mean of g: `state: [...]`, `effect_code: [..., C]` -> `[..., T, A]`; the motion code is ignored."""
+        return self.action_generator(self.meta_dynamics.effect(self.encoder(state), effect_code), state)

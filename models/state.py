@@ -1,4 +1,4 @@
-"""States of the tabletop and windows of experience (paper, sections 2 and 3.1)."""
+"""States and windows of experience (paper, sections 2 and 3.1)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class State(NamedTuple):
     `state[0]` is the tuple's first field, not a scene: use `scene` and `step` to index.
     """
 
-    centers: Tensor  # [..., M, 3] metres, in the robot's base frame
-    features: Tensor  # [..., M, F] geometric features of unit length
+    centers: Tensor  # [..., M, P] positions, in the world's unit
+    features: Tensor  # [..., M, F] what else is seen of each object, such as its geometry, of unit length, or an angle
     mask: Tensor  # [..., M] bool, True for real objects, False for padding
 
     @property
@@ -56,13 +56,13 @@ class State(NamedTuple):
 
 
 class Window(NamedTuple):
-    """One training example: `T + 1` states and the `T` pushes between them, in any batch `[...]`.
+    """One training example: `T + 1` states and the `T` actions between them, in any batch `[...]`.
 
     `window.initial` has the first state alone, and programs sample what they observe of a whole window.
     """
 
     states: State  # fields with leading [..., T + 1]; [..., 1] of an initial window
-    actions: Tensor  # [..., T, 4] normalised pushes (x, y, dx, dy): start and motion
+    actions: Tensor  # [..., T, A] normalised, in [-1, 1]
     transition_mask: Tensor  # [..., T] bool: transitions that count for the dynamics f
     sequence_mask: Tensor  # [...] bool: windows that count for the terms with latent variables (h and g)
 
@@ -73,17 +73,17 @@ class Window(NamedTuple):
 
     @property
     def segment_length(self) -> int:
-        """`T`, the number of pushes."""
+        """`T`, the number of actions."""
         return self.actions.shape[-2]
 
     @property
     def first(self) -> State:
-        """The state s before the first push: `[...]`."""
+        """The state s before the first action: `[...]`."""
         return self.states.step(0)
 
     @property
     def last(self) -> State:
-        """The state s' after the last push, the subgoal reached: `[...]`."""
+        """The state s' after the last action, the subgoal reached: `[...]`."""
         return self.states.step(-1)
 
     @property

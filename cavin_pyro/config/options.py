@@ -26,9 +26,11 @@ T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
 GIVEN = {  # which `build_model` or `make_planner` gives, by group
     "planner": ("decimals",),
-    "prior": ("dimension", "feature_dimension", "effect_dimension"),
+    "prior": ("space", "dimension", "feature_dimension", "effect_dimension"),
     "geometry": ("feature_dimension",),
-    "dynamics": ("feature_dimension", "width"),
+    "dynamics": ("space", "feature_dimension", "width"),
+    "model": ("space",),
+    "scales": ("space",),
 }
 NODES: dict[Any, Callable[..., ValueNode]] = {bool: BooleanNode, int: IntegerNode, float: FloatNode, str: StringNode}
 CONTAINERS = (Sequence, Mapping, list, tuple, dict)

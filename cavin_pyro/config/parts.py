@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import constructor_options
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
@@ -72,22 +73,25 @@ def build_model(config: Config) -> Model:
 
     A model gets a prior for each of its codes, that is, for each of `effect_dimension` and `motion_dimension`
     that its section has: `model.prior` where that names a class, else the section `prior`. Without that section,
-    `model` itself has the parts, as `describe` writes it. A part that cannot be built is a `UserError`.
+    `model` itself has the parts, as `describe` writes it. A part that cannot be built is a `UserError`. The section
+    `space` is the world's; without it, the tabletop's.
     """
     sizes, parts, kinds = dict(config["model"]), dict[str, Any](), list[str]()
     if "prior" in config:
         own_prior = sizes.pop("prior", None) or {}
         check_sizes("model", sizes)
         section = "model.prior" if own_prior.get("_target_") else "prior"
-        given = {"feature_dimension": sizes["feature_dimension"]}
+        space = construct(config["space"]) if config.get("space") else SPACE
+        given = {"space": space, "feature_dimension": sizes["feature_dimension"]}
         kinds = [kind for kind in ("effect", "motion") if f"{kind}_dimension" in sizes]
         for kind in kinds:
             given["effect_dimension"] = sizes.get("effect_dimension") if kind == "motion" else None
             prior = own_prior if section == "model.prior" else config["prior"]
             parts[f"{kind}_prior"] = build_part(section, prior, dimension=sizes[f"{kind}_dimension"], **given)
-        given = {"feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
+        given = {"space": space, "feature_dimension": sizes["feature_dimension"], "width": sizes["width"]}
         parts["dynamics"] = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
-        parts["scales"] = build_part("scales", config.get("scales") or FIXED_SCALES)
+        parts["scales"] = build_part("scales", config.get("scales") or FIXED_SCALES, space=space)
+        parts["space"] = space
     model = build_part("model", sizes, **parts)
     if not isinstance(model, Model):
         raise UserError(f"model {type(model).__name__} is no program: derive it from cavin_pyro.models.model.Model")
@@ -155,7 +159,8 @@ def _described(value: Any, place: str, model: Model) -> Any:
         options = {} if isinstance(value, type) else value.keywords
         return {"_target_": _dotted(function, place), "_partial_": True, **options}
     if is_dataclass(value):
-        return {"_target_": _dotted(type(value), place), **vars(value)}
+        described = {name: _described(one, f"{place}.{name}", model) for name, one in vars(value).items()}
+        return {"_target_": _dotted(type(value), place), **described}
     if isinstance(value, list | tuple):
         return [_described(one, place, model) for one in value]
     if value is None or isinstance(value, bool | int | float | str):

@@ -18,7 +18,7 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
 from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
 from cavin_pyro.models.model import Model
-from cavin_pyro.models.networks.layers import unit
+from cavin_pyro.models.space import unit
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program
 

@@ -35,7 +35,7 @@ from cavin_pyro.storage.trust import check_numbers, check_targets
 FORMAT = "cavin_pyro checkpoint"
 FORMAT_VERSION = 1
 POINTNET = "cavin_pyro.models.networks.pointnet.PointNet"
-BUILT_SECTIONS = ("model", "geometry", "dynamics", "prior", "scales", "guide")  # from which parts are built
+BUILT_SECTIONS = ("space", "model", "geometry", "dynamics", "prior", "scales", "guide")  # from which parts are built
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -203,6 +203,9 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
     whole = isinstance(config, dict) and isinstance(provenance, dict)
     if not whole or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
         raise UserError(f"checkpoint {path} has a damaged header (its configuration or provenance has no sections)")
+    scales = config.get("scales", {})
+    if "start" in scales and "motion" in scales:  # older names
+        scales["action"] = [scales.pop("start"), scales.pop("motion")]
     built = {section: config[section] for section in BUILT_SECTIONS if section in config}
     check_targets(built, path, trust)
     check_numbers(built, path, max((size for value in tensors.values() for size in value.shape), default=0))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavin_pyro.models.space import Space
+
 TABLE_LOW = (0.22, -0.61)  # metres; the table is 0.76 m by 1.22 m around (0.60, 0.00)
 TABLE_HIGH = (0.98, 0.61)  # metres
 TABLE_CENTER = (0.60, 0.00)  # metres
@@ -22,6 +24,20 @@ PUSH_DECIMALS = 3  # of a planned push's numbers: 0.1 mm of its motion, 0.25 and
 TILE_SIDE = 0.15  # metres
 TILE_ORIGIN = (0.295, -0.485)  # metres; the centre of tile (0, 0)
 TILE_COUNT = (5, 7)  # whole tiles on the table along x and y
+
+SPACE = Space(  # the loss weights of the published implementation, divided by that of the KL terms, are its scales
+    origin=(*TABLE_CENTER, 0.0),
+    length=MAXIMUM_MOTION,  # so that inputs of networks are of order one
+    step_range=0.15,
+    subgoal_range=0.5,
+    action_names=("start", "motion"),
+    action_sizes=(2, 2),
+    action_limits=(5.0, 1.0),  # of starts far outside of the reachable box [-1, 1]
+    center_scale=0.01,
+    feature_scale=0.1,  # of a vector of unit length
+    action_scales=(0.077, 0.245),
+)
+"""What networks must know of the table; lengths in metres."""
 
 Tile = tuple[int, int]
 """A tile's numbers (i, j) along x and y."""

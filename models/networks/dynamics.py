@@ -10,13 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.models.networks.layers import ObjectPool, fully_connected, unit
+from cavin_pyro.models.networks.layers import ObjectPool, fully_connected
 from cavin_pyro.models.part import Part
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
-
-PUSH_RANGE = 0.15  # metres, maximum displacement by one push along an axis
-SUBGOAL_RANGE = 0.5  # metres, maximum displacement by a segment along an axis
-START_LIMIT = 5.0  # normalised; soft clip of starts, far outside of the reachable box [-1, 1]
 
 
 class EffectTrunk(nn.Module):
@@ -49,28 +46,33 @@ class StateChange(nn.Module):
     """Predicts the change of each object, with one gate per object.
 
     center'  = center + gate * maximum_displacement * tanh(change of center)
-    feature' = unit(feature + gate * change of feature)
+    feature' = projection of feature + gate * change of feature, such as to unit length
+
+    In a turning space changes are in the axes of object 0.
     """
 
-    def __init__(self, *, maximum_displacement: float, feature_dimension: int = 64, width: int = 64) -> None:
+    def __init__(
+        self, space: Space, *, maximum_displacement: float, feature_dimension: int = 64, width: int = 64
+    ) -> None:
         super().__init__()
-        self.maximum_displacement = maximum_displacement  # metres, along each axis
-        self.parts = (1, 3, feature_dimension)
+        self.space = space
+        self.maximum_displacement = maximum_displacement  # along each axis
+        self.parts = (1, space.positions, feature_dimension)
         self.head = nn.Linear(width, sum(self.parts))
 
     def forward(self, state: State, effect: Tensor) -> State:
         """`effect: [..., M, width]` -> predicted state; leading dimensions broadcast, padding does not change."""
         gate, motion, turn = self.head(effect).split(self.parts, -1)
         gate = gate.sigmoid() * state.mask.unsqueeze(-1)
-        centers = state.centers + gate * (
-            self.maximum_displacement * motion.contiguous().tanh()
-        )  # tanh is slow on tensors that are not contiguous
-        features = unit(state.features + gate * turn)
+        # tanh is slow on tensors that are not contiguous
+        change = gate * (self.maximum_displacement * motion.contiguous().tanh())
+        centers = state.centers + self.space.turn(change, state, back=True)
+        features = self.space.project(state.features + self.space.turn(gate * turn, state, back=True))
         return State(centers, features, state.mask.expand(centers.shape[:-1]))
 
 
-class PushOutcome(Part, ABC):
-    """Base class of f, the state after one push.
+class Outcome(Part, ABC):
+    """Base class of f, the state after one action.
 
     Attributes:
         geometry: the class of geometric features that it can read, None for any. reads_encoding: whether it needs the
@@ -84,46 +86,60 @@ class PushOutcome(Part, ABC):
     neighbours: int | None = None
 
     def forward(self, state: State, encoded: Tensor | None, action: Tensor) -> State:
-        """The mean: `state: [...]`, its features `encoded: [..., M, 3 * width]`, `action: [..., 4]` -> `[...]`."""
+        """The mean: `state: [...]`, its features `encoded: [..., M, 3 * width]`, `action: [..., A]` -> `[...]`."""
         return self.outcome(state, encoded, action)[0]
 
     @abstractmethod
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor | None]:
-        """The mean, and if `predicts_scales` the scales `[..., M, 2]` of its centres (metres) and features."""
+        """The mean, and if `predicts_scales` the scales `[..., M, 2]` of its centres and features."""
 
 
-class Dynamics(PushOutcome):
-    """f as in the paper: the mean of the state after one push."""
+class Dynamics(Outcome):
+    """f as in the paper: the mean of the state after one action."""
 
     def __init__(
-        self, *, feature_dimension: int = 64, width: int = 64, maximum_displacement: float = PUSH_RANGE
+        self,
+        space: Space,
+        *,
+        feature_dimension: int = 64,
+        width: int = 64,
+        maximum_displacement: float | None = None,
     ) -> None:
         """The layers.
 
         Args:
+            space: of the world.
             feature_dimension: F, numbers of an object's geometric feature.
             width: width of all layers.
-            maximum_displacement: largest displacement of an object's centre by one push, along each axis, in metres.
+            maximum_displacement: of an object's centre by one action, along each axis; None takes the space's.
         """
         super().__init__()
-        self.trunk = EffectTrunk(4, width=width, encoder_width=width)
+        self.space = space
+        self.trunk = EffectTrunk(space.actions, width=width, encoder_width=width)
         self.change = StateChange(
-            maximum_displacement=maximum_displacement, feature_dimension=feature_dimension, width=width
+            space,
+            maximum_displacement=space.step_range if maximum_displacement is None else maximum_displacement,
+            feature_dimension=feature_dimension,
+            width=width,
         )
 
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor | None]:
         """The mean; it predicts no scales."""
         assert encoded is not None
-        return self.change(state, self.trunk(encoded, action)), None
+        return self.change(state, self.trunk(encoded, self.space.turn_actions(action, state, dims=0))), None
 
 
 class MetaDynamics(nn.Module):
-    """h: mean of the subgoal, the state T pushes ahead, given an effect code."""
+    """h: mean of the subgoal, the state T actions ahead, given an effect code."""
 
-    def __init__(self, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64) -> None:
+    def __init__(
+        self, space: Space, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64
+    ) -> None:
         super().__init__()
         self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=width)
-        self.change = StateChange(maximum_displacement=SUBGOAL_RANGE, feature_dimension=feature_dimension, width=width)
+        self.change = StateChange(
+            space, maximum_displacement=space.subgoal_range, feature_dimension=feature_dimension, width=width
+        )
 
     def effect(self, encoded: Tensor, effect_code: Tensor) -> Tensor:
         """Effect feature of (s, c): `[..., M, width]`. The action generator reads it too."""
@@ -135,41 +151,53 @@ class MetaDynamics(nn.Module):
 
 
 class ActionGenerator(nn.Module):
-    """g: mean of the T pushes (x, y, dx, dy) of a segment.
+    """g: mean of the T actions of a segment.
 
     pooled      = softmax-weighted mean of the effect features of (s, c) over real objects
     transformed = mean(pooled) + scale(pooled) * z
-    starts      = 5 tanh(x / 5) of FC(transformed), motions = tanh of FC(transformed)
+    part of a   = limit * tanh(FC(transformed) / limit), for each part of an action and its limit in the space
 
-    With `motion_dimension=None` there is no motion code, and the pushes depend on the pooled feature only.
+    With `motion_dimension=None` there is no motion code, and the actions depend on the pooled feature only.
     """
 
-    def __init__(self, *, segment_length: int = 3, motion_dimension: int | None = 16, width: int = 64) -> None:
+    def __init__(
+        self, space: Space, *, segment_length: int = 3, motion_dimension: int | None = 16, width: int = 64
+    ) -> None:
         super().__init__()
+        self.space = space
         self.pool = ObjectPool(width)
         self.transform = None if motion_dimension is None else nn.Linear(width, 2 * motion_dimension)
-        inputs = motion_dimension or width
-        self.starts = _coordinates(inputs, segment_length, width)
-        self.motions = _coordinates(inputs, segment_length, width)
+        for name, size in zip(space.action_names, space.action_sizes, strict=True):
+            layers = _numbers(motion_dimension or width, segment_length, size, width)
+            self.add_module(f"{name}s", layers)
 
-    def forward(self, effect: Tensor, mask: Tensor, motion_code: Tensor | None = None) -> Tensor:
-        """`effect: [..., M, width]`, `mask: [..., M]`, `motion_code: [..., D]` -> `[..., T, 4]`.
+    def forward(self, effect: Tensor, state: State, motion_code: Tensor | None = None) -> Tensor:
+        """`effect: [..., M, width]` of (s, c), `state: [...]`, `motion_code: [..., D]` -> `[..., T, A]`.
 
         Leading dimensions broadcast. Raises `ValueError` if a motion code is missing.
         """
-        feature = self.pool(effect, mask)
+        feature = self.pool(effect, state.mask)
         if self.transform is not None:
             if motion_code is None:
-                raise ValueError("these pushes depend on a motion code; none was given")
+                raise ValueError("these actions depend on a motion code; none was given")
             mean, scale = self.transform(feature).chunk(2, -1)
             # Softplus is ten times slower on tensors that are not contiguous.
             feature = mean + functional.softplus(scale.contiguous()) * motion_code
-        starts = START_LIMIT * (self.starts(feature) / START_LIMIT).tanh()
-        return torch.cat((starts, self.motions(feature).tanh()), -1)
+        parts = [
+            _limited(self.get_submodule(f"{name}s")(feature), limit)
+            for name, limit in zip(self.space.action_names, self.space.action_limits, strict=True)
+        ]
+        return self.space.turn_actions(torch.cat(parts, -1), state, back=True)
 
 
-def _coordinates(inputs: int, segment_length: int, width: int) -> nn.Sequential:
-    """Two numbers for each of the T pushes: `[..., inputs] -> [..., T, 2]`."""
+def _numbers(inputs: int, segment_length: int, size: int, width: int) -> nn.Sequential:
+    """`size` numbers for each of the T actions: `[..., inputs] -> [..., T, size]`."""
     return nn.Sequential(
-        fully_connected(inputs, width), nn.Linear(width, 2 * segment_length), nn.Unflatten(-1, (segment_length, 2))
+        fully_connected(inputs, width),
+        nn.Linear(width, size * segment_length),
+        nn.Unflatten(-1, (segment_length, size)),
     )
+
+
+def _limited(values: Tensor, limit: float) -> Tensor:
+    return values.tanh() if limit == 1 else limit * (values / limit).tanh()

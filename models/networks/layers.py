@@ -16,10 +16,9 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 from torch.nn import functional
 
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
-TABLE_CENTER = (0.6, 0.0, 0.0)  # metres, in the robot's base frame
-POSITION_UNIT = 0.1  # metres; about the length of a push, so that inputs of networks are of order one
 SCALE_FLOOR = 1e-6  # lower bound on standard deviations, so that densities stay finite
 _FIXED = ContextVar("_FIXED", default=False)
 
@@ -45,22 +44,6 @@ def shapes_are_fixed() -> bool:
 def fully_connected(inputs: int, outputs: int) -> nn.Sequential:
     """One "FC layer" of the paper: linear, then ReLU. `[..., inputs] -> [..., outputs]`."""
     return nn.Sequential(nn.Linear(inputs, outputs), nn.ReLU(inplace=True))
-
-
-def relative_positions(centers: Tensor) -> Tensor:
-    """`centers: [..., 3]` metres -> positions from the table's centre, in units of 0.1 m.
-
-    Raw coordinates of about 0.6 m differ by only a few centimetres; centring and scaling makes such differences visible
-    to a network.
-    """
-    # Filled where the centres are: a copy from the CPU would let a GPU wait, and CUDA graphs have none.
-    origin = torch.cat([centers.new_full((1,), coordinate) for coordinate in TABLE_CENTER])
-    return (centers - origin) / POSITION_UNIT
-
-
-def unit(values: Tensor) -> Tensor:
-    """Scale to unit length along the last dimension; zeros stay zeros."""
-    return functional.normalize(values, dim=-1)
 
 
 class ObjectPool(nn.Module):
@@ -107,18 +90,23 @@ class StateEncoder(nn.Module):
     geometric_i = FC(feature_i)
     relation_i  = sum over other real objects j of FC(FC(center_j - center_i))
 
+    Centres are as the space locates and describes them.
+
     Of more than `neighbours` others the nearest enter the sum. Equivariant to the order of objects; padding does not
     affect the features of real objects.
     """
 
-    def __init__(self, *, feature_dimension: int = 64, width: int = 64, neighbours: int | None = None) -> None:
+    def __init__(
+        self, space: Space, *, feature_dimension: int = 64, width: int = 64, neighbours: int | None = None
+    ) -> None:
         """`neighbours`: None sums over all others, as in the paper."""
         super().__init__()
+        self.space = space
         self.feature_dimension = feature_dimension
         self.neighbours = neighbours
-        self.spatial = fully_connected(3, width)
+        self.spatial = fully_connected(space.inputs, width)
         self.geometric = fully_connected(feature_dimension, width)
-        self.difference = nn.Linear(3, width)
+        self.difference = nn.Linear(space.positions, width)
         self.relation = fully_connected(width, width)
 
     def forward(self, state: State) -> Tensor:
@@ -131,8 +119,8 @@ class StateEncoder(nn.Module):
                 f"features have {state.features.shape[-1]} numbers per object; "
                 f"this model expects {self.feature_dimension}"
             )
-        positions = relative_positions(state.centers)
-        spatial = self.spatial(positions)
+        positions = self.space.locate(state)
+        spatial = self.spatial(self.space.describe(state, positions))
         # The layer is linear in the difference: W p_j - (W p_i - b) takes M products instead of M squared.
         others = functional.linear(positions, self.difference.weight)
         own = others - self.difference.bias
@@ -152,9 +140,9 @@ class Neighbour(NamedTuple):
 
 
 def squared_distances(centers: Tensor, mask: Tensor) -> Tensor:
-    """On the table, between all objects: `[..., M, M]` square metres, infinite to itself and to padding.
+    """In the plane of the first two numbers, between all objects: `[..., M, M]`, infinite to itself and to padding.
 
-    `centers: [..., M, 3]` metres, `mask: [..., M]`.
+    `centers: [..., M, 2 or more]`, `mask: [..., M]`.
     """
     x, y = centers[..., 0], centers[..., 1]
     squared = (x.unsqueeze(-1) - x.unsqueeze(-2)).square() + (y.unsqueeze(-1) - y.unsqueeze(-2)).square()
@@ -165,7 +153,7 @@ def squared_distances(centers: Tensor, mask: Tensor) -> Tensor:
 def nearest_pairs(centers: Tensor, mask: Tensor, most: int) -> Tensor:
     """Whether object j is among the `most` nearest others of object i: `[..., M, M]` bool, for networks of all pairs.
 
-    `centers: [..., M, 2 or 3]` metres, `mask: [..., M]` bool. It may be true of padding.
+    `centers: [..., M, 2 or more]`, `mask: [..., M]` bool. It may be true of padding.
     """
     squared = squared_distances(centers, mask.bool())
     return squared <= squared.topk(most, largest=False).values[..., -1:]
@@ -174,11 +162,11 @@ def nearest_pairs(centers: Tensor, mask: Tensor, most: int) -> Tensor:
 def neighbours(centers: Tensor, mask: Tensor, most: int | None) -> list[Neighbour]:
     """For each object the other objects that enter its relations, at most `most` of them.
 
-    All others where there are no more than `most`, or if it is None; else the nearest on the table, so that relation
+    All others where there are no more than `most`, or if it is None; else the nearest, so that relation
     sums do not grow in a crowded scene, and their cost grows with the number of objects, not with its square.
 
     Args:
-        centers: `[..., M, 3]` metres. mask: `[..., M]`.
+        centers: `[..., M, 2 or more]`. mask: `[..., M]`.
     """
     others = mask.shape[-1] - 1
     if most is None or others <= most:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.models.networks.layers import unit
+from cavin_pyro.models.space import unit
 
 HARMONICS = 8  # K; the outline of a box is off by about a millimetre
 DIRECTIONS = 32  # around the object, in which its extent is measured

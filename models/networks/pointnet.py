@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.models.networks.layers import fully_connected, unit
+from cavin_pyro.models.networks.layers import fully_connected
+from cavin_pyro.models.space import unit
 
 CLOUD_UNIT = 0.1  # metres; about the size of an object
 DECODED_POINTS = 64

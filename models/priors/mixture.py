@@ -25,8 +25,8 @@ class ObjectMixturePrior(LearnedPrior):
     i ~ Categorical(weights(s, c))          # object and component, real objects only
     code ~ N(mean_i(s, c), scale_i(s, c))
 
-    A segment pushes one object or another: its codes lie in as many places as there are objects, and one Gaussian over
-    all of them covers what lies between, where pushes touch nothing. The index i is summed out, so that there is no
+    A segment moves one object or another: its codes lie in as many places as there are objects, and one Gaussian over
+    all of them covers what lies between, where actions touch nothing. The index i is summed out, so that there is no
     discrete site. It is initialised close to N(0, I), the paper's prior. Its divergences have no closed form:
     `TraceMeanField_ELBO` uses the one-sample estimate of `Trace_ELBO`.
     """

@@ -8,8 +8,9 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from cavin_pyro.models.networks.layers import fully_connected, relative_positions
+from cavin_pyro.models.networks.layers import fully_connected
 from cavin_pyro.models.part import Part
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
 
@@ -18,6 +19,7 @@ class Prior(Protocol):
 
     `build_model` constructs a prior for each code of a model, with the keywords
 
+    `space`                of the world
     `dimension`            of the code
     `feature_dimension`    F of the states
     `effect_dimension`     C for p(z | s, c), None for p(c | s)
@@ -38,9 +40,10 @@ class SceneContext(nn.Module):
     and to padding.
     """
 
-    def __init__(self, *, feature_dimension: int, effect_dimension: int | None, width: int) -> None:
+    def __init__(self, space: Space, *, feature_dimension: int, effect_dimension: int | None, width: int) -> None:
         super().__init__()
-        self.from_object = nn.Linear(3 + feature_dimension, width)
+        self.space = space
+        self.from_object = nn.Linear(space.inputs + feature_dimension, width)
         self.from_code = None if effect_dimension is None else nn.Linear(effect_dimension, width, bias=False)
         self.objects = fully_connected(width, width)
         self.scene = fully_connected(width, width)
@@ -54,7 +57,8 @@ class SceneContext(nn.Module):
 
     def parts(self, state: State, effect_code: Tensor | None) -> tuple[Tensor, Tensor]:
         """Features of each object `[..., M, width]`, zero for padding, and of the scene `[..., width]`."""
-        hidden = self.from_object(torch.cat((relative_positions(state.centers), state.features), -1))
+        place = self.space.describe(state, self.space.locate(state))
+        hidden = self.from_object(torch.cat((place, state.features), -1))
         if self.from_code is not None and effect_code is not None:
             hidden = hidden + self.from_code(effect_code).unsqueeze(-2)
         elif self.from_code is not None or effect_code is not None:
@@ -68,8 +72,16 @@ class LearnedPrior(Part):
     """Base class of learned priors. For their dimensions see `Prior`; `width`: of all layers."""
 
     def __init__(
-        self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None, width: int = 32
+        self,
+        *,
+        space: Space,
+        dimension: int = 16,
+        feature_dimension: int = 64,
+        effect_dimension: int | None = None,
+        width: int = 32,
     ) -> None:
         super().__init__()
         self.dimension = dimension
-        self.context = SceneContext(feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width)
+        self.context = SceneContext(
+            space, feature_dimension=feature_dimension, effect_dimension=effect_dimension, width=width
+        )

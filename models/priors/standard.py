@@ -8,6 +8,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from cavin_pyro.models.part import Part
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
 
@@ -15,7 +16,12 @@ class StandardPrior(Part):
     """N(0, I) for every state (the paper's prior), without layers; of its dimensions, see `Prior`, one is read."""
 
     def __init__(
-        self, *, dimension: int = 16, feature_dimension: int = 64, effect_dimension: int | None = None
+        self,
+        *,
+        space: Space | None = None,
+        dimension: int = 16,
+        feature_dimension: int = 64,
+        effect_dimension: int | None = None,
     ) -> None:
         super().__init__()
         self.dimension = dimension

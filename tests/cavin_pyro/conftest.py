@@ -23,6 +23,7 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.data.collection import CollectionConfig, collect
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.networks.pointnet import PointNet
@@ -131,7 +132,7 @@ def _command_server() -> subprocess.Popen[str]:
 def small_parts(seed: int = 0) -> dict[str, torch.nn.Module]:
     """An untrained cascade of width 8."""
     torch.manual_seed(seed)
-    model = CascadedModel(effect_dimension=4, motion_dimension=4, width=8)
+    model = CascadedModel(space=SPACE, effect_dimension=4, motion_dimension=4, width=8)
     return {"model": model, "guide": CascadedGuide(model, width=8), "geometry": PointNet()}
 
 

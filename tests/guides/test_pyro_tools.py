@@ -12,6 +12,7 @@ from pyro import infer, poutine
 from pyro.infer import MCMC, NUTS, Importance, Predictive
 from pyro.infer.reparam import LocScaleReparam
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.likelihoods import LikelihoodScales
 from cavin_pyro.models.state import Window
@@ -60,7 +61,7 @@ def test_f_follows_actions_that_are_set_and_a_guide_needs_whole_windows(random_w
 @torch.no_grad()
 def test_importance_sampling_from_the_guide_finds_the_evidence(random_window: Callable[..., Window]) -> None:
     """Wide likelihoods hardly tell about the codes, so that samples of the prior average to the same evidence."""
-    wide = LikelihoodScales(center=1.0, feature=1.0, start=2.0, motion=2.0)
+    wide = LikelihoodScales(SPACE, center=1.0, feature=1.0, action=(2.0, 2.0))
     model = make_model("cascaded", scales=wide)
     guide, window = CascadedGuide(model, width=8), random_window().map(lambda field: field[:1])
 

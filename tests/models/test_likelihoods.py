@@ -8,6 +8,7 @@ import torch
 from pyro import distributions
 from torch import Tensor
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.likelihoods import IsotropicNormal, IsotropicStudentT, LikelihoodScales
 from cavin_pyro.models.state import State
 
@@ -18,9 +19,9 @@ def numbers(*shape: int) -> Tensor:
 
 def test_default_scales_are_those_of_the_published_loss_weights() -> None:
     # weight / KL weight = 1 / variance; the action's weight is a mean over T = 3 pushes of two coordinates.
-    scales = LikelihoodScales()
+    scales = LikelihoodScales(SPACE)
     expected = [(0.1 / 1000) ** 0.5, (0.1 / 10) ** 0.5, (3 * 0.1 / 50) ** 0.5, (3 * 0.1 / 5) ** 0.5]
-    assert [scales.center, scales.feature, scales.start, scales.motion] == pytest.approx(expected, rel=0.01)
+    assert [scales.center, scales.feature, *scales.action] == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize("name", ["normal", "student", "upright"])
@@ -59,8 +60,8 @@ def test_what_is_not_positive_is_refused() -> None:
         IsotropicStudentT(2.0, torch.zeros(1, 3), torch.ones(1))
     with pytest.raises(ValueError, match="ratio must be positive, not nan"):
         IsotropicStudentT(3.0, torch.zeros(1, 3), torch.ones(1), float("nan"))
-    with pytest.raises(ValueError, match="scales.start must be between 1e-12 and 1e12, not -1"):
-        LikelihoodScales(start=-1.0)
+    with pytest.raises(ValueError, match="scales.action must be between 1e-12 and 1e12, not -1"):
+        LikelihoodScales(SPACE, action=(-1.0, 1.0))
     with pytest.raises(ValueError):
         IsotropicNormal(torch.zeros(1), 1.0, validate_args=True).log_prob(torch.tensor([float("nan")]))
 
@@ -68,7 +69,7 @@ def test_what_is_not_positive_is_refused() -> None:
 def test_objects_that_do_not_count_add_nothing_and_starts_weigh_more_than_motions(
     random_state: Callable[..., State],
 ) -> None:
-    mean, observed, scales = random_state(2, 3, real=2), random_state(2, 3), LikelihoodScales()
+    mean, observed, scales = random_state(2, 3, real=2), random_state(2, 3), LikelihoodScales(SPACE)
     likelihood = scales.centers(mean, mean.mask, event_dims=2)
     assert (likelihood.batch_shape, likelihood.event_shape) == ((2,), (3, 4, 3))
     by_hand = distributions.Normal(mean.centers[:, :, :2], 0.01).log_prob(observed.centers[:, :, :2])

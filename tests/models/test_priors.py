@@ -10,13 +10,14 @@ from pyro.distributions import Normal
 from torch import Tensor, nn
 from torch.distributions import Categorical, Independent, MixtureSameFamily
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.priors.conditional import ConditionalPrior
 from cavin_pyro.models.priors.flow import FlowPrior
 from cavin_pyro.models.priors.mixture import GaussianMixture, ObjectMixturePrior
 from cavin_pyro.models.priors.standard import StandardPrior
 from cavin_pyro.models.state import State
 
-SIZES = {"dimension": 4, "feature_dimension": 6, "width": 8}
+SIZES = {"space": SPACE, "dimension": 4, "feature_dimension": 6, "width": 8}
 PRIORS = (ConditionalPrior, FlowPrior, ObjectMixturePrior)
 each_prior = pytest.mark.parametrize("kind", PRIORS)
 
@@ -162,7 +163,7 @@ def test_noise_becomes_codes_of_the_mixture_in_every_direction_and_stays_finite(
 
 
 def test_padding_is_never_chosen_and_no_objects_give_numbers(random_state: Callable[..., State]) -> None:
-    prior = ObjectMixturePrior(dimension=2, feature_dimension=6, components=2)
+    prior = ObjectMixturePrior(space=SPACE, dimension=2, feature_dimension=6, components=2)
     for parameter in prior.parameters():
         nn.init.normal_(parameter, std=0.3)
     weights = prior(random_state(50, objects=4, real=2)).log_weights.exp()

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pyro import distributions, poutine
 from torch import Tensor, nn
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.dynamics_only import DynamicsModel
 from cavin_pyro.models.flat import FlatModel
@@ -24,7 +25,7 @@ from cavin_pyro.models.priors.standard import StandardPrior
 from cavin_pyro.models.single_latent import SingleLatentModel
 from cavin_pyro.models.state import State, Window
 
-SIZES = {"feature_dimension": 6, "width": 8}
+SIZES = {"space": SPACE, "feature_dimension": 6, "width": 8}
 TRANSITIONS = {"next_centers": (4, 3, 4, 3), "next_features": (4, 3, 4, 6)}
 ACTIONS = {"actions": (4, 3, 4)}
 SUBGOAL = {"subgoal_centers": (4, 4, 3), "subgoal_features": (4, 4, 6)}
@@ -100,7 +101,7 @@ def test_generated_windows_score_the_same_when_observed(random_window: Callable[
 
 @every_model
 def test_windows_of_another_shape_are_refused(kind: type[Model], random_window: Callable[..., Window]) -> None:
-    with pytest.raises(ValueError, match="window has 2 pushes; this model was made for 3"):
+    with pytest.raises(ValueError, match="window has 2 actions; this model was made for 3"):
         kind(**SIZES)(random_window(steps=2))
     with pytest.raises(ValueError, match=r"one batch \[B\]; got leading dimensions \[1, 4\]"):
         kind(**SIZES)(random_window().map(lambda tensor: tensor.unsqueeze(0)))
@@ -196,7 +197,7 @@ def test_scales_and_priors_are_parts_like_any_other(random_window: Callable[...,
         def forward(self, state: State, effect_code: Tensor | None = None) -> Any:
             return distributions.Normal(super().forward(state, effect_code).mean + 9, 1.0).to_event(1)
 
-    model = CascadedModel(scales=LearnedScales(), effect_prior=Shifted(dimension=16), **SIZES)
+    model = CascadedModel(scales=LearnedScales(SPACE), effect_prior=Shifted(dimension=16), **SIZES)
     traced = trace(model, random_window())
     assert traced.nodes["effect_code"]["value"].mean() > 7 > traced.nodes["motion_code"]["value"].mean()
     traced.log_prob_sum().backward()
@@ -212,14 +213,14 @@ def test_a_weight_of_actions_is_positive(weight: float) -> None:
 def contact_model(scales: LikelihoodScales) -> tuple[CascadedModel, Window]:
     """With an f that predicts scales, which it needs for `PredictedScales` alone."""
     torch.manual_seed(0)
-    model = CascadedModel(width=8, scales=scales, dynamics=ContactDynamics(object_width=8, pair_width=4))
+    model = CascadedModel(space=SPACE, width=8, scales=scales, dynamics=ContactDynamics(object_width=8, pair_width=4))
     clouds, mask = 0.03 * torch.randn(3, 4, 2, 32, 3), torch.ones(3, 4, 2, dtype=torch.bool)
     centers = torch.tensor([0.5, 0.0, 0.02]) + 0.1 * torch.randn(3, 4, 2, 3)
     counted = mask[:, :3, 0]
     return model, Window(State(centers, Outline()(clouds), mask), 2 * torch.rand(3, 3, 4) - 1, counted, counted[:, 0])
 
 
-@pytest.mark.parametrize("scales", [PredictedScales(), LikelihoodScales()])
+@pytest.mark.parametrize("scales", [PredictedScales(SPACE), LikelihoodScales(SPACE)])
 def test_f_is_scored_by_students_t_with_its_own_scales_or_by_fixed_ones(scales: LikelihoodScales) -> None:
     model, seen = contact_model(scales)
     site = trace(model, seen).nodes["next_centers"]
@@ -232,4 +233,4 @@ def test_f_is_scored_by_students_t_with_its_own_scales_or_by_fixed_ones(scales: 
     assert torch.allclose(site["fn"].log_prob(site["value"]), scored, rtol=1e-4, atol=1e-3)
     trace(model.generate, seen)
     with pytest.raises(ValueError, match="scales=predicted needs an f that predicts them"):
-        CascadedModel(scales=PredictedScales(), **SIZES)
+        CascadedModel(scales=PredictedScales(SPACE), **SIZES)

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 from torch.distributions import ExpTransform, Independent, Normal, TransformedDistribution, Uniform
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.priors.conditional import ConditionalPrior
 from cavin_pyro.models.priors.flow import FlowPrior
@@ -24,6 +25,7 @@ each_prior = pytest.mark.parametrize("kind", [StandardPrior, ConditionalPrior, F
 def model_with(kind: type) -> CascadedModel:
     torch.manual_seed(0)
     model = CascadedModel(
+        space=SPACE,
         effect_dimension=5,
         motion_dimension=4,
         feature_dimension=1,

@@ -16,11 +16,12 @@ from cavin_pyro.models.networks.contact.geometry import (
     ToolContact,
     endpoints,
     in_reach,
+    on_table,
     pair_contact,
 )
 from cavin_pyro.models.networks.contact.rows import Pairs, Rows, components_first, near_pairs
-from cavin_pyro.models.networks.dynamics import PushOutcome
-from cavin_pyro.models.networks.layers import fully_connected, relative_positions, shapes_are_fixed
+from cavin_pyro.models.networks.dynamics import Outcome
+from cavin_pyro.models.networks.layers import fully_connected, shapes_are_fixed
 from cavin_pyro.models.networks.outline import (
     FEATURES,
     HEIGHTS,
@@ -36,14 +37,16 @@ from cavin_pyro.models.networks.outline import (
     turned,
     turned_moments,
 )
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
 MAXIMUM_DISPLACEMENT = 0.2  # metres, by one push, along each axis
+PUSHES = 3, ("start", "motion")  # numbers of a position, and parts of an action
 PLACE = 4  # numbers that say where on the table an object lies, and where a push points to
 INPUTS = 5 + (OUTLINES * PER_OUTLINE + HEIGHTS) + MEASURES + PLACE
 
 
-class ContactDynamics(PushOutcome):
+class ContactDynamics(Outcome):
     """f: mean and scale of the state after one push, from outlines of objects (`Outline`).
 
     In the frame of the push, whose origin is its start and whose x axis is its direction:
@@ -74,6 +77,7 @@ class ContactDynamics(PushOutcome):
 
     def __init__(
         self,
+        space: Space | None = None,
         *,
         feature_dimension: int = 64,
         width: int = 64,
@@ -86,6 +90,7 @@ class ContactDynamics(PushOutcome):
         """The layers.
 
         Args:
+            space: of the world, in which an action must be a push.
             feature_dimension: numbers of an outline.
             width: width of the state encoder, which f does not read.
             object_width: width of the layers for an object.
@@ -95,8 +100,10 @@ class ContactDynamics(PushOutcome):
             equivariant: whether f is equivariant to turns and shifts of the table.
 
         Raises:
-            ValueError: features that are no outlines, or a negative margin.
+            ValueError: another world, features that are no outlines, or a negative margin.
         """
+        if space is not None and (space.positions, space.action_names) != PUSHES:
+            raise ValueError("dynamics=contact is for pushes on a table: choose dynamics=paper")
         if feature_dimension != FEATURES:
             raise ValueError(f"dynamics=contact reads outlines with {FEATURES} numbers, not {feature_dimension}")
         if reach_margin is not None and not reach_margin >= 0:
@@ -125,11 +132,11 @@ class ContactDynamics(PushOutcome):
             self.still_scale = nn.Parameter(torch.zeros(2))
 
     def forward(self, state: State, encoded: Tensor | None, action: Tensor) -> State:
-        """See `PushOutcome`; `encoded` is ignored."""
+        """See `Outcome`; `encoded` is ignored."""
         return self._predict(state, action)[0]
 
     def outcome(self, state: State, encoded: Tensor | None, action: Tensor) -> tuple[State, Tensor]:
-        """The mean and scales of `state: [...]` after `action: [..., 4]`, see `PushOutcome`; `encoded` is ignored."""
+        """The mean and scales of `state: [...]` after `action: [..., 4]`, see `Outcome`; `encoded` is ignored."""
         mean, rows, scales = self._predict(state, action)
         still = _scales(self.still_scale.unsqueeze(1)).T.expand(state.objects, -1)
         return mean, rows.write(still, _scales(scales))
@@ -165,13 +172,13 @@ class ContactDynamics(PushOutcome):
         shape = turned(shape.unflatten(0, (OUTLINES, PER_OUTLINE)), cosines, sines)
         outline = torch.addcmul(self.typical.unsqueeze(1), self.spread.unsqueeze(1), shape[0])
         contact = self.contact(*place, outline, length.squeeze(0))
-        table = relative_positions(centers.movedim(0, -1)).movedim(-1, 0)
+        table = on_table(centers)
         where = (along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT)
         if self.equivariant:
-            heights, on_table = turned_moments(heights, cosines[1], sines[1]), [table[2:]]
+            heights, fixed = turned_moments(heights, cosines[1], sines[1]), [table[2:]]
         else:
-            on_table = [direction, table]
-        each = torch.cat((*where, shape.flatten(0, 1), heights, *on_table, contact)).T  # [R, inputs]
+            fixed = [direction, table]
+        each = torch.cat((*where, shape.flatten(0, 1), heights, *fixed, contact)).T  # [R, inputs]
 
         move, scale = self._motion(each, place, outline, rows, rows.pairs(near)).split((3, 1))
         change = self.shape_head(self.shape(each)).T.contiguous()

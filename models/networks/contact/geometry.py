@@ -20,6 +20,7 @@ from cavin_pyro.models.networks.outline import (
 
 REACH_LOW, REACH_HIGH = (0.30, -0.55), (0.80, 0.55)  # metres; where starts and ends of pushes may lie
 REACH = torch.tensor((REACH_LOW, REACH_HIGH), dtype=torch.float64)
+TABLE_CENTER = (0.6, 0.0, 0.0)  # metres, in the robot's base frame
 PUSH_UNIT = 0.1  # metres, maximum motion of the tool along an axis
 DISPLACEMENT_UNIT = 0.05  # metres, a typical motion of an object
 TOOL_RADIUS = 0.01  # metres
@@ -87,6 +88,13 @@ class ToolContact(nn.Module):
         enter, inside = enter.clamp(-0.2, 0.3), crossed.amax(0)
         measures = (enter, chord, rest, rest * hit, normal_x, normal_y, hit * normal_y, inside)
         return torch.stack(measures) * self.units.view(-1, *ones)
+
+
+def on_table(centers: Tensor) -> Tensor:
+    """Places from the table's centre in units of `PUSH_UNIT`: `[3, R]`, from `centers: [3, R]` metres."""
+    # Filled where the centres are: a copy from the CPU would let a GPU wait, and CUDA graphs have none.
+    origin = torch.cat([centers.new_full((1, 1), coordinate) for coordinate in TABLE_CENTER])
+    return (centers - origin) / PUSH_UNIT
 
 
 def endpoints(action: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from cavin_pyro.criticism.guide import simulate
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.guides.none import NoGuide
 from cavin_pyro.models.cascaded import CascadedModel
@@ -98,14 +99,14 @@ def scene_context(guide: PyroModule, *, shuffled: bool = False, batch: int = 600
     )
 
 
-SIZES = {"feature_dimension": 4, "width": 8, "maximum_objects": 3}
+SIZES = {"space": SPACE, "feature_dimension": 4, "width": 8, "maximum_objects": 3}
 COUNT = 400
 
 
 def cascade_of(center: float = 0.01, feature: float = 0.1) -> CascadedModel:
     """A small cascade whose codes matter, with these scales; always the same weights."""
     torch.manual_seed(1)
-    scales = LikelihoodScales(center=center, feature=feature)
+    scales = LikelihoodScales(SPACE, center=center, feature=feature)
     model = CascadedModel(**SIZES, effect_dimension=2, motion_dimension=2, scales=scales)
     with torch.no_grad():
         model.meta_dynamics.change.head.weight.mul_(5.0)

@@ -28,6 +28,7 @@ from cavin_pyro.criticism.recalibration import (
     sleep_loss,
 )
 from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.none import NoGuide
 from cavin_pyro.models.dynamics_only import DynamicsModel
 from cavin_pyro.models.likelihoods import PredictedScales
@@ -122,7 +123,7 @@ def contact_model() -> DynamicsModel:
     torch.manual_seed(0)
     f = ContactDynamics(object_width=16, pair_width=8)
     f.head.bias.data[3] = 1.5  # so wide that nearly all objects move over 1 cm
-    return DynamicsModel(segment_length=1, scales=PredictedScales(), dynamics=f).requires_grad_(False)
+    return DynamicsModel(space=SPACE, segment_length=1, scales=PredictedScales(SPACE), dynamics=f).requires_grad_(False)
 
 
 def windows_of(model: DynamicsModel, *, wider: float, count: int = 3000, still: int = 0) -> Window:
@@ -172,7 +173,7 @@ def test_one_half_of_the_episodes_fits_and_the_other_half_tells_what_it_brought(
 
 def test_scales_that_cannot_be_calibrated_are_one_line() -> None:
     with pytest.raises(UserError, match=r"parts=\[scales\] .* choose parts=\[guide\]"):
-        check_scales(DynamicsModel())
+        check_scales(DynamicsModel(space=SPACE))
     one = contact_model()
     with pytest.raises(UserError, match="no object moved"):
         calibrate_scales(one, windows_of(one, wider=1.0, count=20, still=20))

@@ -9,6 +9,7 @@ from torch import nn
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_model
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.likelihoods import PredictedScales
@@ -47,14 +48,15 @@ def test_a_checkpoint_alone_is_enough_to_build_its_parts(small: SimpleNamespace,
 
 
 def test_a_model_built_in_python_needs_no_configuration(tmp_path: Path) -> None:
-    path, sizes = tmp_path / "mine.safetensors", {"dimension": 4, "width": 8}
+    path, sizes = tmp_path / "mine.safetensors", {"space": SPACE, "dimension": 4, "width": 8}
     model = CascadedModel(
+        space=SPACE,
         effect_dimension=4,
         motion_dimension=4,
         width=8,
         effect_prior=ObjectMixturePrior(**sizes, components=2),
         motion_prior=ConditionalPrior(**sizes, effect_dimension=4),
-        scales=PredictedScales(height_ratio=0.4),
+        scales=PredictedScales(SPACE, height_ratio=0.4),
         dynamics=ContactDynamics(object_width=8, pair_width=8, shape_width=8),
     )
     guide = CascadedGuide(model, width=8, motion_reads_effect=False)
@@ -71,13 +73,17 @@ def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: P
         """No other program can import it."""
 
     for model, said in (
-        (CascadedModel(effect_prior=nn.Identity()), r"^model\.effect_prior is a Identity, .*Part"),
+        (CascadedModel(space=SPACE, effect_prior=nn.Identity()), r"^model\.effect_prior is a Identity, .*Part"),
         (Own(), "^model is of class .*Own, which no other program can import: move it into a module"),
     ):
         with pytest.raises(UserError, match=said):
             save(tmp_path / "a.safetensors", model=model)
     with pytest.raises(UserError, match="^the guide was built for another model"):
-        save(tmp_path / "a.safetensors", model=CascadedModel(), guide=CascadedGuide(CascadedModel()))
+        save(
+            tmp_path / "a.safetensors",
+            model=CascadedModel(space=SPACE),
+            guide=CascadedGuide(CascadedModel(space=SPACE)),
+        )
     assert not list(tmp_path.iterdir())
 
 

@@ -12,6 +12,7 @@ from pyro.distributions import Normal
 from pyro.infer import Trace_ELBO, TraceEnum_ELBO, TraceMeanField_ELBO
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.models.model import sequence_mask, windows_plate
 from cavin_pyro.models.priors.conditional import ConditionalPrior
@@ -105,7 +106,7 @@ SITES = ("actions", "subgoal_centers", "subgoal_features", "next_centers", "next
 def conditional(guide: str | type[CascadedGuide]) -> tuple:
     """A cascade whose p(z | s, c) depends on c, with a guide."""
     torch.manual_seed(1)
-    prior = ConditionalPrior(dimension=4, feature_dimension=6, effect_dimension=5, width=8)
+    prior = ConditionalPrior(space=SPACE, dimension=4, feature_dimension=6, effect_dimension=5, width=8)
     torch.nn.init.normal_(prior.code.head.weight, std=0.5)
     if isinstance(guide, str):
         programs = make("cascaded", guide, motion_prior=prior)

@@ -16,7 +16,7 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
-from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, SPACE, TABLE_HIGH, TABLE_LOW
 from cavin_pyro.evaluation.factory import make_runner
 from cavin_pyro.guides.automatic import AutomaticGuide
 from cavin_pyro.guides.cascaded import CascadedGuide
@@ -179,7 +179,7 @@ def windows_by_hand() -> WindowTable:
 
 def test_programs_fitted_in_python_have_the_best_weights_and_resume_as_a_checkpoint(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    model = CascadedModel(width=8)
+    model = CascadedModel(space=SPACE, width=8)
     guide = CascadedGuide(model, width=8)
     options = {"steps": 12, "validate_every": 2, "batch_size": 4, "learning_rate": 0.1, "output": tmp_path / "mine"}
     whole = fit(model, guide, windows_by_hand(), geometry=Outline(), **options)
@@ -201,6 +201,6 @@ def test_programs_fitted_in_python_have_the_best_weights_and_resume_as_a_checkpo
 def test_an_automatic_guide_is_fitted_in_python_and_writes_nothing(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
     with pyro.settings.context(module_local_params=False):  # as by default in Pyro
-        model = FlatModel(width=8)
+        model = FlatModel(space=SPACE, width=8)
         run = fit(model, AutomaticGuide(model, autoguide=AutoNormal), windows_by_hand(), steps=2, batch_size=4)
     assert run.best_step == 2 and not list(tmp_path.iterdir()) and not pyro.get_param_store().keys()

@@ -11,16 +11,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from cavin_pyro.envs.tabletop.robots.robot import STICK_RADIUS
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.envs.tabletop.workspace import TABLE_CENTER as CENTER
-from cavin_pyro.models.networks.contact.geometry import TOOL_RADIUS
+from cavin_pyro.models.networks.contact.geometry import PUSH_UNIT, TABLE_CENTER, TOOL_RADIUS
 from cavin_pyro.models.networks.dynamics import (
-    PUSH_RANGE,
-    SUBGOAL_RANGE,
     ActionGenerator,
     Dynamics,
     StateChange,
 )
-from cavin_pyro.models.networks.layers import TABLE_CENTER, StateEncoder, neighbours
+from cavin_pyro.models.networks.layers import StateEncoder, neighbours
 from cavin_pyro.models.networks.pointnet import PointNet, PointNetAutoencoder, chamfer_distance
 from cavin_pyro.models.state import State
 
@@ -29,7 +28,7 @@ ORDER = torch.tensor([2, 0, 3, 1])
 
 
 def small_encoder(most: int | None = None) -> StateEncoder:
-    return StateEncoder(**SIZES, neighbours=most).double()
+    return StateEncoder(SPACE, **SIZES, neighbours=most).double()
 
 
 def double(state: State) -> State:
@@ -38,7 +37,7 @@ def double(state: State) -> State:
 
 def test_networks_know_the_table_and_the_tool_as_the_environments_do() -> None:
     """They do not know the environments, and so have these numbers a second time."""
-    assert (*CENTER, 0.0) == TABLE_CENTER
+    assert (*CENTER, 0.0) == TABLE_CENTER and SPACE.length == PUSH_UNIT
     assert TOOL_RADIUS == STICK_RADIUS
 
 
@@ -60,7 +59,7 @@ def test_neighbours_are_the_nearest_others_that_are_real(
 
 @pytest.mark.parametrize("most", [None, 2])
 def test_order_and_padding_leave_features_and_predictions(random_state: Callable[..., State], most: int | None) -> None:
-    encoder, dynamics = small_encoder(most), Dynamics(**SIZES).double()
+    encoder, dynamics = small_encoder(most), Dynamics(SPACE, **SIZES).double()
     state, action = double(random_state(3, objects=4, real=3)), torch.randn(3, 4, dtype=torch.float64)
     shuffled = state.map(lambda field: field[:, ORDER])
     assert torch.allclose(encoder(shuffled), encoder(state)[:, ORDER], atol=1e-12)
@@ -80,11 +79,11 @@ def test_an_object_alone_has_no_relations_and_other_features_are_refused(random_
         small_encoder()(random_state(features=7))
 
 
-@pytest.mark.parametrize("maximum", [PUSH_RANGE, SUBGOAL_RANGE])
+@pytest.mark.parametrize("maximum", [SPACE.step_range, SPACE.subgoal_range])
 def test_states_change_within_their_range_and_not_behind_a_closed_gate(
     random_state: Callable[..., State], maximum: float
 ) -> None:
-    change, state = StateChange(maximum_displacement=maximum, **SIZES), random_state(500, objects=4, real=2)
+    change, state = StateChange(SPACE, maximum_displacement=maximum, **SIZES), random_state(500, objects=4, real=2)
     predicted = change(state, 100 * torch.randn(500, 4, 8))
     moved = (predicted.centers - state.centers).abs()
     assert 0.99 * maximum < moved.max() <= maximum + 1e-6
@@ -94,15 +93,15 @@ def test_states_change_within_their_range_and_not_behind_a_closed_gate(
     assert torch.allclose(change(state, torch.randn(500, 4, 8)).centers, state.centers)
 
 
-def test_pushes_do_not_depend_on_order_and_padding_and_are_clipped_softly() -> None:
-    generator, mask = ActionGenerator(motion_dimension=5, width=8).double(), torch.tensor([True, True, True, False])
+def test_actions_do_not_depend_on_order_and_padding_and_are_clipped_softly(random_state: Callable[..., State]) -> None:
+    generator, scene = ActionGenerator(SPACE, motion_dimension=5, width=8).double(), random_state(objects=4, real=3)
     effect, code = torch.randn(3, 4, 8, dtype=torch.float64), torch.randn(3, 5, dtype=torch.float64)
-    actions = generator(effect, mask, code)
-    assert torch.allclose(generator(effect[:, ORDER], mask[ORDER], code), actions, atol=1e-12)
-    assert torch.allclose(generator(effect[:, :3], mask[:3], code), actions, atol=1e-12)
-    assert not torch.allclose(generator(effect, torch.ones(4, dtype=torch.bool), code), actions, atol=1e-4)
-    assert generator(effect, torch.zeros(4, dtype=torch.bool), code).isfinite().all()  # no objects
-    wide = generator(effect[:1], mask, 1e4 * torch.randn(200, 5, dtype=torch.float64))
+    actions = generator(effect, scene, code)
+    assert torch.allclose(generator(effect[:, ORDER], scene.scene(ORDER), code), actions, atol=1e-12)
+    assert torch.allclose(generator(effect[:, :3], scene.scene(slice(3)), code), actions, atol=1e-12)
+    assert not torch.allclose(generator(effect, random_state(objects=4), code), actions, atol=1e-4)
+    assert generator(effect, random_state(objects=4, real=0), code).isfinite().all()  # no objects
+    wide = generator(effect[:1], scene, 1e4 * torch.randn(200, 5, dtype=torch.float64))
     assert 4.9 < wide[..., :2].abs().max() <= 5
     assert 0.99 < wide[..., 2:].abs().max() <= 1
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.networks.contact.dynamics import MAXIMUM_DISPLACEMENT, ContactDynamics
 from cavin_pyro.models.networks.contact.geometry import (
     CORNER,
@@ -17,7 +18,6 @@ from cavin_pyro.models.networks.contact.geometry import (
     REACH_LOW,
     TOOL_RADIUS,
 )
-from cavin_pyro.models.networks.layers import POSITION_UNIT, TABLE_CENTER
 from cavin_pyro.models.networks.outline import (
     DIRECTIONS,
     HEIGHT_MEANS,
@@ -132,7 +132,7 @@ def next_state(f: ContactDynamics, centers: Numbers, features: Numbers, action: 
         shape = turn(value[:SHAPE], phi)
         outlines.append(typical + spread * shape[:PER_OUTLINE])
         place = along / PUSH_UNIT, across / DISPLACEMENT_UNIT, (along - length) / PUSH_UNIT, length / PUSH_UNIT
-        table = (center - np.array(TABLE_CENTER)) / POSITION_UNIT
+        table = (center - np.array(SPACE.origin)) / SPACE.length
         contact = tool_contact(along, across, outlines[-1], length)
         heights = turn_moments(value[SHAPE:], phi, HEIGHT_MEANS) if f.equivariant else value[SHAPE:]
         on_table = table[2:] if f.equivariant else np.concatenate((direction, table))
