@@ -108,6 +108,11 @@ class Model(Program):
         if isinstance(self.scales, PredictedScales) and not self.dynamics.predicts_scales:
             raise ValueError("scales=predicted needs an f that predicts them: dynamics=contact")
 
+    @property
+    def action_dimension(self) -> int:
+        """A, the numbers of an action."""
+        return self.space.actions
+
     @staticmethod
     def fixed_shapes() -> AbstractContextManager[None]:
         """See `cavin_pyro.models.networks.layers`: for planners that compile."""

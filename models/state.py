@@ -49,6 +49,10 @@ class State(NamedTuple):
             self.mask.expand(*batch_shape, self.mask.shape[-1]),
         )
 
+    def values(self, features: bool = False) -> Tensor:
+        """The centres `[..., M, P]`; with `features` these behind them, `[..., M, P + F]`."""
+        return torch.cat((self.centers, self.features), -1) if features else self.centers
+
     def expand_plans(self, plans: int) -> State:
         """One copy (a view) per plan sample: `[B] -> [B, N]`."""
         single = State(self.centers.unsqueeze(-3), self.features.unsqueeze(-3), self.mask.unsqueeze(-2))

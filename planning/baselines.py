@@ -1,4 +1,4 @@
-"""The planners that the paper compares with (section 4.1, appendix A.2), an ablation, and random pushes."""
+"""The planners that the paper compares with (section 4.1, appendix A.2), an ablation, and random actions."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.cavin import EffectSpace
 from cavin_pyro.planning.checks import NoFiniteCandidateError, check_positive, check_scenes
 from cavin_pyro.planning.protocol import (
+    ActionModel,
     EffectActionModel,
     ModelRequirements,
     MotionModel,
@@ -21,7 +22,6 @@ from cavin_pyro.planning.protocol import (
     Query,
     RewardFunction,
     SegmentRollout,
-    TransitionModel,
 )
 from cavin_pyro.planning.returns import best_of
 from cavin_pyro.planning.rollout import actions_of, predict_states, project
@@ -29,27 +29,28 @@ from cavin_pyro.planning.sampling import noise_each, sample_codes, uniform_each
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 
 
-class PushSearch(SearchingPlanner):
-    """The common part of CVAE-MPC and MPC, everything but the source of pushes.
+class ActionSearch(SearchingPlanner):
+    """The common part of CVAE-MPC and MPC, everything but the source of actions.
 
-    stride_limits: metres per push, as published 0.01 and 0.15; None in the paper. For the other options see
+    stride_limits: per step; None in the paper. For the other options see
     `SearchingPlanner`.
 
     Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
     """
 
-    space: ClassVar[type]  # a `SearchSpace` that generates the pushes of a segment and predicts their states with f
+    space: ClassVar[type]  # a `SearchSpace` that generates the actions of a segment and predicts their states with f
     has_codes: ClassVar[bool] = False  # the space searches motion codes
-    strides = "pushes"
+    strides = "steps"
 
     def plan_scene(self, scene: Query) -> Plan:
         """Plan for observed scenes `scene.state: [B]`. There are no effect codes and no subgoals."""
-        candidates = self.search_by_reward(type(self).space(self.model, self.decimals), scene)
+        space = type(self).space(self.model, self.decimals, scene.reward.reads_features)
+        candidates = self.search_by_reward(space, scene)
         # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
         scores = torch.where(finite, candidates.returns, -torch.inf)
         choice = Choice(scene, self.model, candidates, lambda: candidates.at(0, actions_of))
-        best = best_of(self.added("rank", scores, choice), "returns of push sequences")
+        best = best_of(self.added("rank", scores, choice), "returns of action sequences")
         chosen = candidates.take(best.unsqueeze(-1))
         actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
         no_codes = codes.new_empty(len(codes), 0, 0)
@@ -65,10 +66,11 @@ class PushSearch(SearchingPlanner):
 
 
 class FlatMotionSpace(NamedTuple):
-    """Motion codes, the pushes that g generates from them alone, and the states that f predicts."""
+    """Motion codes, the actions that g generates from them alone, and the states that f predicts."""
 
     model: MotionModel
     decimals: int | None = None
+    features: bool = False  # whether paths record these too
 
     @property
     def dimension(self) -> int:
@@ -80,14 +82,14 @@ class FlatMotionSpace(NamedTuple):
     ) -> SegmentRollout:
         z = sample_codes(self.model.motion_prior, [plans], noise, generators)
         a = project(self.model.actions(here, motion_code=z), self.decimals)
-        states, path = predict_states(self.model, here, a)
+        states, path = predict_states(self.model, here, a, self.features)
         return SegmentRollout(z, a, states, path)
 
 
-class CvaeMpcPlanner(PushSearch):
-    """CVAE-MPC: sequences of K motion codes z ~ p(z | s), T pushes g(s, z) for each, and f's prediction for all H.
+class CvaeMpcPlanner(ActionSearch):
+    """CVAE-MPC: sequences of K motion codes z ~ p(z | s), T actions g(s, z) for each, and f's prediction for all H.
 
-    model: p(z | s), g without effect codes, f. For the options and errors see `PushSearch`.
+    model: p(z | s), g without effect codes, f. For the options and errors see `ActionSearch`.
     """
 
     requires = ModelRequirements("flat", ("motion_prior", "actions", "next_state"), excluded=("effect_prior",))
@@ -95,43 +97,46 @@ class CvaeMpcPlanner(PushSearch):
     has_codes = True
 
 
-class PushSpace(NamedTuple):
-    """Raw pushes, T a segment, uniform over the action space, and the states that f predicts step by step."""
+class RawActionSpace(NamedTuple):
+    """Raw actions, T a segment, uniform over the action space, and the states that f predicts step by step."""
 
-    model: TransitionModel
+    model: ActionModel
     decimals: int | None = None
+    features: bool = False  # whether paths record these too
 
     @property
     def dimension(self) -> int:
-        """4 T numbers of noise."""
-        return 4 * self.model.segment_length
+        """A T numbers of noise."""
+        return self.model.action_dimension * self.model.segment_length
 
     def extend(
         self, segment: int, here: State, plans: State, noise: Tensor | None, generators: Sequence[torch.Generator]
     ) -> SegmentRollout:
         if noise is None:
             noise = noise_each((plans.batch_shape[-1], self.dimension), generators, plans.centers.device)
-        actions = project((2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, 4)), self.decimals)
-        states, path = predict_states(self.model, here, actions)
+        actions = project(
+            (2.0 * torch.special.ndtr(noise) - 1.0).unflatten(-1, (-1, self.model.action_dimension)), self.decimals
+        )
+        states, path = predict_states(self.model, here, actions, self.features)
         return SegmentRollout(actions.flatten(-2), actions, states, path)
 
 
-class MpcPlanner(PushSearch):
-    """Sequences of H raw pushes in "the original action space" (paper, section 4.1 and appendix A.2).
+class MpcPlanner(ActionSearch):
+    """Sequences of H raw actions in "the original action space" (paper, section 4.1 and appendix A.2).
 
-    model: any model, since only f is used. For the options and errors see `PushSearch`.
+    model: any model, since only f is used. For the options and errors see `ActionSearch`.
     """
 
-    requires = ModelRequirements("dynamics", ("next_state",))
-    space = PushSpace
+    requires = ModelRequirements("dynamics", ("next_state", "action_dimension"))
+    space = RawActionSpace
 
 
 class SectarPlanner(SearchingPlanner):
-    """SeCTAR: effect codes ranked by reward, as in `CavinPlanner`; g generates the pushes from the chosen code alone.
+    """SeCTAR: effect codes ranked by reward, as in `CavinPlanner`; g generates the actions from the chosen code alone.
 
     There is no motion code to choose, so lines 8 to 10 of Algorithm 1 become a = g(s, c*). f only predicts the states
-    after the pushes, for pictures and additions. An effect has one motion here, so additions rank effect plans. Where
-    pushes move nothing, h may still believe that they reach the subgoal, and the next plan starts from the same state.
+    after them, for pictures and additions. An effect has one motion here, so additions rank effect plans. Where
+    actions move nothing, h may still believe that they reach the subgoal, and the next plan starts from the same state.
 
     model: p(c | s), h, g without motion codes, f. For the options see `SearchingPlanner`. Raises ValueError for counts
     below 1, a horizon that T does not divide, and unknown names.
@@ -143,7 +148,8 @@ class SectarPlanner(SearchingPlanner):
 
     def __init__(self, model: EffectActionModel, **options: Any) -> None:
         super().__init__(model, **options)
-        self.space, self.effect_actions = EffectSpace(model), model.actions
+        self.model: EffectActionModel
+        self.model, self.effect_actions = model, model.actions
 
     def _actions(self, here: State, effect_code: Tensor) -> Tensor:
         return project(self.effect_actions(here, effect_code), self.decimals)
@@ -151,7 +157,8 @@ class SectarPlanner(SearchingPlanner):
     def plan_scene(self, scene: Query) -> Plan:
         """Plan for observed scenes `scene.state: [B]`."""
         # Lines 5 to 7: choose the codes c* and their subgoals.
-        effects, here = self.search_by_reward(self.space, scene), scene.state.expand_plans(1)
+        space, here = EffectSpace(self.model, scene.reward.reads_features), scene.state.expand_plans(1)
+        effects = self.search_by_reward(space, scene)
         choice = Choice(
             scene,
             self.model,
@@ -166,13 +173,13 @@ class SectarPlanner(SearchingPlanner):
         best = best_of(self.added("rank", effects.returns, choice), "returns of effect plans")
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]
-        # Lines 8 to 10 without motion codes: the pushes of the first segment, which is executed.
+        # Lines 8 to 10 without motion codes: the actions of the first segment, which is executed.
         actions = self._actions(here, effect_codes[:, :1])
         _, path = predict_states(self.model, here, actions)
         broken = (~torch.isfinite(actions).flatten(1).all(-1)).nonzero().flatten().tolist()
         if broken:
             raise NoFiniteCandidateError(
-                broken[0], "the pushes of the chosen effect are not finite; check the model's weights"
+                broken[0], "the actions of the chosen effect are not finite; check the model's weights"
             )
         return Plan(
             actions=actions[:, 0],
@@ -186,10 +193,11 @@ class SectarPlanner(SearchingPlanner):
 
 
 class CascadeSpace(NamedTuple):
-    """Effect and motion codes of the cascade, the pushes that g generates from both, and the states that f predicts."""
+    """Effect and motion codes of the cascade, the actions that g makes from both, and the states that f predicts."""
 
     model: PlanningModel
     decimals: int | None = None
+    features: bool = False  # whether paths record these too
 
     @property
     def dimension(self) -> int:
@@ -204,17 +212,17 @@ class CascadeSpace(NamedTuple):
         c = sample_codes(self.model.effect_prior, [plans], effect_noise, generators)
         z = sample_codes(self.model.motion_prior, [plans, c], motion_noise, generators)
         a = project(self.model.actions(here, c, z), self.decimals)
-        states, path = predict_states(self.model, here, a)
+        states, path = predict_states(self.model, here, a, self.features)
         return SegmentRollout(torch.cat([c, z], -1), a, states, path)
 
 
-class CavinWithoutEffectsPlanner(PushSearch):
-    """Sequences of K pairs of codes c ~ p(c | s), z ~ p(z | s, c), T pushes g(s, c, z) for each, and f's prediction.
+class CavinWithoutEffectsPlanner(ActionSearch):
+    """Sequences of K pairs of codes c ~ p(c | s), z ~ p(z | s, c), T actions g(s, c, z) for each, and f's prediction.
 
     The same generative model as `CavinPlanner`, but planned like CVAE-MPC: no subgoals, and whole sequences ranked by
     cumulative reward. A plan's motion codes are the pairs, `[B, K, C + Z]`.
 
-    model: the cascade, without h. For the options and errors see `PushSearch`.
+    model: the cascade, without h. For the options and errors see `ActionSearch`.
     """
 
     requires = ModelRequirements("cascaded", ("effect_prior", "motion_prior", "actions", "next_state"))
@@ -223,14 +231,15 @@ class CavinWithoutEffectsPlanner(PushSearch):
 
 
 class RandomPlanner:
-    """Uniform random pushes: each coordinate of start and motion ~ Uniform(-1, 1), normalised.
+    """Uniform random actions: each number ~ Uniform(-1, 1), normalised.
 
-    `segment_length`: T, the number of pushes per plan. Raises ValueError if it is less than 1.
+    `action_dimension`: A. `segment_length`: T, the number of actions per plan. Raises ValueError if one is less than 1.
     """
 
-    def __init__(self, segment_length: int = 3) -> None:
+    def __init__(self, segment_length: int = 3, *, action_dimension: int) -> None:
         check_positive("segment_length", segment_length)
-        self.segment_length = segment_length
+        check_positive("action_dimension", action_dimension)
+        self.segment_length, self.action_dimension = segment_length, action_dimension
 
     @torch.inference_mode()
     def plan(
@@ -241,14 +250,15 @@ class RandomPlanner:
         reward: RewardFunction | None = None,
         observed: Any = None,
     ) -> Plan:
-        """Sample `[B, T, 4]` pushes for the scenes `state: [B]`; without prediction or choice.
+        """Sample `[B, T, A]` actions for the scenes `state: [B]`; without prediction or choice.
 
         Raises ValueError unless there are scenes, with a generator for each.
         """
         check_scenes(state, generators)
         environments, objects = state.mask.shape
+        size = self.segment_length, self.action_dimension
         empty = state.centers.new_empty
-        actions = 2 * uniform_each((self.segment_length, 4), generators, state.centers.device) - 1
+        actions = 2 * uniform_each(size, generators, state.centers.device) - 1
         return Plan(
             actions=actions,
             planned_actions=actions,
@@ -256,9 +266,9 @@ class RandomPlanner:
             motion_codes=empty(environments, 0, 0),
             subgoals=state.map(lambda field: field[:, None][:, :0]),
             segments=torch.zeros(environments, dtype=torch.int64, device=actions.device),
-            predicted_centers=empty(environments, 0, objects, 3),
+            predicted_centers=empty(environments, 0, objects, state.centers.shape[-1]),
             expected_return=state.centers.new_full((environments,), torch.nan),
             expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
-            candidate_centers=empty(environments, 0, 0, objects, 3),
+            candidate_centers=empty(environments, 0, 0, objects, state.centers.shape[-1]),
             candidate_returns=empty(environments, 0),
         )

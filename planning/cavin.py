@@ -28,7 +28,7 @@ class CavinPlanner(SearchingPlanner):
     motion_share: motions to sample at line 8, as a share of N (paper: 1).
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     motion_horizon: motions are planned for all K segments, `full_horizon` (paper), or for the executed `first_segment`.
-    feature_weight: square metres per squared unit of feature distance, in the distance to subgoals; 0: centres only.
+    feature_weight: of squared distances between features, in the distance to subgoals; 0: centres only.
     options: of `cavin_pyro.planning.searching.SearchingPlanner`, whose optimizer searches codes at both levels.
     Raises ValueError for counts below 1, a horizon that T does not divide, unknown names, and a negative weight.
     """
@@ -66,7 +66,8 @@ class CavinPlanner(SearchingPlanner):
         s_t, focus = scene.state, self.added("focus", Focus(), scene)
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
-        effects = self.search_by_reward(EffectSpace(self.model), scene._replace(state=focus.of(s_t)))
+        space = EffectSpace(self.model, scene.reward.reads_features)
+        effects = self.search_by_reward(space, scene._replace(state=focus.of(s_t)))
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
@@ -86,7 +87,7 @@ class CavinPlanner(SearchingPlanner):
         distance = self.added("subgoal_distance", SubgoalDistance(self.feature_weight), scene, self.motion_segments)
         tracking_cost = self.added("wrap_objective", TrackingCost(subgoals, effect.segments, distance), scene, effect)
         motions = self.search(
-            MotionSpace(self.model, c_star, focus, self.decimals),
+            MotionSpace(self.model, c_star, focus, self.decimals, scene.reward.reads_features),
             tracking_cost,
             scene,
             optimizer=self.motion_optimizer,
@@ -108,6 +109,7 @@ class EffectSpace(NamedTuple):
     """Lines 5 and 6: effect codes, and the subgoals that h predicts from them."""
 
     model: EffectModel
+    features: bool = False  # whether paths record these too
 
     @property
     def dimension(self) -> int:
@@ -121,7 +123,7 @@ class EffectSpace(NamedTuple):
         c = sample_codes(self.model.effect_prior, [plans], noise, generators)
         # Line 6: predict the subgoal by equation 2, and interpolate the state trajectory.
         subgoal = self.model.subgoal(here, c).expand(plans.batch_shape)
-        path = interpolate(plans.centers, subgoal.centers, self.model.segment_length)
+        path = interpolate(plans.values(self.features), subgoal.values(self.features), self.model.segment_length)
         return SegmentRollout(c, None, subgoal, path)
 
 
@@ -132,6 +134,7 @@ class MotionSpace(NamedTuple):
     effect_codes: Tensor  # [B, K, C] c*, with which every sequence is paired
     focus: Focus
     decimals: int | None
+    features: bool = False
 
     @property
     def dimension(self) -> int:
@@ -146,5 +149,5 @@ class MotionSpace(NamedTuple):
         z = sample_codes(self.model.motion_prior, [self.focus.of(plans), c], noise, generators)
         # Line 9: generate T actions by equation 3, and predict a state after each by equation 1.
         a = project(self.model.actions(self.focus.of(here), c, z), self.decimals)
-        states, path = predict_states(self.model, here, a)
+        states, path = predict_states(self.model, here, a, self.features)
         return SegmentRollout(z, a, states, path)

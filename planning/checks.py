@@ -60,7 +60,7 @@ def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:
     """The limits as a tuple. Raises ValueError unless they are two distances, in order and not negative."""
     numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
     if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
-        raise ValueError(f"{name} must be two distances in metres, low then high, not {limits}")
+        raise ValueError(f"{name} must be two distances, low then high, not {limits}")
     return limits[0], limits[1]
 
 
@@ -79,9 +79,9 @@ def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
 def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
     """Raise ValueError unless `state` is a batch `[B]` each with an object and a generator of its own."""
     centers = state.centers
-    if centers.ndim != 3 or centers.shape[-1] != 3 or state.mask.shape != centers.shape[:-1] or not len(centers):
+    if centers.ndim != 3 or state.mask.shape != centers.shape[:-1] or not len(centers):
         raise ValueError(
-            "a planner takes states of at least one scene, with centers [B, M, 3] and mask [B, M], "
+            "a planner takes states of at least one scene, with centers [B, M, P] and mask [B, M], "
             f"not {list(centers.shape)} and {list(state.mask.shape)}"
         )
     if not state.mask.any(-1).all():

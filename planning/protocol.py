@@ -31,10 +31,18 @@ class TransitionModel(Protocol):
 
     @property
     def segment_length(self) -> int:
-        """`T`, the number of pushes from a state to its subgoal."""
+        """`T`, the number of actions from a state to its subgoal."""
 
     def next_state(self, state: State, action: Tensor) -> State:
-        """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., 4]`."""
+        """Mean of the dynamics f(s'' | s, a): `[...]`; `action: [..., A]`."""
+
+
+class ActionModel(TransitionModel, Protocol):
+    """A model that tells the size of an action, for planners that search raw actions."""
+
+    @property
+    def action_dimension(self) -> int:
+        """A."""
 
 
 @runtime_checkable
@@ -70,14 +78,14 @@ class PlanningModel(EffectModel, Protocol):
         """p(z | s, c), or p(z): batch `[...]`, event `[Z]`; `effect_code: [..., C]`."""
 
     def actions(self, state: State, effect_code: Tensor, motion_code: Tensor) -> Tensor:
-        """Mean of the action generator g(a | s, c, z): `[..., T, 4]` pushes; codes `[..., C]`, `[..., Z]`."""
+        """Mean of the action generator g(a | s, c, z): `[..., T, A]`; codes `[..., C]`, `[..., Z]`."""
 
 
 class EffectActionModel(EffectModel, Protocol):
     """One code for the subgoal and the actions (SeCTAR): `model=single_latent`."""
 
     def actions(self, state: State, effect_code: Tensor) -> Tensor:
-        """Mean of g(a | s, c): `[..., T, 4]` pushes."""
+        """Mean of g(a | s, c): `[..., T, A]`."""
 
 
 class MotionModel(TransitionModel, Protocol):
@@ -91,7 +99,7 @@ class MotionModel(TransitionModel, Protocol):
         """p(z | s), or p(z): batch `[...]`, event `[Z]`."""
 
     def actions(self, state: State, *, motion_code: Tensor) -> Tensor:
-        """Mean of g(a | s, z): `[..., T, 4]` pushes."""
+        """Mean of g(a | s, z): `[..., T, A]`."""
 
 
 @dataclass(frozen=True)
@@ -146,25 +154,33 @@ class RemainingDistance(Protocol):
     """The remaining distance to the goal along allowed places, for guidance beyond the horizon."""
 
     def __call__(self, centers: Tensor, mask: Tensor, /) -> Tensor:
-        """Metres left: `[...]`, from `centers: [..., M, 3]` metres and `mask: [..., M]` bool; 0 at the goal."""
+        """What is left: `[...]`, from `centers: [..., M, P]` and `mask: [..., M]` bool; 0 at the goal."""
 
     def longest(self, mask: Tensor, /) -> Tensor:
-        """An upper bound on the metres left with the objects in `mask: [..., M]`: `[...]`."""
+        """An upper bound on what is left with the objects in `mask: [..., M]`: `[...]`."""
 
 
 class RewardFunction(Protocol):
     """R(s_{t+1}) of the paper (section 2); it also takes the state before, for rewards of progress."""
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, /) -> StepOutcome:
-        """Evaluate the step `previous: [..., M, 3]` to `centers: [..., M, 3]` metres; `mask: [..., M]` bool.
+        """Evaluate the step `previous: [..., M, P]` to `centers: [..., M, P]`; `mask: [..., M]` bool.
 
-        Object 0 is the target.
+        Object 0 is the target. A reward that `reads_features` gets `[..., M, P + F]`, centres and features.
         """
 
 
 @runtime_checkable
 class Reward(RewardFunction, Protocol):
     """A reward function with what planners can use besides; `as_reward` gives a plain function the defaults."""
+
+    @property
+    def reads_features(self) -> bool:
+        """Whether it gets centres and features of the objects, not centres alone.
+
+        Of the states between a segment's ends (line 6) features are interpolated: vectors of unit length get shorter.
+        """
+        return False
 
     @property
     def about(self) -> str:
@@ -177,7 +193,7 @@ class Reward(RewardFunction, Protocol):
         return math.inf
 
     def along(self, states: Tensor, mask: Tensor, /) -> StepOutcome:
-        """Evaluate the T steps of paths `states: [..., T + 1, M, 3]` metres, `mask: [..., M]` bool: fields `[..., T]`.
+        """Evaluate the T steps of paths `states: [..., T + 1, M, P]`, `mask: [..., M]` bool: fields `[..., T]`.
 
         Equal to a call for each step; it may read every state once instead of twice.
         """
@@ -216,14 +232,14 @@ class Query(NamedTuple):
 class SegmentRollout(NamedTuple):
     """One segment of n candidates, T steps long."""
 
-    code: Tensor  # [B, n, D] effect or motion codes; or the concatenated T raw pushes
-    actions: Tensor | None  # [B, n, T, 4], if the search space has actions
+    code: Tensor  # [B, n, D] effect or motion codes; or the concatenated T raw actions
+    actions: Tensor | None  # [B, n, T, A], if the search space has actions
     states: State  # [B, n, M, .] at the end of the segment
-    path: Tensor  # [B, n, T, M, 3] metres, after every step
+    path: Tensor  # [B, n, T, M, P] centres after every step; [B, n, T, M, P + F] for a reward that reads features
 
 
 class SearchSpace(Protocol):
-    """Effect codes, motion codes or raw pushes. A named tuple, so that a backend can compile it."""
+    """Effect codes, motion codes or raw actions. A named tuple, so that a backend can compile it."""
 
     @property
     def dimension(self) -> int:
@@ -298,20 +314,20 @@ class Plan(NamedTuple):
 
     S is the number of segments with motions: K, or 1 if motions are planned for the first segment only. C and Z are the
     dimensions of the codes. Fields that a planner lacks are empty: without effect codes K = 0 for these and the
-    subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for its pushes,
+    subgoals, without motion codes S = 0 for these. `RandomPlanner`, which predicts nothing, has S = 1 for its actions,
     and no codes, states or candidates.
     """
 
-    actions: Tensor  # [B, T, 4] the first segment; it, or its first pushes, are executed before the next plan
-    planned_actions: Tensor  # [B, S T, 4] a*, which begins with `actions`
+    actions: Tensor  # [B, T, A] the first segment; it, or its first actions, are executed before the next plan
+    planned_actions: Tensor  # [B, S T, A] a*, which begins with `actions`
     effect_codes: Tensor  # [B, K, C] c*
     motion_codes: Tensor  # [B, S, Z] z*
     subgoals: State  # [B, K, M, .] chosen subgoals; those after the plan's end repeat the last one
     segments: Tensor  # [B] int64: segments until the chosen plan ends, 1..K; later ones have no meaning
-    predicted_centers: Tensor  # [B, S T, M, 3] metres, predicted by f after each of the planned actions
+    predicted_centers: Tensor  # [B, S T, M, P] predicted by f after each of the planned actions
     expected_return: Tensor  # [B] cumulative reward of the chosen plan; NaN where nothing was predicted
     expected_success: Tensor  # [B] bool: the chosen plan reaches the goal
-    # [B, N, K, M, 3] metres, ends of all plans' segments, traced back through copies; of the nearest objects alone, the
+    # [B, N, K, M, P] ends of all plans' segments, traced back through copies; of the nearest objects alone, the
     # target first, where plans are about these
     candidate_centers: Tensor
     candidate_returns: Tensor  # [B, N] their cumulative rewards; -inf where a prediction was not finite
@@ -326,7 +342,7 @@ class Planner(Protocol):
 
     @property
     def segment_length(self) -> int:
-        """T, the number of pushes in a plan's `actions`."""
+        """T, the number of actions in a plan's `actions`."""
 
     def plan(
         self, state: State, *, reward: RewardFunction, generators: Sequence[torch.Generator], observed: Any = None

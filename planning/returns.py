@@ -36,7 +36,7 @@ class Progress(NamedTuple):
 
 
 def start(centers: Tensor) -> Progress:
-    """Progress of candidates without a step, for `centers: [..., M, 3]`: fields `[...]`."""
+    """Progress of candidates without a step, for `centers: [..., M, P]`: fields `[...]`."""
     shape = centers.shape[:-2]
     return Progress(
         returns=centers.new_zeros(shape),
@@ -49,7 +49,7 @@ def start(centers: Tensor) -> Progress:
 def interpolate(start: Tensor, end: Tensor, steps: int) -> Tensor:
     """Straight, evenly timed path of T = `steps` states from `start` (not included) to `end` (included).
 
-    `start`, `end`: `[..., M, 3]` metres -> `[..., T, M, 3]`, of which the last equals `end` exactly
+    `start`, `end`: `[..., M, D]` -> `[..., T, M, D]`, of which the last equals `end` exactly
     (Algorithm 1, line 6).
     """
     fraction = torch.arange(1, steps + 1, device=end.device, dtype=end.dtype) / steps
@@ -59,13 +59,13 @@ def interpolate(start: Tensor, end: Tensor, steps: int) -> Tensor:
 def advance(progress: Progress, reward: Reward, start: Tensor, centers: Tensor, mask: Tensor) -> Progress:
     """Add the rewards of one segment up to and including the step that ends a plan.
 
-    `progress`: fields `[...]`; `start: [..., M, 3]` metres, the state before the segment;
-    `centers: [..., T, M, 3]` metres, the T states of the segment; `mask: [..., M]` bool.
+    `progress`: fields `[...]`; `start: [..., M, P]`, the state before the segment;
+    `centers: [..., T, M, P]`, the T states of the segment, both as the reward reads them; `mask: [..., M]` bool.
     A step that is both a success and a failure is a failure. A step with a centre (of a real object) or a
     reward that is not finite is a failure with reward -inf, even if the reward function disagrees: no
     comparison holds for NaN, so "no object is in the region" would be a success.
     """
-    states = torch.cat([start.unsqueeze(-3), centers], dim=-3)  # [..., T + 1, M, 3]
+    states = torch.cat([start.unsqueeze(-3), centers], dim=-3)  # [..., T + 1, M, P]
     outcome = reward.along(states, mask)
     # A sum is finite only if all of its terms are.
     real = centers.where(mask[..., None, :, None], 0.0)
@@ -106,7 +106,8 @@ class CumulativeReward:
 
     def advance(self, score_state: Progress, segment: int, before: State, rollout: SegmentRollout) -> Progress:
         path = rollout.path if self.at == "path" else rollout.path[..., -1:, :, :]
-        return advance(score_state, self.reward, before.centers, path, before.mask)
+        start = before.values(self.reward.reads_features)
+        return advance(score_state, self.reward, start, path, before.mask)
 
     def early_stopped(self, score_state: Progress) -> Tensor:
         """`[B]` bool: no active candidate can still reach a higher return than the best terminated one.
@@ -123,13 +124,19 @@ class CumulativeReward:
 class StrideLimits(Reward):
     """A reward function that ends plans whose strides are implausible (published code; not in the paper).
 
-    A stride fails if every object moves less than `shortest`, or any farther than `longest` metres; its reward is
-    then -100. `of`: `segments` (published: 0.1 m and 0.3 m from subgoal to subgoal) or `pushes` (0.01 m and 0.15 m).
+    A stride fails if every object moves less than `shortest`, or any farther than `longest`; its reward is then -100.
+    `of`: `segments`, from subgoal to subgoal, or `steps`. `positions`: P, how many numbers are a centre.
     """
 
     reward: Reward
-    limits: Sequence[float]  # shortest and longest, in metres
+    limits: Sequence[float]  # shortest and longest
     of: str
+    positions: int
+
+    @property
+    def reads_features(self) -> bool:
+        """As without limits."""
+        return self.reward.reads_features
 
     @property
     def maximum_return(self) -> float:
@@ -137,9 +144,9 @@ class StrideLimits(Reward):
         return self.reward.maximum_return
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
-        """Evaluate the steps `previous: [..., T, M, 3]` to `centers: [..., T, M, 3]` metres of whole segments."""
+        """Evaluate the steps `previous: [..., T, M, P]` to `centers: [..., T, M, P]` of whole segments."""
         outcome = self.reward(previous, centers, mask)
-        if self.of == "pushes":
+        if self.of == "steps":
             outside = self._outside(previous, centers, mask)
         else:
             whole = self._outside(previous[..., 0, :, :], centers[..., -1, :, :], mask[..., -1, :])
@@ -152,16 +159,16 @@ class StrideLimits(Reward):
 
     def _outside(self, before: Tensor, after: Tensor, mask: Tensor) -> Tensor:
         shortest, longest = self.limits
-        strides = (after - before).norm(dim=-1)
+        strides = (after - before)[..., : self.positions].norm(dim=-1)
         short = ((strides < shortest) | ~mask).all(-1)
         return short | ((strides > longest) & mask).any(-1)
 
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:
-    """Sum over real objects of the squared distance to their goals: `[...]` square metres.
+    """Sum over real objects of the squared distance to their goals: `[...]`.
 
     `states`, `goals`: `[...]`, whose leading dimensions broadcast; the mask is the goals'. `feature_weight`:
-    square metres per squared unit of distance between features; 0 ignores features.
+    of squared distances between features; 0 ignores features.
     """
     per_object = (states.centers - goals.centers).square().sum(-1)
     if feature_weight:
@@ -179,16 +186,16 @@ class SubgoalDistance(NamedTuple):
     feature_weight: float = 0.0
     at: str = END
 
-    def pushes(self, segment_length: int) -> int:
-        """After how many of a segment's T pushes centres are compared."""
+    def steps(self, segment_length: int) -> int:
+        """After how many of a segment's T actions centres are compared."""
         return segment_length if self.at == END else 1
 
     def __call__(self, end: State, path: Tensor, subgoal: State) -> Tensor:
-        """`[...]` square metres, from the last state `end: [...]` and the centres `path: [..., T, M, 3]` metres.
+        """`[...]`, from the last state `end: [...]` and the centres `path: [..., T, M, P]`.
 
         Their leading dimensions and those of `subgoal: [...]` broadcast.
         """
-        compared = end if self.at == END else end._replace(centers=path[..., 0, :, :])
+        compared = end if self.at == END else end._replace(centers=path[..., 0, :, : end.centers.shape[-1]])
         return squared_distance(compared, subgoal, feature_weight=self.feature_weight)
 
 
@@ -200,7 +207,7 @@ def select_segment(values: Tensor, number: int | Tensor) -> Tensor:
 class TrackingState(NamedTuple):
     """The tracking cost of motion candidates so far; fields `[B, n]`."""
 
-    cost: Tensor  # square metres, summed over the segments
+    cost: Tensor  # summed over the segments
     executed_cost: Tensor  # of the first segment, which is executed
     finite: Tensor  # bool: all actions are finite
 

@@ -62,7 +62,7 @@ class SegmentRecord(NamedTuple):
 
 
 def actions_of(segment: SegmentRecord) -> Tensor:
-    """The actions `[B, R, T, 4]` of a segment, for a search space that has them."""
+    """The actions `[B, R, T, A]` of a segment, for a search space that has them."""
     assert segment.rollout.actions is not None
     return segment.rollout.actions
 
@@ -73,15 +73,17 @@ def project(actions: Tensor, decimals: int | None) -> Tensor:
     return projected if decimals is None else projected.double().round(decimals=decimals).to(actions.dtype)
 
 
-def predict_states(model: TransitionModel, here: State, pushes: Tensor) -> tuple[State, Tensor]:
-    """T `pushes: [B, n, T, 4]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]` and the path `[B, n, T, M, 3]`.
+def predict_states(
+    model: TransitionModel, here: State, actions: Tensor, features: bool = False
+) -> tuple[State, Tensor]:
+    """T `actions: [B, n, T, A]` from `here: [B, n]` or `[B, 1]`: the last state `[B, n]`, the path `[B, n, T, M, P]`.
 
-    Step by step; the path is in metres.
+    Step by step. `features`: the path has these too, as in `State.values`.
     """
     steps = []
-    for push in pushes.unbind(-2):
-        here = model.next_state(here, push).expand(pushes.shape[:2])
-        steps.append(here.centers)
+    for action in actions.unbind(-2):
+        here = model.next_state(here, action).expand(actions.shape[:2])
+        steps.append(here.values(features))
     return here, torch.stack(steps, -3)
 
 
@@ -132,6 +134,11 @@ def extend_segment(
     return ExtendedSegment(rollout, after, ancestors, *records.take((rollout.states, after), ancestors), early_stopped)
 
 
+def has_features(rollout: SegmentRollout) -> bool:
+    """Whether its path records features as well."""
+    return rollout.path.shape[-1] > rollout.states.centers.shape[-1]
+
+
 def _stay(rollout: SegmentRollout, before: State, active: Tensor) -> SegmentRollout:
     """Keep the states of terminated candidates, those outside `active: [B, n]`."""
     going = active[..., None, None]
@@ -140,7 +147,8 @@ def _stay(rollout: SegmentRollout, before: State, active: Tensor) -> SegmentRoll
         torch.where(going, rollout.states.features, before.features),
         rollout.states.mask,
     )
-    path = torch.where(going.unsqueeze(-1), rollout.path, before.centers.unsqueeze(-3))
+    stays = before.values(has_features(rollout)).unsqueeze(-3)
+    path = torch.where(going.unsqueeze(-1), rollout.path, stays)
     return rollout._replace(states=states, path=path)
 
 
@@ -293,22 +301,23 @@ class Candidates:
 
     @property
     def codes(self) -> Tensor:
-        """`[B, n, k, D]` effect or motion codes, or the concatenated pushes of each segment."""
+        """`[B, n, k, D]` effect or motion codes, or the concatenated actions of each segment."""
         return self.history(lambda segment: segment.rollout.code)
 
     @property
     def actions(self) -> Tensor:
-        """`[B, n, k T, 4]`, for a search space that has actions."""
+        """`[B, n, k T, A]`, for a search space that has actions."""
         return self.history(actions_of).flatten(2, 3)
 
     @property
     def path(self) -> Tensor:
-        """`[B, n, k T, M, 3]` metres, the predicted centres after every step."""
-        return self.history(lambda segment: segment.rollout.path).flatten(2, 3)
+        """`[B, n, k T, M, P]` the predicted centres after every step."""
+        size = self.plans.centers.shape[-1]
+        return self.history(lambda segment: segment.rollout.path[..., :size]).flatten(2, 3)
 
     @property
     def centers(self) -> Tensor:
-        """`[B, n, k, M, 3]` metres, the predicted centres at the end of every segment."""
+        """`[B, n, k, M, P]` the predicted centres at the end of every segment."""
         return self.history(lambda segment: segment.rollout.states.centers)
 
     @property
@@ -377,7 +386,7 @@ class Candidates:
             last.code.new_zeros(*shape, last.code.shape[-1]),
             None if last.actions is None else last.actions.new_zeros(*shape, *last.actions.shape[2:]),
             self.plans,
-            self.plans.centers.unsqueeze(-3).expand(-1, -1, last.path.shape[-3], -1, -1),
+            self.plans.values(has_features(last)).unsqueeze(-3).expand(-1, -1, last.path.shape[-3], -1, -1),
         )
         segments = (*self.segments, SegmentRecord(noise, rollout, self.score_state))
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))

@@ -59,7 +59,7 @@ class SearchingPlanner:
         `cavin_pyro.planning.optimizers.Optimizer`.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment (published
         implementation).
-    stride_limits: two distances in metres; a segment that moves every object less than the first, or any object more
+    stride_limits: two distances; a segment that moves every object less than the first, or any object more
         than the second, ends the plan like a violation (0.1 and 0.3 from subgoal to subgoal in the published
         implementation); None in the paper.
     decimals: to which actions are rounded before f predicts them, so that what is executed is what was scored; None
@@ -71,7 +71,7 @@ class SearchingPlanner:
     """
 
     requires: ClassVar[ModelRequirements]  # of the planner on its model
-    strides: ClassVar[str] = "segments"  # unit of `stride_limits`: "segments" or "pushes"
+    strides: ClassVar[str] = "segments"  # unit of `stride_limits`: "segments" or "steps"
     hooks: ClassVar[tuple[str, ...]] = ("wrap_objective", "rank")  # of `Addition`, which the planner calls
 
     def __init__(
@@ -176,7 +176,7 @@ class SearchingPlanner:
         """Candidates `[B, N]` of K segments, searched by cumulative reward."""
         reward, limits = scene.reward, self.stride_limits
         if limits is not None:
-            reward = StrideLimits(reward, limits, of=self.strides)
+            reward = StrideLimits(reward, limits, self.strides, scene.state.centers.shape[-1])
         objective = self.added("wrap_objective", CumulativeReward(reward, self.reward_at), scene, None)
         return self.search(space, objective, scene, early_stopping=self.early_stopping)
 

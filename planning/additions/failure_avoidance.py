@@ -73,7 +73,8 @@ class AvoidFailures(NamedTuple):
         inner = self.objective.advance(state.inner, segment, before, rollout)
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
         progress = state.progress._replace(succeeded=state.progress.succeeded | ~counts)  # later segments cannot fail
-        progress = returns.advance(progress, self.reward, before.centers, rollout.path, before.mask)
+        start = before.values(self.reward.reads_features)
+        progress = returns.advance(progress, self.reward, start, rollout.path, before.mask)
         executed = torch.as_tensor(segment == 0, device=counts.device)
         return FailureState(inner, progress, torch.where(executed, progress.failed, state.failed_in_executed))
 

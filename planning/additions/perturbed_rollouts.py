@@ -91,7 +91,7 @@ class PerturbedRollouts(Addition):
             choice,
             scores=ranked,
             goal=goal,
-            actions=actions[..., : choice.distance.pushes(choice.model.segment_length), :],
+            actions=actions[..., : choice.distance.steps(choice.model.segment_length), :],
             later=later,
         )
         chosen = torch.zeros_like(scores, dtype=torch.bool).scatter(1, best.unsqueeze(-1), True)

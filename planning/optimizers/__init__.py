@@ -1,6 +1,6 @@
 """Optimizers, which search candidates by their noise and returns only.
 
-Standard normal noise `[B, n, K, D]` determines codes and pushes, so every optimizer respects the prior and the bounds.
+Standard normal noise `[B, n, K, D]` determines codes and actions, so every optimizer respects the prior and the bounds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The cross-entropy method and iCEM, in the noise of codes or pushes."""
+"""The cross-entropy method and iCEM, in the noise of codes or actions."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.guides.flat import FlatGuide
 from cavin_pyro.guides.flow import FlowGuide
@@ -40,7 +41,7 @@ MISFITS = [(model, guide) for model in MODELS for guide in GUIDES if model not i
 
 def make_model(name: str, **more: Any) -> Model:
     kind, sizes = MODELS[name]
-    return kind(feature_dimension=6, width=8, **sizes, **more)
+    return kind(space=SPACE, feature_dimension=6, width=8, **sizes, **more)
 
 
 def make(model: str, guide: str, **more: Any) -> tuple[Model, Guide]:

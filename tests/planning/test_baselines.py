@@ -243,7 +243,9 @@ def test_one_motion_is_the_one_that_is_drawn(horizon: str, toy: SimpleNamespace)
 
 def test_pushes_are_uniform_in_the_normalised_box(toy: SimpleNamespace) -> None:
     state = toy.scenes([[(0.0, 0.0)]])
-    actions = RandomPlanner(segment_length=20000).plan(state, generators=toy.generators(0)).actions[0]
+    actions = (
+        RandomPlanner(segment_length=20000, action_dimension=4).plan(state, generators=toy.generators(0)).actions[0]
+    )
     assert actions.abs().max() <= 1.0
     for quantile in (0.1, 0.5, 0.9):
         torch.testing.assert_close(
@@ -252,7 +254,7 @@ def test_pushes_are_uniform_in_the_normalised_box(toy: SimpleNamespace) -> None:
 
 
 def test_pushes_depend_on_the_environments_own_generator_only(toy: SimpleNamespace) -> None:
-    planner = RandomPlanner()
+    planner = RandomPlanner(action_dimension=4)
     together = planner.plan(toy.scenes([[(0.0, 0.0)]] * 2), generators=toy.generators(3, 4))
     alone = planner.plan(toy.scenes([[(0.7, 0.7)]]), generators=toy.generators(4))
     assert torch.equal(together.actions[1], alone.actions[0])

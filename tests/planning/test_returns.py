@@ -109,7 +109,7 @@ def way(*x: float, objects: int = 1) -> tuple[Tensor, Tensor, Tensor]:
     ],
 )
 def test_strides_of_segments(toy: SimpleNamespace, x: tuple[float, ...], failures: list[bool]) -> None:
-    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.1, 0.5], of="segments")
+    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.1, 0.5], of="segments", positions=3)
     outcome = limited(*way(*x))
     assert outcome.failure.tolist() == failures
     assert (outcome.reward[outcome.failure] == -100.0).all()
@@ -117,7 +117,7 @@ def test_strides_of_segments(toy: SimpleNamespace, x: tuple[float, ...], failure
 
 
 def test_strides_of_pushes(toy: SimpleNamespace) -> None:
-    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.01, 0.15], of="pushes")
+    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.01, 0.15], of="steps", positions=3)
     assert limited(*way(0.0, 0.005, 0.105, 0.305)).failure.tolist() == [True, False, True]
 
 

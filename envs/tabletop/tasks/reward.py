@@ -150,6 +150,11 @@ class TaskReward:
         return Outcome(reward.to(states.dtype), terms, success, violation, fall)
 
     @property
+    def reads_features(self) -> bool:
+        """Whether it reads features beside centres: never."""
+        return False
+
+    @property
     def about(self) -> str:
         """The objects that the goal is about: the `target` (object 0), or `all`."""
         return self.task.about

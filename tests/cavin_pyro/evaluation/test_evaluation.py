@@ -67,7 +67,9 @@ def test_one_rollout_tells_how_it_ends_by_either_criterion() -> None:
     pointnet, ended = PointNet(), []
     for criterion in ("strict", "published"):
         env = PushingEnv(task="crossing", objects=5, maximum_steps=30, criterion=criterion)
-        ended.append(rollout(env, RandomPlanner(), pointnet, seed=30))  # of seeds 10 to 39 the only one that leaves it
+        ended.append(
+            rollout(env, RandomPlanner(action_dimension=4), pointnet, seed=30)
+        )  # of seeds 10 to 39 the only one that leaves it
         env.close()
     strict, published = ended
     assert strict.outcome == "violation"
@@ -106,7 +108,9 @@ class Listener(EpisodeCallback):
 
 def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) -> None:
     listener = Listener()
-    episode = rollout(env, RandomPlanner(3), PointNet(), seed=0, callbacks=[listener, EpisodeCallback()])
+    episode = rollout(
+        env, RandomPlanner(action_dimension=4), PointNet(), seed=0, callbacks=[listener, EpisodeCallback()]
+    )
     called = listener.plans
     assert called == episode.plan_records
     assert listener.transitions == episode.transitions

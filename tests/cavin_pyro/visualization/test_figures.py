@@ -49,7 +49,7 @@ def state() -> State:
 
 
 def random_plan() -> Plan:
-    return RandomPlanner(T).plan(state(), generators=[torch.Generator().manual_seed(0)])
+    return RandomPlanner(T, action_dimension=4).plan(state(), generators=[torch.Generator().manual_seed(0)])
 
 
 def made_up_plan(segments: int = 2) -> Plan:
