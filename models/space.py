@@ -59,14 +59,16 @@ class Space:
         for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         parts = (self.action_names, self.action_limits, self.action_scales)
-        if not self.action_sizes or any(len(one) != len(self.action_sizes) for one in parts):
+        if not self.action_sizes or any(len(one) != len(self.action_sizes) for one in (*parts, {*self.action_names})):
             raise ValueError(
-                f"a space has names, limits and scales for each of its {len(self.action_sizes)} action parts"
+                f"a space has different names, limits and scales for each of its {len(self.action_sizes)} action parts"
             )
         positive = (self.length, self.step_range, self.subgoal_range, *self.action_limits, *self.action_sizes)
         scales = (self.center_scale, self.feature_scale, *self.action_scales)
         if not self.origin or not all(0 < number < math.inf for number in (*positive, *scales)):
             raise ValueError("lengths, ranges, limits, scales and sizes of a space must be positive numbers")
+        if self.frequencies < 0 or (self.unit_features or 0) < 0:
+            raise ValueError("frequencies and unit_features of a space must not be negative")
         if self.turning and (self.positions < 2 or any(size != 2 for size in self.action_sizes)):
             raise ValueError("a turning space has positions of at least 2 numbers, and actions in parts of 2")
 

@@ -25,7 +25,7 @@ from cavin_pyro.config.errors import UserError
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
 GIVEN = {  # which `build_model` or `make_planner` gives, by group
-    "planner": ("decimals",),
+    "planner": ("decimals", "action_dimension"),
     "prior": ("space", "dimension", "feature_dimension", "effect_dimension"),
     "geometry": ("feature_dimension",),
     "dynamics": ("space", "feature_dimension", "width"),

@@ -26,6 +26,7 @@ from cavin_pyro.models.part import Part
 PARTS = ("model", "guide", "prior", "geometry", "dynamics", "scales", "objective")  # sections of a training
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "cavin_pyro.models.priors.standard.StandardPrior"
+MAY_BE_ZERO = ("_weight", "_margin", "unit_features", "frequencies")  # ends of names
 LARGEST_SIZE = 10**6  # more would fill the memory until the system kills the process, or take minutes to begin
 FIXED_SCALES = {"_target_": "cavin_pyro.models.likelihoods.LikelihoodScales"}
 PAPER_DYNAMICS = {"_target_": "cavin_pyro.models.networks.dynamics.Dynamics"}
@@ -47,14 +48,14 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
 
 
 def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
-    """Raise a `UserError` for a number that is not finite, or a whole one, of no weight or margin, out of range."""
+    """Raise a `UserError` for a number that is not finite, or a whole one out of range, but for those that may be 0."""
     for name, value in config.items():
         option = f"{section}.{name!s}"
         if isinstance(value, Mapping | DictConfig):
             check_sizes(option, value, minimum)
         elif isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"{option} must be finite, not {value}")
-        elif type(value) is int and not option.endswith(("_weight", "_margin")) and value < minimum:
+        elif type(value) is int and not option.endswith(MAY_BE_ZERO) and value < minimum:
             raise UserError(f"{option} must be at least {minimum:g}, not {value}")
         elif type(value) is int and value > LARGEST_SIZE:
             raise UserError(f"{option} must be at most {LARGEST_SIZE}, not {value}")

@@ -23,7 +23,7 @@ from cavin_pyro.config.world import object_ranges, part_of, task_of
 from cavin_pyro.envs.tabletop.layouts import GENERATED
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts, Task, TaskReward
-from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, PUSH_DECIMALS
+from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, PUSH_DECIMALS, SPACE
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
@@ -168,7 +168,7 @@ def planner_of(config: DictConfig, model: Model | None, device: torch.device) ->
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free", False):
         with user_input("planner"):
-            return construct(options)
+            return construct(options, action_dimension=SPACE.actions)
     if model is None:
         raise UserError(f"{planner_name(config)} needs a model: give one, or choose planner=random")
     pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)

@@ -41,7 +41,7 @@ MISFITS = [(model, guide) for model in MODELS for guide in GUIDES if model not i
 
 def make_model(name: str, **more: Any) -> Model:
     kind, sizes = MODELS[name]
-    return kind(space=SPACE, feature_dimension=6, width=8, **sizes, **more)
+    return kind(**({"space": SPACE, "feature_dimension": 6, "width": 8} | sizes | more))
 
 
 def make(model: str, guide: str, **more: Any) -> tuple[Model, Guide]:

@@ -12,6 +12,7 @@ from pyro.distributions import Normal
 from pyro.infer import RenyiELBO, Trace_ELBO, TraceMeanField_ELBO
 from torch import Tensor, nn
 
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.cascaded import CascadedGuide
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
@@ -137,8 +138,8 @@ each_prior = pytest.mark.parametrize("kind", [ConditionalPrior, FlowPrior, Objec
 
 
 def with_priors(kind: type) -> tuple[Model, Guide]:
-    effect_prior = kind(dimension=5, feature_dimension=6, width=8)
-    motion_prior = kind(dimension=4, feature_dimension=6, effect_dimension=5, width=8)
+    effect_prior = kind(space=SPACE, dimension=5, feature_dimension=6, width=8)
+    motion_prior = kind(space=SPACE, dimension=4, feature_dimension=6, effect_dimension=5, width=8)
     model = make_model("cascaded", effect_prior=effect_prior, motion_prior=motion_prior)
     for name, parameter in model.named_parameters():
         if name.startswith("prior"):

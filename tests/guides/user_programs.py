@@ -37,7 +37,7 @@ class KindsModel(FlatModel):
             with sequence_mask(window):
                 kind = pyro.sample("kind", Categorical(logits=self.logits), infer={"enumerate": "parallel"})
                 motion_code = pyro.sample("motion_code", self.prior_of_motions(first))
-                mean = self.action_generator(self.trunk(encoded[:, 0]), first.mask, motion_code)
+                mean = self.action_generator(self.trunk(encoded[:, 0]), first, motion_code)
                 around = self.scales.actions(mean + self.shifts[kind].unsqueeze(-2))
                 actions = pyro.sample("actions", around, obs=window.observed(window.actions))
             for step in self.transitions(window, encoded, actions):
@@ -63,4 +63,4 @@ class InferredKindsGuide(KindsGuide):
         encoded = self.model.encode(window)
         with windows_plate(window), sequence_mask(window):
             pyro.sample("kind", Categorical(logits=self.kind(window.actions.flatten(-2))))
-            pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first.mask, window.actions))
+            pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first, window.actions))

@@ -25,7 +25,7 @@ class PointMass:
     Each move is multiplied by the object's gain, the first number of its features.
     """
 
-    segment_length = 3
+    segment_length, action_dimension = 3, 4
     effect_dimension = motion_dimension = 16
 
     def __init__(self, noise: float = 0.02) -> None:
@@ -59,7 +59,7 @@ class Single(PointMass):
 class Flat:
     """Without effects: the T = 3 pushes are the motion code's first six numbers, times 0.05 m; f obeys."""
 
-    segment_length = 3
+    segment_length, action_dimension = 3, 4
     motion_dimension = 16
 
     def motion_prior(self, state: State) -> Distribution:
@@ -76,7 +76,7 @@ class Flat:
 class Tabled:
     """One object on a line, codes from tables: h moves it by c, each of the T = 2 pushes by c / 2 + z."""
 
-    segment_length = 2
+    segment_length, action_dimension = 2, 4
     effect_dimension = motion_dimension = 16
 
     def __init__(self, effects: Sequence[Sequence[float]], motions: Sequence[Sequence[float]]) -> None:

@@ -55,7 +55,7 @@ def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> Non
         def actions(self, state: State, effect_code: Tensor) -> Tensor:
             return torch.full((*effect_code.shape[:2], 2, 4), torch.nan)
 
-    with pytest.raises(ValueError, match="^environment 0: the pushes of the chosen effect are not finite"):
+    with pytest.raises(ValueError, match="^environment 0: the actions of the chosen effect are not finite"):
         replay(toy, SectarPlanner, Broken(EFFECTS, []), additions=[PerturbedRollouts()])
 
 

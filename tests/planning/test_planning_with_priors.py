@@ -30,8 +30,8 @@ def model_with(kind: type) -> CascadedModel:
         motion_dimension=4,
         feature_dimension=1,
         width=8,
-        effect_prior=kind(dimension=5, feature_dimension=1),
-        motion_prior=kind(dimension=4, feature_dimension=1, effect_dimension=5),
+        effect_prior=kind(space=SPACE, dimension=5, feature_dimension=1),
+        motion_prior=kind(space=SPACE, dimension=4, feature_dimension=1, effect_dimension=5),
     )
     for name, parameter in model.named_parameters():
         if name.startswith("prior"):

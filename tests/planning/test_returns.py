@@ -123,7 +123,7 @@ def test_strides_of_pushes(toy: SimpleNamespace) -> None:
 
 @pytest.mark.parametrize("limits", [[0.3], [0.3, 0.1], [-0.1, 0.3], 3, ["a", "b"]])
 def test_bad_limits_are_one_clear_line(toy: SimpleNamespace, limits: object) -> None:
-    with pytest.raises(ValueError, match="^stride_limits must be two distances in metres, low then high, not "):
+    with pytest.raises(ValueError, match="^stride_limits must be two distances, low then high, not "):
         CavinPlanner(toy.PointMass(), stride_limits=limits)  # type: ignore[arg-type]
 
 

@@ -11,6 +11,7 @@ from pyro.infer import Trace_ELBO
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import build_guide, build_model, construct
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.outline import Outline
 from cavin_pyro.models.networks.pointnet import PointNet
@@ -54,7 +55,7 @@ def test_presets_of_priors_and_guides_build_what_a_checkpoint_builds_again(
 
 def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNamespace) -> None:
     with pytest.raises(UserError) as caught:
-        build_guide(small.config(), AnotherModel())
+        build_guide(small.config(), AnotherModel(space=SPACE))
     assert str(caught.value) == (
         "guide cavin_pyro.guides.cascaded.CascadedGuide does not fit model AnotherModel (it fits cascaded): "
         "choose guide= from none of ours"
@@ -70,7 +71,7 @@ def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNam
             "cavin_pyro.models.networks.pointnet.PointNet cannot be built: .*'depth'",
         ),
         (
-            {"_target_": "cavin_pyro.planning.RandomPlanner", "segment_length": 0},
+            {"_target_": "cavin_pyro.planning.RandomPlanner", "segment_length": 0, "action_dimension": 4},
             "^segment_length must be at least 1, not 0$",
         ),
         ({"depth": 3}, "a part has no _target_"),

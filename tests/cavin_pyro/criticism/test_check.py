@@ -24,6 +24,7 @@ from cavin_pyro.criticism.loading import CheckContext, compare_data, load_contex
 from cavin_pyro.criticism.section import Section, Verdict
 from cavin_pyro.data.dataset import content_records
 from cavin_pyro.data.windows import load_windows
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.storage.checkpoint import load, save
 from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
 from tests.guides.user_programs import InferredKindsGuide, KindsGuide, KindsModel
@@ -87,7 +88,7 @@ def test_other_models_are_checked_for_what_they_have(
 def test_a_discrete_latent_of_a_users_model_is_left_to_the_sections_that_it_suits(
     kind: type[KindsGuide], cascade: CheckContext, tmp_path: Path
 ) -> None:
-    model = KindsModel(width=8, motion_dimension=4).double().requires_grad_(False)
+    model = KindsModel(space=SPACE, width=8, motion_dimension=4).double().requires_grad_(False)
     context = replace(cascade, model=model, guide=kind(model, width=8).double().requires_grad_(False))
     names = ["elbo", "guide", "prior", "predictive", "intervals"]
     sizes = {"guide": {"samples": 8, "particles": 20}, "predictive": {"replicates": 2}, "intervals": {"samples": 8}}

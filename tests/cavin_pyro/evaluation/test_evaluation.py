@@ -128,7 +128,7 @@ def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) 
 
 
 def test_an_episode_does_not_depend_on_how_a_machine_rounds(env: PushingEnv) -> None:
-    exact, rounded, other = Rounding(), Rounding(), Rounding()
+    exact, rounded, other = (Rounding(action_dimension=4) for _ in range(3))
     rounded.error, other.error = 1e-6, 2e-3
     one, same, different = (happened(rollout(env, planner, PointNet(), seed=3)) for planner in (exact, rounded, other))
     assert one == same
@@ -143,7 +143,7 @@ def test_an_episode_does_not_depend_on_how_a_machine_rounds(env: PushingEnv) -> 
 def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
     env: PushingEnv, pushes_per_plan: int | None, steps: list[int]
 ) -> None:
-    episode = rollout(env, Still(3), PointNet(), seed=0, pushes_per_plan=pushes_per_plan)
+    episode = rollout(env, Still(3, action_dimension=4), PointNet(), seed=0, pushes_per_plan=pushes_per_plan)
     assert [record.step for record in episode.plan_records] == steps
     assert len(episode.transitions) == 4
     for record, end in zip(episode.plan_records, [*steps[1:], 4], strict=True):
@@ -156,7 +156,7 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
 @pytest.mark.parametrize("pushes", [0, 4])
 def test_as_many_pushes_of_a_plan_are_made_as_there_are(env: PushingEnv, pushes: int) -> None:
     with pytest.raises(UserError, match=f"pushes_per_plan must be between 1 and 3, not {pushes}"):
-        rollout(env, Still(3), PointNet(), seed=0, pushes_per_plan=pushes)
+        rollout(env, Still(3, action_dimension=4), PointNet(), seed=0, pushes_per_plan=pushes)
 
 
 def test_the_planner_gets_the_observed_points_without_needless_padding(env: PushingEnv) -> None:
@@ -189,7 +189,7 @@ def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: Pushin
                 actions=torch.zeros(1, 3, 4), subgoals=there, segments=torch.ones(1, dtype=torch.int64)
             )
 
-    episode = rollout(env, Wishful(3), PointNet(), seed=0)
+    episode = rollout(env, Wishful(3, action_dimension=4), PointNet(), seed=0)
     distances = [transition.subgoal_distance for transition in episode.transitions]
     assert distances[2] == pytest.approx(0.3, abs=0.05)
     assert np.isnan([distances[0], distances[1]]).all()

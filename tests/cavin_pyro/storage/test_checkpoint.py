@@ -74,7 +74,7 @@ def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: P
 
     for model, said in (
         (CascadedModel(space=SPACE, effect_prior=nn.Identity()), r"^model\.effect_prior is a Identity, .*Part"),
-        (Own(), "^model is of class .*Own, which no other program can import: move it into a module"),
+        (Own(space=SPACE), "^model is of class .*Own, which no other program can import: move it into a module"),
     ):
         with pytest.raises(UserError, match=said):
             save(tmp_path / "a.safetensors", model=model)

@@ -34,7 +34,7 @@ def window() -> Window:
 
 @pytest.fixture
 def kinds() -> KindsModel:
-    return KindsModel(feature_dimension=6, width=8, motion_dimension=4).double()
+    return KindsModel(space=SPACE, feature_dimension=6, width=8, motion_dimension=4).double()
 
 
 def given(kind: int, model: KindsModel) -> Callable[..., object]:
@@ -76,7 +76,7 @@ def test_a_model_that_observes_where_it_generates_is_refused(window: Window) -> 
             super().forward(window)
             pyro.sample("more", Normal(0.0, 1.0), obs=torch.tensor(0.0))
 
-    model = Fixed(feature_dimension=6, width=8, motion_dimension=4).double()
+    model = Fixed(space=SPACE, feature_dimension=6, width=8, motion_dimension=4).double()
     with pytest.raises(UserError, match="model Fixed observes more where it generates: write obs=window.observed"):
         check_compatibility(model, KindsGuide(model, width=8).double(), window, ENUMERATION)
 
@@ -87,7 +87,7 @@ class MotionFirst(CascadedGuide):
     def forward(self, window: Window) -> None:
         encoded = self.model.encode(window)
         with windows_plate(window), sequence_mask(window):
-            z = pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first.mask, window.actions))
+            z = pyro.sample("motion_code", self.motion_inference(encoded[:, 0], window.first, window.actions))
             c = self.effect_inference(window.first, window.last).base_dist
             pyro.sample("effect_code", Normal(c.loc + 3 * z.sum(-1, keepdim=True), c.scale).to_event(1))
 
