@@ -18,7 +18,7 @@ from cavin_pyro.models.state import State, Window
 
 
 class SingleLatentModel(Model):
-    """Effects that also determine the pushes, for each window with states s = s_0, ..., s_T = s'.
+    """Effects that also determine the actions, for each window with states s = s_0, ..., s_T = s'.
 
     c ~ p(c | s)                     # effect_code
     s' ~ h(s' | s, c)                # subgoal_centers, subgoal_features

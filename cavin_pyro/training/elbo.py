@@ -87,8 +87,8 @@ def sum_out(sites: Sites) -> tuple[Callable[[Tensor], Tensor], dict[str, Tensor]
         return lambda log_density: log_density, {}
     every = tuple(dims.values())  # -2, -3, ... or, beside particles, -3, -4, ...
     densities = [site["log_prob"] for site in sites.values() if site["log_prob"].dim() >= -every[0]]
-    table = sum(densities, torch.zeros(()))
-    posterior = (table - table.logsumexp(every, keepdim=True)).detach()
+    joint = sum(densities, torch.zeros(()))
+    posterior = (joint - joint.logsumexp(every, keepdim=True)).detach()
     weights = posterior.exp()
 
     def expectation(log_density: Tensor) -> Tensor:

@@ -19,9 +19,9 @@ from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
 
 CODES = ("effect_code", "motion_code")
 COMPILED = (infer.JitTrace_ELBO, infer.JitTraceEnum_ELBO, infer.JitTraceGraph_ELBO, infer.JitTraceMeanField_ELBO)
-CENTER_UNIT = 0.005  # metres, a typical error of f after one push
+CENTER_UNIT = 0.005  # in the world's unit, a typical error of f after one action; on the tabletop 5 mm
 FEATURE_UNIT = 0.1  # of a vector of unit length
-SMOOTHING = 1e-6  # square metres, and of feature vectors; the distance has no gradient at 0
+SMOOTHING = 1e-6  # of squared distances between centres, and between features; the distance has no gradient at 0
 
 
 class Objective:
@@ -40,7 +40,7 @@ class Objective:
         warm_up_steps: steps over which the weights of the codes' log densities, of prior and guide, grow from near 0.
         counterfactual_weight: weight of the published code's term, see `counterfactual_loss`.
         rollout_weight: weight of the error where f reads its own predictions, see `rollout_loss`. The bound contains
-            each push already, so a weight trades its density for the accuracy of rollouts.
+            each step already, so a weight trades its density for the accuracy of rollouts.
 
     Raises:
         ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
@@ -202,11 +202,11 @@ def rollout_loss(model: Model, window: Window) -> Tensor:
     """Distances between f's own rollout and what was observed, summed over the windows `[B]`, a scalar.
 
     s^_0 = s_0, s^_t+1 = mean of f(. | s^_t, a_t) for t = 0, ..., T - 1, and the term is the sum over t and objects of
-    |center^ - center| / 5 mm + |feature^ - feature| / 0.1. Distances, not squares, because a few pushes end with an
-    object that rolls away. Objects count that are real before and after push t, in windows whose pushes up to t all
+    |center^ - center| / 0.005 + |feature^ - feature| / 0.1. Distances, not squares, because a few actions end far from
+    what is likely. Objects count that are real before and after action t, in windows whose actions up to t all
     count (`transition_mask`).
 
-    The bound scores each push from the state that was observed before it. A plan's later pushes start from predictions,
+    The bound scores each step from the state that was observed before it. A plan's later steps start from predictions,
     whose errors grow, and the bound does not penalise these.
     """
     state, counts = window.first, torch.ones_like(window.sequence_mask)

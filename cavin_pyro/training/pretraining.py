@@ -41,7 +41,7 @@ def pretrain(
     rare in the data; validation clouds (one in ten) are not.
 
     Args:
-        clouds: [N, 256, 3] metres from their centres. log: where the losses go, as CSV.
+        clouds: [N, 256, 3] from their centres. log: where the losses go, as CSV.
         resume: a file that keeps the state at every fiftieth of the steps, from which the same call resumes; the result
             equals that of an unbroken run.
         device: of the steps; the batches are chosen and augmented on the CPU, where the autoencoder is in the end.

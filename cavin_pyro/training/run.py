@@ -36,7 +36,7 @@ from cavin_pyro.training.trainer import Trainer, fixed_windows
 
 FREE = ("data", "output", "device", "trainer.patience")  # options that may differ when a training resumes
 UNVALIDATED = {"validate_distributions_pyro": False, "validate_distributions_torch": False}
-DATA_SHARE = 0.5  # of a GPU's free memory, which states and pushes may take; the rest is for steps
+DATA_SHARE = 0.5  # of a GPU's free memory, which states and actions may take; the rest is for steps
 
 
 def train(config: DictConfig) -> Trainer:

@@ -49,7 +49,7 @@ Row = dict[str, float]
 
 
 class Trainer:
-    """Trains one model and guide on one table of windows, all on the table's device.
+    """Trains one model and guide on windows, all on their device.
 
     Args:
         objective: what is minimised. folder: where metrics and the resume file go. seed: of batches and codes.
@@ -256,7 +256,7 @@ class Trainer:
 
 
 def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:
-    """Mirror some of the windows `[B]` in the plane y = 0, about which table, reach and camera are symmetric.
+    """Mirror some of the windows `[B]` in the plane y = 0, for worlds that are symmetric about it.
 
     Args:
         which: `[B]` bool. signs: `[F]`, of features, see `Geometry.mirror_signs`.

@@ -14,13 +14,13 @@ HARMONICS = 8  # K; the outline of a box is off by about a millimetre
 DIRECTIONS = 32  # around the object, in which its extent is measured
 OUTLINES = 3
 HEIGHTS = 12
-OUTLINE_UNIT = 0.05  # metres; about the size of an object
-TOP = 0.01  # metres below the highest point
+OUTLINE_UNIT = 0.05  # in the unit of the clouds; about the size of an object
+TOP = 0.01  # in the unit of the clouds, below the highest point
 PRODUCT = 10  # of the heights' part, the mean of x y
 SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of the points, for quantiles of their heights
 PER_OUTLINE = 2 * HARMONICS + 1
 FEATURES = OUTLINES * PER_OUTLINE + HEIGHTS + 1
-# Mean and spread of outlines and heights in 200,000 collected pushes, in units of 0.05 m: layers read inputs that vary
+# Mean and spread of outlines and heights of 200,000 states on the tabletop in units of 0.05: layers read what varies
 # alike. The spreads of a cosine and its sine are equal, so that outlines turn in these units as well.
 OUTLINE_MEAN, OUTLINE_SPREAD = 0.9, 0.3
 ORDER_SPREADS = (0.06, 0.09, 0.02, 0.035, 0.02, 0.02, 0.02, 0.02)  # of coefficients 1 to K
@@ -62,7 +62,7 @@ class Outline(Geometry):
         self.register_buffer("scaling", torch.stack((TYPICAL, SPREAD / STANDARD_UNIT)))
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """`clouds: [..., P, 3]` metres from the object's centre, in any order -> `[..., 64]`."""
+        """`clouds: [..., P, 3]` from the object's centre, in any order -> `[..., 64]`."""
         flat, height = clouds[..., :2], clouds[..., 2]
         extent = flat @ self.directions  # [..., P, directions]
         highest = height.amax(-1, keepdim=True)
@@ -122,9 +122,9 @@ def turned(outlines: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
 
 
 def supports(outlines: Tensor, cosines: Tensor, sines: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """How far outlines reach along a direction, against it, to its left and to its right, `[...]` metres each.
+    """How far outlines reach along a direction, against it, to its left and to its right, `[...]` each.
 
-    `outlines: [2 K + 1, ...]` in units of 0.05 m, components first; `cosines, sines: [K, ...]` of 1 to K times the
+    `outlines: [2 K + 1, ...]` in units of 0.05, components first; `cosines, sines: [K, ...]` of 1 to K times the
     direction's angle in the axes of the series. Only signs differ: order k, a quarter further on, is i^k times itself.
     """
     mean, real, imaginary = outlines.split((1, HARMONICS, HARMONICS))

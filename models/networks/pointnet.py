@@ -9,7 +9,7 @@ from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.networks.layers import fully_connected
 from cavin_pyro.models.space import unit
 
-CLOUD_UNIT = 0.1  # metres; about the size of an object
+CLOUD_UNIT = 0.1  # in the unit of the clouds; about the size of an object
 DECODED_POINTS = 64
 
 
@@ -27,7 +27,7 @@ class PointNet(Geometry):
         self.feature = nn.Linear(64, feature_dimension)
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """`clouds: [..., P, 3]` metres from the object's centre, in any order -> `[..., F]`."""
+        """`clouds: [..., P, 3]` from the object's centre, in any order -> `[..., F]`."""
         pooled = self.points(clouds / CLOUD_UNIT).amax(-2)
         return unit(self.feature(pooled))
 
@@ -51,7 +51,7 @@ class PointNetAutoencoder(nn.Module):
         )
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """`clouds: [..., P, 3]` metres -> reconstructions `[..., points, 3]` metres."""
+        """`clouds: [..., P, 3]` -> reconstructions `[..., points, 3]`."""
         return CLOUD_UNIT * self.decoder(self.encoder(clouds))
 
     def loss(self, clouds: Tensor) -> Tensor:

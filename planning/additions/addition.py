@@ -40,7 +40,7 @@ class Addition:
     """
 
     stops_early: ClassVar[bool] = False  # a search by reward may stop when no candidate can become the best
-    for_one_push: ClassVar[bool] = False  # only for callers that plan again after each push
+    for_one_push: ClassVar[bool] = False  # only for callers that plan again after each action
     for_motions: ClassVar[bool] = False  # only for motions that follow an effect, which baselines do not have
 
     def focus(self, focus: Focus, scene: Query) -> Focus:

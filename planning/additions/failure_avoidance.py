@@ -14,7 +14,7 @@ from cavin_pyro.planning.additions.addition import Addition, Choice, ChosenEffec
 from cavin_pyro.planning.protocol import Query, Reward, SearchObjective, SegmentRollout, unwrap
 from cavin_pyro.planning.returns import Progress, prefer
 
-FAILURE = 1e3  # square metres, the cost of a predicted failure: more than any distance on the table
+FAILURE = 1e3  # a squared distance, the cost of a predicted failure: more than any between states
 
 
 @dataclass(frozen=True)

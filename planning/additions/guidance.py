@@ -31,7 +31,7 @@ from cavin_pyro.planning.protocol import (
 from cavin_pyro.planning.returns import Progress, TrackingState, select_segment
 
 CONTINUES = 0.9  # after each segment; 1 values the last state alone
-PUSHES_PER_METRE = 20.0  # turns metres into returns, whose unit is a push: one moves an object by about 0.05 m
+ACTIONS_PER_LENGTH = 20.0  # turns distances into returns, whose unit is an action: one moves an object by about 0.05
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class GuidedProgress(NamedTuple):
     """The cumulative reward of candidates so far, and the value of their states; fields `[B, n]`."""
 
     inner: Any  # without guidance
-    value: Tensor  # at most 0; in pushes
+    value: Tensor  # at most 0; in actions
     passed: Tensor  # the part of the value that later segments do not change
 
     @property
@@ -90,13 +90,13 @@ class GuidedReturn:
         return self.valued(inner, passed + CONTINUES * arrives * potential, passed, before.mask)
 
     def potential(self, centers: Tensor, mask: Tensor) -> Tensor:
-        """Minus the distance to the goal, in pushes: `[B, n]`."""
-        return -PUSHES_PER_METRE * self.distance_to_goal(centers, mask)
+        """Minus the distance to the goal, in actions: `[B, n]`."""
+        return -ACTIONS_PER_LENGTH * self.distance_to_goal(centers, mask)
 
     def valued(self, inner: Any, value: Tensor, passed: Tensor, mask: Tensor) -> GuidedProgress:
         """The state of plans with that value, if they have not ended."""
         progress = unwrap(inner, Progress)
-        lowest = -PUSHES_PER_METRE * self.distance_to_goal.longest(mask)
+        lowest = -ACTIONS_PER_LENGTH * self.distance_to_goal.longest(mask)
         value = torch.where(progress.failed, lowest, torch.where(progress.succeeded, 0.0, value))
         return GuidedProgress(inner, value, passed)
 
