@@ -1,4 +1,4 @@
-"""Criticise: `python -m cavin_pyro.check checkpoint=FILE data=DIR output=DIR`, or two with `a=FILE b=FILE`."""
+"""Criticise: `python -m cavin_pyro.check checkpoint=FILE data=DIR output=DIR`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ def main(config: DictConfig) -> None:
 
     from cavin_pyro.config.errors import user_input
     from cavin_pyro.config.parts import check_sizes
-    from cavin_pyro.criticism.comparison import check_pair, write_pair
     from cavin_pyro.criticism.export import check_export, write_samples
-    from cavin_pyro.criticism.graph import program_graph
     from cavin_pyro.criticism.loading import load_context
     from cavin_pyro.criticism.report import write_report
     from cavin_pyro.criticism.sections import choose_sections, fingerprint_of, print_findings, run_sections
@@ -27,23 +25,20 @@ def main(config: DictConfig) -> None:
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     with user_input("sections", "sizes"):
         names = choose_sections(config.sections, config.sizes)
-        pair, export = check_pair(config), check_export(config.export)
+        export = check_export(config.export)
         check_sizes("sizes.export", config.sizes.export)
         accept = partial(check_objects, objects=config.sizes.subgoals.objects) if "subgoals" in names else None
     with output_folder(config.output) as folder:
-        if pair:
-            parts = write_pair(config, names, folder, accept)
-        else:
-            check_same_run(folder, config, ignore=("output", "sections", "export"))
-            context, about = load_context(config, accept)
-            write_config(folder, config)
-            if export:
-                sizes = config.sizes.export
-                write_samples(context, export, about, windows=sizes.windows, samples=sizes.samples)
-                print(f"written: {export}")
-            # A section of an earlier run is reused if a new run would give the same result.
-            parts = run_sections(names, context, config.sizes, folder, fingerprint_of(about))
-            write_report(folder, {**about, "graph": program_graph(context.model, context.validation)}, parts)
+        check_same_run(folder, config, ignore=("output", "sections", "export"))
+        context, about = load_context(config, accept)
+        write_config(folder, config)
+        if export:
+            sizes = config.sizes.export
+            write_samples(context, export, about, windows=sizes.windows, samples=sizes.samples)
+            print(f"written: {export}")
+        # A section of an earlier run is reused if a new run would give the same result.
+        parts = run_sections(names, context, config.sizes, folder, fingerprint_of(about))
+        write_report(folder, about, parts)
         print_findings(parts)
         print(f"written: {folder / 'report.html'}")
 

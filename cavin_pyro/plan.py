@@ -16,17 +16,16 @@ def main(config: DictConfig) -> Figures:
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
-    from cavin_pyro.visualization.rendering import check_goal, check_viewer, episode_files, render_episode, write_goal
+    from cavin_pyro.visualization.rendering import check_goal, episode_files, render_episode, write_goal
 
     config.device = choose_device(config.device).type
-    check_viewer(config.viewer)
     check_goal(config.save_goal)
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "video", "viewer", "save_goal", "planner.compile"))
+        check_same_run(folder, config, ignore=("output", "video", "save_goal", "planner.compile"))
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
         announce_objects(config)
-        row = render_episode(runner, folder, seed=config.seed, video=config.video, viewer=config.viewer)
+        row = render_episode(runner, folder, seed=config.seed, video=config.video)
         if config.save_goal is not None:
             write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
@@ -36,7 +35,7 @@ def main(config: DictConfig) -> Figures:
         print(f"{runner.task.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)
-        for name in episode_files(video=config.video, viewer=config.viewer):
+        for name in episode_files(video=config.video):
             print(f"  {folder / name}")
         return {name: row[name] for name in ("outcome", "steps", "return")}
 

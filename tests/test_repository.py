@@ -30,7 +30,6 @@ DISTRIBUTIONS = {
     "pybullet_data": "pybullet",
     "pybullet_utils": "pybullet",
     "pyro": "pyro-ppl",
-    "rerun": "rerun-sdk",
     "yaml": "pyyaml",
 }
 CODE_RUNNING_MODULES = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"}
@@ -105,9 +104,9 @@ def test_every_dependency_is_locked_at_a_version_that_the_project_admits() -> No
 
 
 def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
-    # What an optional extra brings is imported only on request: tests/cavin_pyro/visualization/test_recording.py.
+    # What an optional extra brings is imported only on request.
     extras = PROJECT["project"]["optional-dependencies"]
-    optional = [one for name in ("assets", "viewer", "graph", "minari", "ray") for one in extras[name]]
+    optional = [one for name in ("assets", "minari", "ray") for one in extras[name]]
     declared = {one.name for one in ranges(PROJECT["project"]["dependencies"] + optional)}
     known = {*sys.stdlib_module_names, "cavin_pyro"}
     strangers = [

@@ -198,8 +198,6 @@ class CheckConfig:
 
     defaults: list[Any] = preset_defaults("sizes=default env/ranges=paper")
     checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
-    a: str | None = option(None, "first of two checkpoints to compare, in place of checkpoint")
-    b: str | None = option(None, "second one; both are checked on windows that neither was trained on")
     trust: list[str] = option([], TRUST)
     data: Any = option("data/pushes", f"{DATA}; preferably the model's training data")
     output: str | None = option(None, FOLDER)
@@ -288,7 +286,6 @@ class PlanConfig(EpisodeConfig):
     output: str | None = option(None, "folder for the results; by default one in runs/")
     video: bool = option(True, "write a video of the episode")
     save_goal: str | None = option(None, "file for the last scene, a goal for task=rearrange: .png or .safetensors")
-    viewer: str | None = option(None, "recording in 3D, episode.rrd, by the extra .[viewer]", choices=("rerun",))
 
 
 @dataclass

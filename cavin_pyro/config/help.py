@@ -22,7 +22,7 @@ EXAMPLES = {
     "collect": ("transitions=100000 workers=2", "env.objects=random output=data/random", "transitions=200000"),
     "pretrain": ("data=data/pushes", "data=[data/pushes,data/random]", "held_out_objects=[mug,banana]"),
     "train": ("data=data/pushes", "model=flat guide=flat", "trainer.steps=200000 trainer.batches=bucketed"),
-    "check": ("checkpoint=cavin data=data/pushes", "a=cavin b=sectar", "sections=[prior,subgoals]"),
+    "check": ("checkpoint=cavin data=data/pushes", "checkpoint=contact windows=2000", "sections=[prior,subgoals]"),
     "calibrate": ("checkpoint=runs/train/checkpoint.safetensors data=data/pushes", "checkpoint=contact seed=1"),
     "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
     "evaluate": ("task=crossing objects=3", "planner=paper compare=runs/mine", "-m task=clearing,insertion,crossing"),
@@ -43,10 +43,10 @@ USUAL = {  # options that a user of the field changes, which --help lists; --hel
     "train": "model guide prior geometry dynamics scales objective data output device seed pointnet initial trained "
     "trainer.steps trainer.batch_size trainer.learning_rate trainer.schedule trainer.validate_every trainer.patience "
     "windows.held_out_objects objective.elbo.num_particles model.width model.effect_dimension model.motion_dimension",
-    "check": "sizes checkpoint a b data output seed windows sections export trust env.objects env.camera "
+    "check": "sizes checkpoint data output seed windows sections export trust env.objects env.camera "
     "env.segmentation env.assets sizes.guide.samples sizes.predictive.replicates sizes.subgoals.scenes",
     "calibrate": "checkpoint data output device seed parts steps batch_size learning_rate windows samples",
-    "plan": f"{EPISODES} task tiles.goal video viewer save_goal",
+    "plan": f"{EPISODES} task tiles.goal video save_goal",
     "evaluate": f"{EPISODES} task episodes compare shard workers",
     "demo": f"{EPISODES} tasks",
     "reproduce": "scale methods planners tasks objects rewards episodes bottom_episodes models output device workers "

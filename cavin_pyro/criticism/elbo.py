@@ -11,7 +11,7 @@ from torch import Tensor
 from cavin_pyro.criticism.codes import SYMBOLS, sample_guide
 from cavin_pyro.criticism.estimates import Interval, clustered_interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.section import Section, Table, conclude, grade
+from cavin_pyro.criticism.section import Section, conclude, grade
 from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, window_terms
@@ -88,17 +88,8 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
         {**means, "difference": differences, "active": active, "windows": counts},
         "-ELBO, held-out minus training windows (nats)",
         total,
-        [
-            Table(
-                ["term", "training", "held-out", "held-out minus training"],
-                [
-                    [term, *(means[name][term].text() for name in parts), differences[term].text()]
-                    for term in means["training"]
-                ],
-            )
-        ],
-        _figure(differences),
-        "Each term on held-out windows minus the same on training windows, with 95 % intervals over episodes.",
+        figure=_figure(differences),
+        caption="Each term on held-out windows minus the same on training windows, with 95 % intervals over episodes.",
     )
 
 

@@ -107,17 +107,16 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
     world = collecting_world(config.env)
-    loaded = load_trained(config, config.checkpoint, accept)
-    return context_of(config, loaded, world, loaded.table.validation)
+    return context_of(config, load_trained(config, accept), world)
 
 
-@user_input("checkpoint", "data", "a", "b")
-def load_trained(config: DictConfig, name: str, accept: Accept | None = None) -> Loaded:
-    """A checkpoint by its name or path, with its programs, and the windows of the option `data` as its training split.
+@user_input("checkpoint", "data")
+def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
+    """The checkpoint that the options name, with its programs, and the windows of `data` as its training split them.
 
     `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
     """
-    checkpoint = load(name, trust=list(config.trust))
+    checkpoint = load(config.checkpoint, trust=list(config.trust))
     if accept is not None:
         accept(checkpoint.model)
     check_fit(checkpoint.model, checkpoint.geometry)
@@ -135,15 +134,13 @@ def load_trained(config: DictConfig, name: str, accept: Accept | None = None) ->
     return Loaded(checkpoint, selection, table, folders)
 
 
-def context_of(
-    config: DictConfig, loaded: Loaded, world: CollectionConfig, held_out: Tensor
-) -> tuple[CheckContext, dict[str, Any]]:
-    """The context of a checkpoint and its data, and `about`; `held_out`: indices of windows for validation."""
+def context_of(config: DictConfig, loaded: Loaded, world: CollectionConfig) -> tuple[CheckContext, dict[str, Any]]:
+    """The context of a checkpoint and its data, and `about`."""
     checkpoint, selection, table, folders = loaded
     path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
     chosen = {
         "training": sample_windows(table, table.training, config.windows, seed=[config.seed, 0]),
-        "validation": sample_windows(table, held_out, config.windows, seed=[config.seed, 1]),
+        "validation": sample_windows(table, table.validation, config.windows, seed=[config.seed, 1]),
     }
     episodes = {name: table.episodes[indices] for name, indices in chosen.items()}
     context = CheckContext(
@@ -231,11 +228,6 @@ def trained_windows(checkpoint: Checkpoint) -> tuple[WindowConfig, int, int]:
 
 def sample_windows(table: WindowTable, indices: Tensor, count: int, *, seed: Sequence[int]) -> Tensor:
     """Indices of at most `count` of the windows `indices: [N]` int64, among those that `sequence_mask` keeps."""
-    unmasked = unmasked_windows(table, indices)
+    unmasked = indices[table.sequence_mask[indices]]
     order = np.random.default_rng(list(seed)).permutation(len(unmasked))[:count]
     return unmasked[torch.from_numpy(np.sort(order))]
-
-
-def unmasked_windows(table: WindowTable, indices: Tensor) -> Tensor:
-    """Those of the windows `indices: [N]` int64 that `sequence_mask` keeps."""
-    return indices[table.sequence_mask[indices]]

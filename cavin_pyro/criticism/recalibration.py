@@ -65,8 +65,8 @@ def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
                 "calibrate"
             )
 
-    loaded = load_trained(config, config.checkpoint, accept)
-    context, _ = context_of(config, loaded, CollectionConfig(), loaded.table.validation)
+    loaded = load_trained(config, accept)
+    context, _ = context_of(config, loaded, CollectionConfig())
     return loaded, context
 
 

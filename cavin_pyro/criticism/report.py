@@ -5,7 +5,7 @@ Keys of report.json:
     about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`
                 and `prior` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
                 `same` and `verdict`: whether training saw it), `windows` (how many were read), `windows_digest` (hash
-                of which ones), `run` (of this check), `graph` of the program (see `cavin_pyro.criticism.graph`)
+                of which ones), `run` (of this check)
     sections    by name: `title`, `verdict` (`level`: good, inspect, bad, too few or none; `rule`; `advice`, what to do
                 next), `number` (`mean`, `low`, `high`) of what `measure` says, `findings` (sentences) and `values`
 
@@ -30,7 +30,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from cavin_pyro.criticism.section import NONE, Section
+from cavin_pyro.criticism.section import Section
 from cavin_pyro.storage.files import atomic_write, write_json
 
 SIGNIFICANT_DIGITS = 6
@@ -47,7 +47,6 @@ def render(section: Section) -> Part:
         "number": plain(section.number and section.number._asdict()),
         "findings": list(section.findings),
         "values": plain(section.values),
-        "tables": [asdict(table) for table in section.tables],
         "image": image(section.figure) if section.figure else None,
     }
 
@@ -70,11 +69,7 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
     details = json.dumps(about["trained"], indent=2, ensure_ascii=False)
     # Old checkpoints may lack some of these.
     trained = {name: about["trained"].get(name, "") for name in ("command", "date", "step", "program", "revision")}
-    heading = about.get("heading", f"Criticism of {about['model']}")
-    judged = any(part["verdict"]["level"] != NONE for part in parts)
-    return environment.from_string(source).render(
-        about=about, trained=trained, details=details, sections=parts, heading=heading, judged=judged
-    )
+    return environment.from_string(source).render(about=about, trained=trained, details=details, sections=parts)
 
 
 def plain(value: Any) -> Any:

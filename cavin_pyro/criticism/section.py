@@ -37,14 +37,6 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Text in `rows`, each with one entry per column of `header`."""
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True)
 class Section:
     """One section of the report.
 
@@ -65,7 +57,6 @@ class Section:
     values: Mapping[str, Any] = field(default_factory=dict)
     measure: str = ""
     number: Interval | None = None
-    tables: Sequence[Table] = ()
     figure: Figure | None = None
     caption: str = ""
 

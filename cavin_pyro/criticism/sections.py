@@ -42,10 +42,7 @@ def choose_sections(names: Sequence[str] | None, sizes: Mapping[str, Mapping[str
 
 
 def fingerprint_of(about: Mapping[str, Any]) -> str:
-    """What a section of an earlier run must have been made from, to be reused: program, weights, windows and data.
-
-    The weights alone do not decide the windows: those of a comparison depend on the other checkpoint too.
-    """
+    """What a section of an earlier run must have been made from, to be reused: program, weights, windows and data."""
     data = [f"{dataset['fingerprint']} {dataset['transitions']}" for dataset in about["data"]]
     return " ".join([program_fingerprint(), about["weights"], about["windows_digest"], *data])
 

@@ -1,1 +1,1 @@
-"""Figures, videos and recordings."""
+"""Figures and videos."""

@@ -1,6 +1,6 @@
 """Overlays of an episode in pixels: tiles, candidates, subgoals, predictions and pushes.
 
-Figures, videos and recordings share them. All pixels are (column, row), as in `Camera.project`.
+Figures and videos share them. All pixels are (column, row), as in `Camera.project`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Episode rendering: progress on the screen, a table of steps, pictures of the plans, a video, and a recording."""
+"""Episode rendering: progress on the screen, a table of steps, pictures of the plans, and a video."""
 
 from __future__ import annotations
 
 import csv
-import importlib.util
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -64,15 +63,6 @@ class EpisodeProgress(EpisodeCallback):
         self._planned = None
 
 
-def check_viewer(viewer: object) -> None:
-    """Refuse, by a UserError, the option `viewer` without its package, before anything is written."""
-    if viewer is not None and importlib.util.find_spec("rerun") is None:
-        raise UserError(
-            f"viewer={viewer} needs an optional part that is not installed: "
-            "run python -m pip install --constraint constraints.txt --editable '.[viewer]' in the repository"
-        )
-
-
 def check_goal(path: str | None) -> None:
     """Check the option `save_goal`, before anything is written.
 
@@ -91,22 +81,13 @@ def write_goal(path: str, scene: Scene) -> None:
         save_goal(temporary, scene)
 
 
-def render_episode(
-    runner: EpisodeRunner, folder: Path, *, seed: int, video: bool, viewer: str | None = None
-) -> dict[str, Any]:
-    """Run one episode, print its pushes and write `episode_files` about it; returns its results' row.
-
-    `viewer`: "rerun" writes a recording for it as well.
-    """
+def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: bool) -> dict[str, Any]:
+    """Run one episode, print its pushes and write `episode_files` about it; returns its results' row."""
     env = runner.env
     with ExitStack() as stack:
         callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
         if video:
             callbacks.append(stack.enter_context(episode_video(folder / "episode.mp4", env, runner.task)))
-        if viewer is not None:
-            from cavin_pyro.visualization.recording import recording  # an optional extra
-
-            callbacks.append(stack.enter_context(recording(folder / "episode.rrd", env, runner.task)))
         episode = runner.rollout(seed, photograph=True, callbacks=callbacks)
     write_steps(folder / "steps.csv", episode)
     draw_plan(folder / "plan.png", episode, runner.task, env.scene.camera)
@@ -114,10 +95,9 @@ def render_episode(
     return episode_row(episode)
 
 
-def episode_files(*, video: bool, viewer: str | None = None) -> list[str]:
+def episode_files(*, video: bool) -> list[str]:
     """Names of the files that `render_episode` writes."""
-    names = ["steps.csv", "plan.png", "plan-above.png"]
-    return names + ["episode.mp4"] * video + ["episode.rrd"] * (viewer is not None)
+    return ["steps.csv", "plan.png", "plan-above.png"] + ["episode.mp4"] * video
 
 
 def write_steps(path: Path, episode: Episode) -> None:

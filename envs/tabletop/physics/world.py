@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from cavin_pyro.envs.tabletop.objects.object_sets import ObjectAsset
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectParameters
 from cavin_pyro.envs.tabletop.physics.bullet import BulletClient, connect, pybullet
-from cavin_pyro.envs.tabletop.physics.visuals import Part, parts_of
 from cavin_pyro.envs.tabletop.sensors.camera import FAR, NEAR, Camera
 from cavin_pyro.envs.tabletop.sensors.sensor import Rendering
 from cavin_pyro.envs.tabletop.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TABLE_THICKNESS
@@ -178,22 +177,6 @@ class PhysicsWorld(Uncopied):
             self.client.resetBasePositionAndOrientation(body, position, orientation)
             self.client.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self.rest(bodies)
-
-    def parts(self) -> list[Part]:
-        """The appearance of every body, for other renderers; `link_poses` has the current poses of its frames."""
-        return parts_of(self.client)
-
-    def link_poses(self, links: Sequence[tuple[int, int]]) -> Poses:
-        """True poses of the parts' frames, for (body, link) pairs; link -1 is a body's base."""
-        found, bullet = [], self.client
-        for body, link in links:
-            if link >= 0:
-                found.append(bullet.getLinkState(body, link, computeForwardKinematics=1)[4:6])
-                continue
-            # Bullet returns the pose of the base's centre of mass.
-            inertial = bullet.invertTransform(*bullet.getDynamicsInfo(body, -1)[3:5])
-            found.append(bullet.multiplyTransforms(*bullet.getBasePositionAndOrientation(body), *inertial))
-        return Poses(np.array([pose[0] for pose in found]), np.array([pose[1] for pose in found]))
 
     def fastest(self, bodies: Sequence[int]) -> float:
         """Largest speed among the bodies, in metres per second; a turn of 1 rad/s counts as 0.05 m/s."""

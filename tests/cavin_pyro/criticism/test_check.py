@@ -19,7 +19,6 @@ from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
-from cavin_pyro.criticism.comparison import assess_pair, check_pair, write_pair
 from cavin_pyro.criticism.loading import CheckContext, compare_data, load_context, trained_windows
 from cavin_pyro.criticism.section import Section, Verdict
 from cavin_pyro.data.dataset import content_records
@@ -196,47 +195,3 @@ def test_finished_sections_are_kept_and_others_run_again(counted: list[str], tmp
     assert run("one", "two") == both and counted == ["two"]  # whatever ran before it samples the same numbers
     run("one", fingerprint="b")
     assert counted == ["one"]
-
-
-def test_two_checkpoints_are_compared_on_the_windows_that_both_held_out(
-    small: SimpleNamespace, pushes: Path, tmp_path: Path
-) -> None:
-    def trained(name: str, seed: int) -> None:
-        config = {**small.config(), "windows": WINDOWS, "seed": seed}
-        save(tmp_path / name, **small.parts(), config=config, provenance={})
-
-    def check() -> dict[str, Any]:
-        write_pair(config, ["elbo"], folder)
-        return {name: json.loads((folder / name / "report.json").read_text()) for name in ("a", "b", ".")}
-
-    trained("a", seed=1), trained("b", seed=2)
-    options = [f"a={tmp_path / 'a'}", f"b={tmp_path / 'b'}", f"data={pushes}", "windows=1000", *SMALL_CHECK[1:]]
-    config, folder = compose("check", *options), tmp_path / "out"
-    folder.mkdir()
-    first = check()
-    assert first["a"]["about"]["windows_digest"] != first["b"]["about"]["windows_digest"]  # of training windows too
-    alone = load_context(compose("check", f"checkpoint={tmp_path / 'a'}", f"data={pushes}", "windows=1000"))[1]
-    assert 0 < first["a"]["about"]["windows"]["validation"] < alone["windows"]["validation"]
-    assert set(first["."]["sections"]) == {"verdicts", "comparison"}
-    assert first["."]["about"]["checkpoint"] == f"a: {tmp_path / 'a'}; b: {tmp_path / 'b'}"
-    pages = {name: (folder / name / "report.html").read_text() for name in ("a", ".")}
-    assert "<h1>Comparison of a and b</h1>" in pages["."] and "<h1>Criticism of CascadedModel</h1>" in pages["a"]
-    assert "<li>f: next states: a minus b" in pages["."]
-    trained("b", seed=1)  # another training under the same path, which held out all windows of a
-    assert check()["a"]["about"]["windows"] == alone["windows"]
-    assert check_pair(config) and not check_pair(compose("check"))
-    with pytest.raises(UserError, match="give both"):
-        check_pair(compose("check", f"a={tmp_path / 'a'}"))
-
-
-def test_a_model_compared_with_itself_shows_no_difference_and_a_worse_one_does(
-    cascade: CheckContext, small: SimpleNamespace
-) -> None:
-    same = assess_pair({"a": cascade, "b": cascade}).values
-    assert {one["better"] for one in same.values()} == {"no difference shown"} and len(same) == 7
-    worse = small.parts()["model"].double().requires_grad_(False)
-    for parameter in worse.dynamics.parameters():
-        parameter.add_(0.5)
-    found = assess_pair({"a": cascade, "b": replace(cascade, model=worse)}).values
-    assert found["f: next states"]["better"] == "a is better" and found["f: next states"]["high"] < 0
-    assert found["g: actions"]["better"] == "no difference shown"  # only f is worse

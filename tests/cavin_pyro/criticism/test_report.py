@@ -6,7 +6,6 @@ import json
 import math
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,8 @@ import torch
 from matplotlib.figure import Figure
 
 from cavin_pyro.criticism.estimates import Interval
-from cavin_pyro.criticism.graph import MISSING, program_graph
 from cavin_pyro.criticism.report import page, plain, render, write_report
-from cavin_pyro.criticism.section import Section, Table, Verdict
+from cavin_pyro.criticism.section import Section, Verdict
 
 ABOUT: dict[str, Any] = {
     "checkpoint": "here/<b>.safetensors",
@@ -63,7 +61,6 @@ def section(**changes: Any) -> Section:
         "values": {"rate": np.float32(1 / 3), "list": torch.arange(2), "none": math.nan, "far": [math.inf]},
         "measure": "share <q>",
         "number": Interval(0.25, math.nan, 0.5),
-        "tables": [Table(["name", "x<y"], [["<a>", "0.12"]])],
         "figure": figure,
         "caption": "Lines <u>.",
     }
@@ -71,13 +68,13 @@ def section(**changes: Any) -> Section:
 
 
 def test_the_page_is_valid_html_that_needs_nothing_else_and_escapes_what_it_shows() -> None:
-    html = page(ABOUT, [render(section()), render(section(name="second", tables=(), figure=None, number=None))])
+    html = page(ABOUT, [render(section()), render(section(name="second", figure=None, number=None))])
     reader = Reader(html)
     assert all(reference.startswith(("data:image/svg", "#")) for reference in reader.references)
     assert {"#first", "#second"} < set(reader.references) and len(reader.references) == 3
     assert not {"script", "link", "iframe", "object", "b", "em", "i", "s", "u", "q"} & reader.tags
     assert "http://" not in html and "https://" not in html and "url(" not in html and "@import" not in html
-    said = ("One <em>.", "By <s>rule</s>.", "x<y", "<a>", "0.12", "Lines <u>.", "share <q>: 0.25 (– to 0.5)")
+    said = ("One <em>.", "By <s>rule</s>.", "Lines <u>.", "share <q>: 0.25 (– to 0.5)")
     assert [phrase for phrase in said if phrase not in reader.text] == []
 
 
@@ -99,21 +96,3 @@ def test_a_rendered_section_survives_the_disk_and_other_values_are_refused() -> 
     assert json.loads(json.dumps(part)) == part == render(section())
     with pytest.raises(TypeError, match="PosixPath"):
         plain({"folder": [Path("here")]})
-
-
-DOT = """#!/bin/sh
-cat > /dev/null
-echo '<svg>drawn</svg>'
-"""
-
-
-def test_graphviz_draws_the_program_and_without_it_a_line_says_so(
-    right: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "dot").write_text(DOT)
-    (tmp_path / "dot").chmod(0o755)
-    for path, drawn in ((f"{tmp_path}:/usr/bin:/bin", True), (str(tmp_path / "nowhere"), False)):
-        monkeypatch.setenv("PATH", path)
-        graph = program_graph(right.model, right.windows["h"])
-        assert (graph["line"] is None) == drawn == bool(graph["image"])
-        assert (f'<img src="{graph["image"]}"' if drawn else MISSING) in page({**ABOUT, "graph": graph}, [])

@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from cavin_pyro.envs.tabletop.objects.sampling import WHOLE_TABLE, ObjectRanges
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
-from cavin_pyro.envs.tabletop.physics import PhysicsWorld
-from cavin_pyro.envs.tabletop.physics.visuals import Part
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.robots.robot import SETTLED_SPEED, STICK_RADIUS
 from cavin_pyro.envs.tabletop.scene import Scene
@@ -90,27 +88,6 @@ def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scen
     assert not observed.clouds[2:].any() and not observed.centers[2:].any()
     poses = scene.ground_truth().positions
     np.testing.assert_allclose(observed.centers[:2, :2], poses[:, :2], atol=0.02)  # half of an object is hidden
-
-
-def in_world(part: Part, world: PhysicsWorld) -> np.ndarray:
-    """The part's vertices [V, 3] metres where they are now."""
-    pose = world.link_poses([(part.body, part.link)])
-    return Rotation.from_quat(pose.orientations[0]).apply(part.vertices) + pose.positions[0]
-
-
-def test_every_body_is_drawn_where_the_camera_sees_it() -> None:
-    env = PushingEnv(task="crossing", objects=5)
-    observation, _ = env.reset(seed=3)
-    world = env.scene.world
-    parts = {part.body: part for part in world.parts()}
-    assert len(parts) == 7  # the table, five objects and the tool
-    for slot, body in enumerate(env.scene.bodies):
-        vertices, cloud = in_world(parts[body], world), observation["clouds"][slot]
-        # The camera's pixels are 5 mm wide on the table.
-        assert (cloud > vertices.min(axis=0) - 0.006).all()
-        assert (cloud < vertices.max(axis=0) + 0.006).all()
-        assert cloud[:, 2].max() == pytest.approx(vertices[:, 2].max(), abs=0.006)
-    env.close()
 
 
 @pytest.mark.parametrize("task", ["crossing", "rearrange"])
