@@ -9,7 +9,7 @@ from cavin_pyro.config.application import DictConfig, command
 
 @command("collect")
 def main(config: DictConfig) -> None:
-    """Collect pushes by the heuristic policy, or by a model, into a dataset folder, with a picture of their statistics.
+    """Collect pushes by the heuristic policy, or by a model, into a dataset folder, with their statistics.
 
     Resumes an interrupted run.
     """
@@ -19,7 +19,6 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.data.summary import summarize_data
     from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import output_folder, write_json
-    from cavin_pyro.visualization.data_summary import draw_data
 
     if config.minimum_objects > config.maximum_objects:
         raise UserError(f"minimum_objects must be at most maximum_objects={config.maximum_objects}")
@@ -33,7 +32,6 @@ def main(config: DictConfig) -> None:
         metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)
         summary = summarize_data(folder)
         write_json(folder / "statistics.json", summary.figures())
-        draw_data(folder / "statistics.png", summary)
         if lost := metadata["episodes"] - summary.episodes:
             raise UserError(
                 f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "

@@ -1,4 +1,4 @@
-"""Look after datasets: `python -m cavin_pyro.data info|verify|merge|export DIR`."""
+"""Look after datasets: `python -m cavin_pyro.data info|verify|export DIR`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavin_pyro.config.errors import Parser
 
 
 def main() -> None:
-    """Describe, verify, merge or export datasets from collect."""
+    """Describe, verify or export datasets from collect."""
     guarded(_run, "data")
 
 
@@ -22,31 +22,27 @@ def _run() -> None:
 
         print(f"{export(folders[0], arguments.to)} episodes in {arguments.to}")
         return
-    from cavin_pyro.data.maintenance import describe, merge, verify
+    from cavin_pyro.data.maintenance import describe, verify
 
     if arguments.action == "info":
         print("\n\n".join(describe(folder) for folder in folders))
-    elif arguments.action == "verify":
+    else:
         for folder in folders:
             verify(folder)
-    else:
-        metadata = merge(folders, arguments.to)
-        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
 
 
 def _parser() -> Parser:
     parser = Parser(prog="python -m cavin_pyro.data", description=main.__doc__)
     parser.add_argument("--version", action="version", version=f"cavin_pyro {__version__}")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="info|verify|merge|export")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="info|verify|export")
     for name, how_many, said in (
         ("info", "+", "pushes, episodes, files, objects, world, and how full the episodes are"),
         ("verify", "+", "read every file and name each defect in a line; exit status 2 if there is one"),
-        ("merge", "+", "join datasets of one world and of different seeds into a new one"),
         ("export", 1, "write a dataset in Minari's format; needs the extra .[minari]"),
     ):
         action = actions.add_parser(name, help=said, description=said)
         action.add_argument("folders", nargs=how_many, metavar="DIR", help="dataset folder from collect")
-        if name in ("merge", "export"):
+        if name == "export":
             where = "folder for the result; Minari wants a name such as NAME-v0"
             action.add_argument("--to", type=Path, required=True, metavar="DIR", help=where)
     return parser

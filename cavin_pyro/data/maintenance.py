@@ -1,24 +1,19 @@
-"""Looking after datasets: what is in one, whether it is whole, and joining several of one world."""
+"""Looking after datasets: what is in one, and whether it is whole."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cavin_pyro import __version__
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.options import shown
+from cavin_pyro.config.options import flat_options, shown
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS
-from cavin_pyro.storage.files import atomic_write, output_folder
 from cavin_pyro.storage.progress import progress_bar
-
-WORLD = ("object_set", "camera", "segmentation", "ranges", "steps")  # options that merged datasets have in common
 
 
 def describe(folder: Path) -> str:
@@ -28,24 +23,19 @@ def describe(folder: Path) -> str:
         UserError: no dataset.
     """
     metadata = dataset.read_metadata(folder)
-    configuration, sources = metadata["configuration"], dataset.sources_of(metadata)
+    configuration = metadata["configuration"]
     whole, by_count, by_shape = _count(folder, metadata)
     full = metadata["transitions"] / (metadata["episodes"] * configuration["steps"])
-    features = sorted(path for path in folder.glob("features-*") if path.is_dir())
-    told = {*WORLD, "seed"}
+    size = sum(file.stat().st_size for file in folder.rglob("*.h5"))
     rows = {
-        "dataset": f"{folder}, made by {', '.join(sorted({str(source.get('made_by')) for source in sources}))}",
+        "dataset": f"{folder}, made by {metadata.get('made_by')}",
         "pushes": f"{metadata['transitions']} in {metadata['episodes']} episodes of at most {configuration['steps']}: "
         f"{full:.1%} full",
-        "files": f"{whole} of {metadata['shards']} readable, {_size(folder.glob('episodes-*.h5'))}; features of "
-        f"{len(features)} geometries, {_size(file for one in features for file in one.glob('*.h5'))}",
-        "seeds": ", ".join(f"{dataset.seed_of(source)} ({source['episodes']} episodes)" for source in sources),
+        "files": f"{whole} of {metadata['shards']} readable, with features {size / 1e6:,.1f} MB",
         "objects": ", ".join(map("{} {}".format, metadata.get("shape_names", []), by_shape)),
         "on the table": ", ".join(f"{n}: {count}" for n, count in enumerate(by_count) if count)
         + " (objects: episodes)",
-        "world": ", ".join(f"{name} {configuration.get(name, '?')}" for name in WORLD[:3]),
-        "ranges": _listed(configuration.get("ranges") or {}),
-        "policy": _listed({name: value for name, value in configuration.items() if name not in told}),
+        "collected by": ", ".join(f"{name}={shown(value)}" for name, value in flat_options(configuration).items()),
     }
     return "\n".join(f"{name:<14}{value}" for name, value in rows.items())
 
@@ -63,16 +53,6 @@ def _count(folder: Path, metadata: Mapping[str, Any]) -> tuple[int, list[int], l
         by_count += np.bincount(arrays["mask"].sum(axis=-1), minlength=len(by_count))
         by_shape += np.bincount(arrays["shape"][arrays["shape"] >= 0], minlength=len(by_shape))
     return whole, by_count.tolist(), by_shape.tolist()
-
-
-def _size(files: Iterator[Path]) -> str:
-    return f"{sum(file.stat().st_size for file in files) / 1e6:,.1f} MB"
-
-
-def _listed(values: Mapping[str, Any]) -> str:
-    """Options as on the command line; long lists of names by their length."""
-    short = {name: f"[{len(value)} names]" if name == "names" and value else value for name, value in values.items()}
-    return ", ".join(f"{name}={shown(value)}" for name, value in short.items())
 
 
 def verify(folder: Path) -> None:
@@ -122,82 +102,3 @@ def find_defects(folder: Path) -> Iterator[str]:
             bar.update()
     if len(lengths) == metadata["shards"] and sum(lengths) != metadata["transitions"]:
         yield f"{folder / 'metadata.json'}: counts {metadata['transitions']} transitions, the files have {sum(lengths)}"
-
-
-def merge(folders: Sequence[Path], target: Path) -> dict[str, Any]:
-    """Copy the files of all datasets, one after another, into a new dataset. Its metadata come last.
-
-    Training on it equals training on `data=[DIR,DIR]`: episodes keep their numbers and their seeds.
-
-    Returns:
-        The metadata of the new dataset.
-
-    Raises:
-        UserError: fewer than two datasets, different worlds, a seed in two of them, a defect, or `target` holds data.
-    """
-    if len(folders) < 2:
-        raise UserError("merge takes at least two datasets: merge DIR DIR --to DIR")
-    every = [dataset.read_metadata(folder) for folder in folders]
-    _check_same_world(folders, every)
-    _check_seeds(folders, every)
-    with output_folder(target):
-        if (target / "metadata.json").exists() or any(target.resolve() == folder.resolve() for folder in folders):
-            raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
-        for folder in folders:
-            if defect := next(find_defects(folder), None):
-                raise UserError(f"{defect}; python -m cavin_pyro.data verify {folder} names every defect")
-        files = [(folder, n) for folder, one in zip(folders, every, strict=True) for n in range(one["shards"])]
-        with progress_bar("copying", total=len(files), unit="file") as bar:
-            for number, (folder, n) in enumerate(files):
-                _copy(dataset.shard_path(folder, n), dataset.shard_path(target, number))
-                for features in folder.glob(f"features-*/{dataset.shard_path(folder, n).name}"):
-                    beside = target / features.parent.name
-                    beside.mkdir(exist_ok=True)
-                    _copy(features, dataset.shard_path(beside, number))
-                bar.update()
-        metadata = _merged(every)
-        dataset.write_metadata(target, metadata)
-    return metadata
-
-
-def _merged(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    sources = [source for one in every for source in dataset.sources_of(one)]
-    first, *others = [source["configuration"] for source in sources]
-    missing = object()  # what is not the same in all sources stands in theirs alone
-    common = {name: value for name, value in first.items() if all(o.get(name, missing) == value for o in others)}
-    return {
-        "configuration": common,
-        "shape_names": every[0].get("shape_names", []),
-        "made_by": f"cavin_pyro {__version__}",
-        **{name: sum(one[name] for one in every) for name in dataset.COUNTS},
-        "sources": sources,
-    }
-
-
-def _check_same_world(folders: Sequence[Path], every: Sequence[dict[str, Any]]) -> None:
-    worlds = [{**one["configuration"], "shape_names": one.get("shape_names")} for one in every]
-    for folder, world in zip(folders[1:], worlds[1:], strict=True):
-        for name in (*WORLD, "shape_names"):
-            if world.get(name) != worlds[0].get(name):
-                raise UserError(
-                    f"{folders[0]} and {folder} are not of the same world ({name} is {worlds[0].get(name)} and "
-                    f"{world.get(name)}): merge datasets of one world, or train on several with data=[DIR,DIR]"
-                )
-
-
-def _check_seeds(folders: Sequence[Path], every: Sequence[dict[str, Any]]) -> None:
-    known: dict[int, Path] = {}
-    for folder, one in zip(folders, every, strict=True):
-        for source in dataset.sources_of(one):
-            seed = dataset.seed_of(source)
-            if seed in known:
-                raise UserError(
-                    f"{known[seed]} and {folder} both have episodes of seed={seed}, which may be the same ones: "
-                    "collect one of them with another seed"
-                )
-            known[seed] = folder
-
-
-def _copy(source: Path, target: Path) -> None:
-    with atomic_write(target) as temporary:
-        shutil.copyfile(source, temporary)

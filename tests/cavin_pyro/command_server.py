@@ -47,7 +47,6 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.reproduction.results",
     "cavin_pyro.training.pretraining",
     "cavin_pyro.training.run",
-    "cavin_pyro.visualization.data_summary",
     "cavin_pyro.visualization.rendering",
     "cavin_pyro.visualization.training",
     "cavin_pyro.guides.cascaded",

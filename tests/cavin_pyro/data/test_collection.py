@@ -6,18 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import imageio.v2 as imageio
 import numpy as np
 import pytest
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.collection import collect, collect_episode, repair
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_metadata
-from cavin_pyro.data.summary import summarize_data
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.envs.tabletop.scene import Scene
-from cavin_pyro.visualization.data_summary import draw_data
 
 
 def data_of(folder: Path) -> dict[str, bytes]:
@@ -117,9 +114,3 @@ def test_a_full_disk_leaves_whole_files_that_count_and_room_to_go_on(
     assert read_metadata(tmp_path)["shards"] == 1
     collect(small.pushes, tmp_path, transitions=60, workers=1)
     assert data_of(tmp_path) == data_of(pushes)
-
-
-def test_a_dataset_is_drawn(pushes: Path, tmp_path: Path) -> None:
-    draw_data(tmp_path / "statistics.png", summarize_data(pushes))
-    assert imageio.imread(tmp_path / "statistics.png").std() > 10
-    assert [path.name for path in tmp_path.iterdir()] == ["statistics.png"]
