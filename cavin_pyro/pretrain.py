@@ -20,7 +20,6 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.run_directory import check_same_run, write_config
     from cavin_pyro.training.pretraining import pretrain
     from cavin_pyro.training.run import data_folders
-    from cavin_pyro.visualization.training import draw_reconstructions
 
     device = choose_device(config.device)
     config.device = device.type
@@ -42,7 +41,6 @@ def main(config: DictConfig) -> None:
         parts = {"geometry": autoencoder.encoder, "decoder": autoencoder.decoder}
         save(folder / "pointnet.safetensors", **parts, config=stored_config, provenance=record)
         write_json(folder / "metrics.json", record)
-        draw_reconstructions(folder / "reconstructions.png", autoencoder, clouds[:8])
         print(f"validation loss {losses['validation']:.4f}, against {losses['mean_shape']:.4f} for one average shape")
         print(f"written: {folder / 'pointnet.safetensors'}")
 

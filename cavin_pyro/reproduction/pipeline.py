@@ -29,7 +29,7 @@ from cavin_pyro.storage.run_directory import write_config
 
 ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
-RESULTS = {"collect": "statistics.json", "pretrain": "reconstructions.png", "train": "training.png"}  # written last
+RESULTS = {"collect": "statistics.json", "pretrain": "metrics.json", "train": "training.png"}  # written last
 
 
 @dataclass(frozen=True)

@@ -57,29 +57,16 @@ QUICK_TRAINING = (
 )
 
 SIZES: dict[str, Size] = {
-    "minimal": Size(  # for tests: every stage once, in a minute
+    "smoke": Size(  # to see that everything runs, in minutes; its success rates mean nothing
         transitions=100,
         training_seeds=(0,),
         episodes=1,
         bottom_episodes=1,
         first_scene=50_000,
-        tasks=("clearing",),
-        object_counts=(1, 3),
         collection=("episodes_per_shard=5",),
         pretraining=("clouds=100", "steps=2", "batch_size=8"),
         training=TINY_TRAINING,
         planning=("planner.samples=8", "planner.horizon=6", "maximum_steps=2"),
-    ),
-    "smoke": Size(  # to see that everything runs, in minutes; its success rates mean nothing
-        transitions=400,
-        training_seeds=(0,),
-        episodes=2,
-        bottom_episodes=1,
-        first_scene=51_000,
-        collection=("episodes_per_shard=10",),
-        pretraining=("clouds=1000", "steps=50", "batch_size=32"),
-        training=TINY_TRAINING,
-        planning=("planner.samples=32", "planner.horizon=6", "maximum_steps=3"),
     ),
     "small": Size(
         transitions=20_000,

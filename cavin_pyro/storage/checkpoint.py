@@ -27,7 +27,7 @@ from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.networks.pointnet import PointNet
-from cavin_pyro.storage.digests import check_manifest, tensors_digest
+from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.provenance import provenance as of_this_process
 from cavin_pyro.storage.trust import check_numbers, check_targets
@@ -252,7 +252,6 @@ def read_checkpoint(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     if not _is_file(path):
         raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
     try:
-        check_manifest(path, shipped_folder())
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -7,20 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from cavin_pyro.models.networks.pointnet import PointNetAutoencoder
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.training.trainer import Row
 
 DOTS_PER_INCH = 120
 COLORS = {"training": "#0072B2", "validation": "#D55E00"}
-OBSERVED, RECONSTRUCTED = "#9A9A9A", "#E69F00"  # points of a cloud, and of its reconstruction
 RUN_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 COLUMNS = 3  # of panels
 
@@ -41,35 +37,6 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
     panels = {"loss": {name: (color, _curve(rows, f"{name}_loss")) for name, color in COLORS.items()}}
     panels |= {term: {"validation": (COLORS["validation"], _curve(rows, term))} for term in terms}
     save_figure(path, _draw_panels(panels))
-
-
-@torch.inference_mode()
-def draw_reconstructions(path: Path, autoencoder: PointNetAutoencoder, clouds: NDArray[np.float32]) -> None:
-    """Clouds and their reconstructions, from above and from the side.
-
-    `clouds`: [8, 256, 3] metres from their centres, or another number of them.
-    """
-    reconstructed = autoencoder(torch.from_numpy(np.ascontiguousarray(clouds, dtype=np.float32))).numpy()
-    figure = Figure(figsize=(0.8 + 1.6 * len(clouds), 4.1), dpi=DOTS_PER_INCH, layout="constrained")
-    axes = figure.subplots(2, len(clouds), squeeze=False, sharex=True, sharey=True)
-    reach = 1.1 * 100 * max(np.abs(clouds).max(), np.abs(reconstructed).max())  # centimetres
-    for column, pair in enumerate(zip(clouds, reconstructed, strict=True)):
-        for row, vertical in enumerate((1, 2)):
-            panel = axes[row, column]
-            for points, color, size in zip(pair, (OBSERVED, RECONSTRUCTED), (5, 9), strict=True):
-                panel.scatter(100 * points[:, 0], 100 * points[:, vertical], s=size, color=color, linewidths=0)
-            panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-            panel.tick_params(labelsize=8)
-    for row, label in enumerate(("from above\ny (cm)", "from the side\nz (cm)")):
-        axes[row, 0].set_ylabel(label, fontsize=9)
-    for panel in axes[1]:
-        panel.set_xlabel("x (cm)", fontsize=9)
-    handles = [
-        Line2D([], [], color=OBSERVED, marker="o", markersize=4, linestyle="", label="observed"),
-        Line2D([], [], color=RECONSTRUCTED, marker="o", markersize=4, linestyle="", label="reconstructed"),
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=9, frameon=False)
-    save_figure(path, figure)
 
 
 def compare_runs(runs: Mapping[str, Sequence[Row]]) -> Figure:

@@ -27,8 +27,8 @@ class SMC:
 
     After segment k of K the particles target p(codes) exp(return so far / temperature_k). A segment's weight is the
     ratio of this to the one before. Z is the normalising constant after segment K: the prior's
-    expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight since the last
-    resampling, is in the plan's `evidence`.
+    expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight, is in the
+    plan's `evidence`.
 
     With a `temperature` the estimate of Z is unbiased for any number of particles. Without one, every
     temperature is chosen by the weights that it gives. The estimate is then biased, its Z is of that temperature, and
@@ -38,8 +38,6 @@ class SMC:
     effective sample size is this fraction of the particles that have not failed. moves: number for every particle
     after every segment. block: last segments that a move changes. step: size of a move, in (0, 1]; 1 samples
     independently of the current value. temperature: temperature of the target, in units of the return; None adapts it.
-    resample_below: resample if the effective sample size is at most this fraction of the particles, and after the last
-    segment; 1 resamples after every segment.
 
     Extending n particles over K segments and moving their last ones costs as much as N samples of shooting.
 
@@ -52,7 +50,6 @@ class SMC:
     block: int = 2
     step: float = 0.4
     temperature: float | None = None
-    resample_below: float = 1.0
 
     def __post_init__(self) -> None:
         check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
@@ -61,7 +58,6 @@ class SMC:
         check_positive("block", self.block)
         check_fraction("step", self.step, positive=True)
         check_temperature(self.temperature)
-        check_fraction("resample_below", self.resample_below, positive=True)
 
     def particles(self, samples: int, segments: int) -> int:
         """n, for which extending and moving costs at most N = `samples` whole plans; at least 1."""
@@ -73,24 +69,18 @@ class SMC:
         count = self.particles(samples, problem.segments)
         particles = problem.begin(count)
         tempered = torch.zeros_like(particles.returns).double()  # log density over the prior's, after moves
-        weights = torch.zeros_like(tempered)  # logarithms, since the last resampling; their mean weight is 1
         evidence, sizes = torch.zeros_like(tempered[:, 0]), []
         for number in range(1, problem.segments + 1):
             noise = noise_each((count, problem.dimension), problem.generators, problem.device)
             particles = particles.extend(noise)
-            scores, before = self._scores(particles), tempered - weights
-            inverse, relative = self._tempered(scores, before)
-            logarithms = inverse.unsqueeze(-1) * scores.double() - before
-            factor = log_mean(logarithms)
-            evidence = evidence + factor
+            scores = self._scores(particles)
+            inverse, relative = self._tempered(scores, tempered)
+            logarithms = inverse.unsqueeze(-1) * scores.double() - tempered
+            evidence = evidence + log_mean(logarithms)
             sizes.append(effective_sample_size(logarithms))
             if number == problem.segments:
                 problem.add_candidates(particles)
-            always = self.resample_below == 1 or number == problem.segments
-            due = (sizes[-1] <= self.resample_below * count) | always
-            particles = particles.take(_resample(relative, problem.generators, due))
-            kept = ~due & torch.isfinite(factor)
-            weights = torch.where(kept.unsqueeze(-1), logarithms - factor.unsqueeze(-1), 0.0)
+            particles = particles.take(_resample(relative, problem.generators))
             for _ in range(self.moves):
                 particles, proposed = self._move(particles, inverse)
                 if number == problem.segments:
@@ -136,12 +126,12 @@ def active_returns(candidates: Candidates) -> Tensor:
     return torch.where(valid | ~valid.any(-1, keepdim=True), candidates.returns, -torch.inf)
 
 
-def _resample(logarithms: Tensor, generators: Sequence[torch.Generator], due: Tensor) -> Tensor:
-    """Ancestors' indices `[B, n]` int64 by systematic resampling where it is `due: [B]` and a weight is not zero."""
+def _resample(logarithms: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+    """Ancestors' indices `[B, n]` int64 by systematic resampling, where a weight is not zero."""
     count = logarithms.shape[-1]
     weights = torch.softmax(logarithms, -1)
     offsets = uniform_each((1,), generators, weights.device)
     places = (torch.arange(count, device=weights.device) + offsets.double()) / count
     indices = torch.searchsorted(weights.cumsum(-1), places).clamp(max=count - 1)
-    stay = ~(due.unsqueeze(-1) & torch.isfinite(weights).all(-1, keepdim=True))
+    stay = ~torch.isfinite(weights).all(-1, keepdim=True)
     return torch.where(stay, torch.arange(count, device=weights.device), indices)

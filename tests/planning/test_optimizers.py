@@ -114,7 +114,6 @@ def test_an_optimizer_works_at_both_levels(toy: SimpleNamespace, name: str) -> N
         ("smc", {"moves": -1}, "moves must be at least 0, not -1"),
         ("smc", {"block": 0}, "block must be at least 1, not 0"),
         ("smc", {"temperature": 0.0}, "temperature must be a positive number or null, not 0.0"),
-        ("smc", {"resample_below": 0.0}, "resample_below must be above 0 and at most 1, not 0.0"),
     ],
 )
 def test_bad_options_are_one_clear_line(name: str, options: dict, message: str) -> None:

@@ -75,7 +75,7 @@ def deviation(log_estimates: Tensor, expected: float) -> tuple[float, float]:
 CASES: dict[str, dict[str, Any]] = {
     "as it is": {},
     "moves of all segments": {"moves": 2, "block": SEGMENTS, "step": 0.9},
-    "resampled when needed": {"moves": 0, "resample_below": 0.5},
+    "without moves": {"moves": 0},
 }
 
 
@@ -94,7 +94,7 @@ def test_where_no_return_is_finite_z_is_zero(toy: SimpleNamespace) -> None:
             judged = super().__call__(previous, centers, mask)
             return judged._replace(reward=torch.full_like(judged.reward, torch.nan))
 
-    for options in ({}, {"resample_below": 0.5}, {"temperature": None}):
+    for options in ({}, {"temperature": None}):
         evidence = estimate(problem_of(toy, runs=2, objective=CumulativeReward(Nothing(TOP))), **options)
         assert (evidence.log_evidence == -torch.inf).all()
         assert (evidence.effective_samples == 0).all()

@@ -40,7 +40,7 @@ LINES = {
     "evaluate": f"{EPISODE} layout=bridge.yaml episodes=2 workers=1 seed=6 output=evaluation",
 }
 LEFT = {  # files that each command leaves
-    "features": {"config.yaml", "metrics.csv", "metrics.json", "pointnet.safetensors", "reconstructions.png"},
+    "features": {"config.yaml", "metrics.csv", "metrics.json", "pointnet.safetensors"},
     "run": {"config.yaml", "metrics.csv", "metrics.json", "checkpoint.safetensors", "training.png"},
     "report": {"config.yaml", "report.html"},
     "episode": {"config.yaml", "results.json", "steps.csv", "plan.png", "plan-above.png", "episode.mp4"},

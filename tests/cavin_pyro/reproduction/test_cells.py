@@ -105,12 +105,12 @@ def test_shards_share_the_trainings_without_overlap() -> None:
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("tasks=[crossing]", "no cell of scale=minimal has these methods, planners, tasks, objects and rewards"),
-        ("episodes=1001", "episodes must be at most 1000 with scale=minimal, not 1001"),
+        ("shard=6/6", "no cell of scale=smoke has these methods, planners, tasks, objects and rewards"),
+        ("episodes=1001", "episodes must be at most 1000 with scale=smoke, not 1001"),
         ("objects=[6]", "objects has 6: choose from 1, 2, 3, 4, 5"),
         ("models=nowhere", "models=nowhere holds no cavin-0.safetensors"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_is_written(option: str, said: str) -> None:
     with pytest.raises(UserError, match=re.escape(said)):
-        check_inputs(compose("reproduce", "scale=minimal", option))
+        check_inputs(compose("reproduce", "scale=smoke", option))

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from cavin_pyro.reproduction.results import write_results
 from cavin_pyro.reproduction.sizes import SIZES
 from cavin_pyro.reproduction.table import as_table, chosen_rows, episode_row, read_table, write_table
 
-WHOLE = ("scale=minimal", "methods=[mpc]", "planners=[paper]", "workers=1")
+WHOLE = ("scale=smoke", "methods=[mpc]", "planners=[paper]", "tasks=[clearing]", "objects=[1,3]", "workers=1")
 RESULTS = ("episodes.parquet", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png")
 
 
@@ -51,7 +52,7 @@ def test_a_reproduction_killed_and_resumed_with_more_episodes_equals_an_unbroken
     whole = shell.run_command("reproduce", *WHOLE, *options, folder=tmp_path)
     assert whole.status == 0, whole.errors
     assert not (tmp_path / "whole" / "train").exists() and contents(tmp_path / "whole") == contents(home)
-    other = shell.run_command("reproduce", "scale=smoke", "output=home", folder=tmp_path)
+    other = shell.run_command("reproduce", "scale=small", "output=home", folder=tmp_path)
     assert other.status == 2 and "holds a run with" in other.complaints[0]
 
 
@@ -66,9 +67,9 @@ def test_a_failed_stage_is_told_with_its_command_and_its_last_line(
 
 
 def played() -> pd.DataFrame:
-    """The table of a minimal run, in which CAVIN succeeds and MPC runs out of time."""
+    """The table of a small run, in which CAVIN succeeds and MPC runs out of time."""
     rows = []
-    for cell in cells(SIZES["minimal"], ["cavin", "mpc"], ["paper"]):
+    for cell in cells(replace(SIZES["smoke"], tasks=("clearing",), object_counts=(1, 3)), ["cavin", "mpc"], ["paper"]):
         outcome = "success" if cell.method == "cavin" else "timeout"
         line = {"seed": cell.seed, "outcome": outcome, "steps": 2, "return": 97.5, "unsafe": 1, "ineffective": 0}
         line |= {"plans": 2, "plans_reaching_goal": 1, "subgoal_distance": None, "planning_ms": [1.0]}

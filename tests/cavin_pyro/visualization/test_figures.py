@@ -15,7 +15,6 @@ from cavin_pyro.envs.tabletop.layouts import load_task
 from cavin_pyro.envs.tabletop.scene import COLORS
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord, Transition
-from cavin_pyro.models.networks.pointnet import PointNetAutoencoder
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import Plan, RandomPlanner
 from cavin_pyro.planning.protocol import Evidence
@@ -30,7 +29,7 @@ from cavin_pyro.visualization.overlay import (
 )
 from cavin_pyro.visualization.plan import FAILURE_COLOR, SUCCESS_COLOR, Map, draw_plan
 from cavin_pyro.visualization.rendering import write_steps
-from cavin_pyro.visualization.training import compare_runs, draw_reconstructions, draw_training
+from cavin_pyro.visualization.training import compare_runs, draw_training
 
 CAMERA = Camera().resized(512, 424)
 OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5
@@ -201,17 +200,6 @@ def test_training_curves_are_drawn_from_numbers_and_from_strings_of_a_csv_file(t
     image = imageio.imread(tmp_path / "training.png")
     for color in figures.COLORS.values():
         assert pixels_like(image, color) > 20
-
-
-def test_reconstructions_show_both_clouds(tmp_path: Path) -> None:
-    count = 2
-    clouds = 0.03 * np.random.default_rng(0).standard_normal((count, 256, 3)).astype(np.float32)
-    draw_reconstructions(tmp_path / "clouds.png", PointNetAutoencoder(), clouds)
-    image = imageio.imread(tmp_path / "clouds.png")
-    # Versions of matplotlib round inches to pixels differently.
-    assert image.shape[:2] == pytest.approx((120 * 4.1, 120 * (0.8 + 1.6 * count)), abs=1)
-    assert pixels_like(image, figures.OBSERVED) > 100
-    assert pixels_like(image, figures.RECONSTRUCTED) > 100
 
 
 def test_runs_are_compared_term_by_term() -> None:
