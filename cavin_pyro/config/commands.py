@@ -285,7 +285,7 @@ class PlanConfig(EpisodeConfig):
 
     output: str | None = option(None, "folder for the results; by default one in runs/")
     video: bool = option(True, "write a video of the episode")
-    save_goal: str | None = option(None, "file for the last scene, a goal for task=rearrange: .png or .safetensors")
+    save_goal: str | None = option(None, "file.png for the last scene, a goal for task=rearrange")
 
 
 @dataclass

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.tabletop.goals import SUFFIXES, save_goal
+from cavin_pyro.envs.tabletop.goals import SUFFIX, save_goal
 from cavin_pyro.envs.tabletop.pushing import ObservationDict
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.evaluation.evaluation import episode_row
@@ -69,8 +69,8 @@ def check_goal(path: str | None) -> None:
     Raises:
         UserError: a suffix that no goal has, or no folder to write into.
     """
-    if path is not None and Path(path).suffix.lower() not in SUFFIXES:
-        raise UserError(f"save_goal={path} must end in {' or '.join(SUFFIXES)}")
+    if path is not None and Path(path).suffix.lower() != SUFFIX:
+        raise UserError(f"save_goal={path} must end in {SUFFIX}")
     if path is not None and not Path(path).parent.is_dir():
         raise UserError(f"save_goal={path}: there is no folder {Path(path).parent}")
 

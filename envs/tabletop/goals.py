@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 from scipy.optimize import linear_sum_assignment
 
 from cavin_pyro.envs.tabletop.markings import Place
@@ -33,7 +31,7 @@ from cavin_pyro.envs.tabletop.workspace import (
 )
 
 SHAPE_WEIGHT = 100.0  # metres of distance that one metre of shape difference is worth
-SUFFIXES = (".png", ".safetensors")
+SUFFIX = ".png"
 MILLIMETRE = 1e-3  # metres per unit of a PNG, as depth cameras write them
 LARGEST = 32 * 2**20  # bytes of a file
 WIDEST = 2048  # pixels of an image
@@ -105,24 +103,21 @@ def outlines(clouds: NDArray[np.floating]) -> NDArray[np.float64]:
 def read_goal(path: str | Path) -> Goal:
     """The arrangement of objects that a file shows.
 
-    The suffix says what it is: `.png`, a depth image with 16 bits per pixel, in millimetres; `.safetensors`, the entry
-    `clouds` [n, 256, 3] in metres in the robot's base frame. The camera of an image is the environments', at its
-    nominal pose, with any number of pixels; 0 is no measurement. The objects in it are found as `segmentation=clusters`
-    does.
+    It is a depth image with 16 bits per pixel, in millimetres, of the environments' camera at its nominal pose, with
+    any number of pixels; 0 is no measurement. The objects in it are found as `segmentation=clusters` does.
 
     Raises:
         ValueError: no such file, another suffix, content, size or unit, or no objects on the table; one line.
     """
     path = Path(path)
-    readers = {".png": lambda content: _clouds_in(_image(content)), ".safetensors": _clouds}
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"goal {path} must be a file that ends in {' or '.join(SUFFIXES)}")
+    if path.suffix.lower() != SUFFIX:
+        raise ValueError(f"goal {path} must be a file that ends in {SUFFIX}")
     try:
         with open(path, "rb") as file:
             content = file.read(LARGEST + 1)
         if len(content) > LARGEST:
             raise ValueError(f"has over {LARGEST} bytes")
-        return _goal(readers[path.suffix.lower()](content))
+        return _goal(_clouds_in(_image(content)))
     except OSError as error:
         raise ValueError(f"goal {path} cannot be read: {error.strerror or error}") from error
     except ValueError as error:
@@ -130,20 +125,9 @@ def read_goal(path: str | Path) -> Goal:
 
 
 def save_goal(path: str | Path, scene: Scene) -> None:
-    """Write a scene as it is now to a file that `read_goal` reads, of the kind that the suffix says.
-
-    Raises:
-        ValueError: another suffix. OSError: the file cannot be written.
-    """
-    path = Path(path)
-    if path.suffix.lower() == ".png":
-        depth = np.rint(scene.capture().depth / MILLIMETRE).clip(0, 2**16 - 1)
-        Image.fromarray(depth.astype(np.uint16)).save(path, "PNG")
-    elif path.suffix.lower() == ".safetensors":
-        observation = scene.observe()
-        path.write_bytes(save({"clouds": np.ascontiguousarray(observation.clouds[observation.mask])}))
-    else:
-        raise ValueError(f"a goal must end in {' or '.join(SUFFIXES)}, not {path.suffix!r}")
+    """Write a scene as it is now to a file that `read_goal` reads."""
+    depth = np.rint(scene.capture().depth / MILLIMETRE).clip(0, 2**16 - 1)
+    Image.fromarray(depth.astype(np.uint16)).save(path, "PNG")
 
 
 def _image(content: bytes) -> DepthImage:
@@ -173,16 +157,6 @@ def _clouds_in(image: DepthImage) -> NDArray[np.float32]:
     points = [image.camera.points(image.depth, *pixels) for pixels in found]
     clouds = [sample_cloud(one, POINTS_PER_OBJECT, generator) for one in points]
     return np.array(clouds, dtype=np.float32).reshape(-1, POINTS_PER_OBJECT, 3)
-
-
-def _clouds(content: bytes) -> NDArray[np.float32]:
-    try:
-        clouds = load(content).get("clouds")
-    except (SafetensorError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"is damaged or no safetensors file ({error})") from error
-    if clouds is None or clouds.dtype != np.float32 or clouds.ndim != 3 or clouds.shape[1:] != (POINTS_PER_OBJECT, 3):
-        raise ValueError(f"must hold clouds, float32 [objects, {POINTS_PER_OBJECT}, 3]")
-    return clouds
 
 
 def _goal(clouds: NDArray[np.float32]) -> Goal:
