@@ -30,9 +30,9 @@ def main(config: DictConfig) -> None:
         if config.repair:
             print(f"{repair(collection, folder, workers=launcher)} files collected again")
         metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)
-        summary = summarize_data(folder)
-        write_json(folder / "statistics.json", summary.figures())
-        if lost := metadata["episodes"] - summary.episodes:
+        figures = summarize_data(folder)
+        write_json(folder / "statistics.json", figures)
+        if lost := metadata["episodes"] - figures["episodes"]:
             raise UserError(
                 f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "
                 "run the same command with repair=true, which collects them again"

@@ -1,4 +1,4 @@
-"""Look after datasets: `python -m cavin_pyro.data info|verify|export DIR`."""
+"""Look after datasets: `python -m cavin_pyro.data verify|export DIR`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavin_pyro.config.errors import Parser
 
 
 def main() -> None:
-    """Describe, verify or export datasets from collect."""
+    """Verify or export datasets from collect."""
     guarded(_run, "data")
 
 
@@ -22,21 +22,17 @@ def _run() -> None:
 
         print(f"{export(folders[0], arguments.to)} episodes in {arguments.to}")
         return
-    from cavin_pyro.data.maintenance import describe, verify
+    from cavin_pyro.data.maintenance import verify
 
-    if arguments.action == "info":
-        print("\n\n".join(describe(folder) for folder in folders))
-    else:
-        for folder in folders:
-            verify(folder)
+    for folder in folders:
+        verify(folder)
 
 
 def _parser() -> Parser:
     parser = Parser(prog="python -m cavin_pyro.data", description=main.__doc__)
     parser.add_argument("--version", action="version", version=f"cavin_pyro {__version__}")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="info|verify|export")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="verify|export")
     for name, how_many, said in (
-        ("info", "+", "pushes, episodes, files, objects, world, and how full the episodes are"),
         ("verify", "+", "read every file and name each defect in a line; exit status 2 if there is one"),
         ("export", 1, "write a dataset in Minari's format; needs the extra .[minari]"),
     ):

@@ -1,4 +1,4 @@
-"""Looking after datasets: what is in one, and whether it is whole."""
+"""Looking after datasets: whether one is whole."""
 
 from __future__ import annotations
 
@@ -6,53 +6,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.options import flat_options, shown
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS
 from cavin_pyro.storage.progress import progress_bar
-
-
-def describe(folder: Path) -> str:
-    """Pushes, episodes, files, objects, world, and how full a dataset is; only small arrays are read.
-
-    Raises:
-        UserError: no dataset.
-    """
-    metadata = dataset.read_metadata(folder)
-    configuration = metadata["configuration"]
-    whole, by_count, by_shape = _count(folder, metadata)
-    full = metadata["transitions"] / (metadata["episodes"] * configuration["steps"])
-    size = sum(file.stat().st_size for file in folder.rglob("*.h5"))
-    rows = {
-        "dataset": f"{folder}, made by {metadata.get('made_by')}",
-        "pushes": f"{metadata['transitions']} in {metadata['episodes']} episodes of at most {configuration['steps']}: "
-        f"{full:.1%} full",
-        "files": f"{whole} of {metadata['shards']} readable, with features {size / 1e6:,.1f} MB",
-        "objects": ", ".join(map("{} {}".format, metadata.get("shape_names", []), by_shape)),
-        "on the table": ", ".join(f"{n}: {count}" for n, count in enumerate(by_count) if count)
-        + " (objects: episodes)",
-        "collected by": ", ".join(f"{name}={shown(value)}" for name, value in flat_options(configuration).items()),
-    }
-    return "\n".join(f"{name:<14}{value}" for name, value in rows.items())
-
-
-def _count(folder: Path, metadata: Mapping[str, Any]) -> tuple[int, list[int], list[int]]:
-    """How many files are readable; episodes by their number of objects; objects in episodes by their shape."""
-    by_count, by_shape = np.zeros(MAXIMUM_OBJECTS + 1, np.int64), np.zeros(128, np.int64)
-    whole = 0
-    for number in range(metadata["shards"]):
-        try:
-            arrays = dataset.read_shard(dataset.shard_path(folder, number), ("mask", "shape"), metadata=metadata)
-        except UserError:
-            continue  # `verify` names it
-        whole += 1
-        by_count += np.bincount(arrays["mask"].sum(axis=-1), minlength=len(by_count))
-        by_shape += np.bincount(arrays["shape"][arrays["shape"] >= 0], minlength=len(by_shape))
-    return whole, by_count.tolist(), by_shape.tolist()
 
 
 def verify(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""`python -m cavin_pyro.data` info, verify and export, the last read back with Minari's own reader."""
+"""`python -m cavin_pyro.data` verify and export, the last read back with Minari's own reader."""
 
 from __future__ import annotations
 
@@ -19,19 +19,6 @@ from cavin_pyro.data.dataset import (
 )
 from cavin_pyro.data.features import geometry_fingerprint, shard_features
 from cavin_pyro.models.networks.pointnet import PointNet
-
-
-def test_info_tells_what_is_in_a_dataset(data: Callable, own_pushes: Path) -> None:
-    metadata = read_metadata(own_pushes)
-    shards = [read_shard(shard_path(own_pushes, number)) for number in range(3)]
-    status, output, errors = data("info", own_pushes)
-    assert (status, errors) == (0, "")
-    there = np.concatenate([arrays["shape"][arrays["mask"]] for arrays in shards])
-    of_each = ", ".join(f"{name} {(there == number).sum()}" for number, name in enumerate(metadata["shape_names"]))
-    for told in (f"{metadata['transitions']} in 12 episodes", "3 of 3 readable", "seed=3", of_each):
-        assert told in output
-    shard_path(own_pushes, 1).unlink()
-    assert "2 of 3 readable" in data("info", own_pushes)[1]
 
 
 def test_a_whole_dataset_has_no_defect(data: Callable, own_pushes: Path) -> None:
@@ -88,7 +75,7 @@ def test_damaged_files_lost_ones_and_features_of_another_file_are_named_together
 
 
 def test_a_wrong_command_line_is_one_line(data: Callable, tmp_path: Path) -> None:
-    for words in (["info", tmp_path], ["look", tmp_path], ["export", tmp_path]):
+    for words in (["verify", tmp_path], ["look", tmp_path], ["export", tmp_path]):
         status, output, errors = data(*words)
         assert (status, output, errors.count("error:")) == (2, "", 1)
     assert not list(tmp_path.iterdir())

@@ -29,7 +29,7 @@ from cavin_pyro.visualization.overlay import (
 )
 from cavin_pyro.visualization.plan import FAILURE_COLOR, SUCCESS_COLOR, Map, draw_plan
 from cavin_pyro.visualization.rendering import write_steps
-from cavin_pyro.visualization.training import compare_runs, draw_training
+from cavin_pyro.visualization.training import draw_training
 
 CAMERA = Camera().resized(512, 424)
 OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5
@@ -200,20 +200,6 @@ def test_training_curves_are_drawn_from_numbers_and_from_strings_of_a_csv_file(t
     image = imageio.imread(tmp_path / "training.png")
     for color in figures.COLORS.values():
         assert pixels_like(image, color) > 20
-
-
-def test_runs_are_compared_term_by_term() -> None:
-    def rows(scale: float, *terms: str) -> list[dict[str, float]]:
-        return [{"step": step, **{f"validation_{term}": scale * step for term in terms}} for step in (1.0, 2.0, 3.0)]
-
-    figure = compare_runs({"one": rows(1.0, "loss", "nll_actions"), "other": rows(2.0, "loss", "kl_motion_code")})
-    panels = {panel.get_title(): panel.get_lines() for panel in figure.axes if panel.get_title()}
-    drawn = {title: [line for line in lines if len(line.get_ydata())] for title, lines in panels.items()}
-    assert {title: len(lines) for title, lines in drawn.items()} == {"loss": 2, "nll actions": 1, "kl motion code": 1}
-    assert [line.get_label() for line in drawn["loss"]] == ["one", "other"]
-    assert [list(line.get_ydata()) for line in drawn["loss"]] == [[1, 2, 3], [2, 4, 6]]
-    with pytest.raises(ValueError, match=r"^give 1 to 5 runs, each with a validation"):
-        compare_runs({"one": rows(1.0, "loss"), "other": []})
 
 
 def test_the_table_of_steps_has_a_row_per_push_and_tells_of_plans_at_their_first(tmp_path: Path) -> None:
