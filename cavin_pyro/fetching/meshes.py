@@ -67,18 +67,6 @@ def write_parts(path: Path, parts: Sequence[trimesh.Trimesh]) -> None:
     path.write_text(export_obj(trimesh.Scene(parts), digits=6, **plain), encoding="utf-8")
 
 
-def read_parts(path: Path) -> list[trimesh.Trimesh]:
-    """The parts of a Wavefront file, a group each; a UserError: the file is missing or damaged."""
-    try:
-        scene = trimesh.load_scene(path, split_objects=True, group_material=False, skip_materials=True)
-        parts = [part for part in scene.geometry.values() if len(part.faces)]
-    except Exception as error:  # whatever a reader makes of bytes that are no mesh
-        raise UserError(f"{path} is missing or damaged") from error
-    if not parts:
-        raise UserError(f"{path} is damaged: it holds no mesh")
-    return parts
-
-
 def read_mesh(content: bytes, kind: str, name: str) -> trimesh.Trimesh:
     """A mesh from a file of another kind, without colours and normals: corners at one place become one vertex."""
     try:
