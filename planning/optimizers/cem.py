@@ -22,8 +22,8 @@ class CEM:
     The cross-entropy method (Rubinstein and Kroese 2004).
 
     iterations: number of iterations, which share the samples equally. elite_fraction: fraction of an iteration's
-    candidates for the next fit. momentum: weight of the last mean and scale in the next. replacement: failed candidates
-    become copies of active ones, as in shooting.
+    candidates for the next fit. momentum: weight of the last mean and scale in the next. Failed candidates become
+    copies of active ones, as in shooting.
 
     Raises ValueError for counts below 1 and fractions outside of their range.
     """
@@ -31,7 +31,6 @@ class CEM:
     iterations: int = 4
     elite_fraction: float = 0.1
     momentum: float = 0.1
-    replacement: bool = True
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
@@ -48,7 +47,7 @@ class CEM:
                 noise = mean + scale * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
-            candidates = problem.evaluate(noise, replacement=self.replacement)
+            candidates = problem.evaluate(noise, replacement=True)
             wanted = max(1, round(self.elite_fraction * count))
             population = self.competing(Population(candidates.noise, candidates.returns), elites, wanted)
             elites = best(population, wanted)

@@ -25,8 +25,8 @@ class Evolution:
     generations: number after the initial one, which is sampled from the prior. initial_fraction: fraction of the
     samples for the initial generation. parents: number of parents, at most. deletion_rate: segments that an offspring
     loses, on average. mutation_rate: segments of an offspring that mutate, on average. step: size of a mutation, in
-    (0, 1], which leaves the prior invariant; 1 samples the segment anew. replacement: failed candidates of the initial
-    generation become copies of active ones, as in shooting.
+    (0, 1], which leaves the prior invariant; 1 samples the segment anew. Failed candidates of the initial generation
+    become copies of active ones, as in shooting.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -37,7 +37,6 @@ class Evolution:
     deletion_rate: float = 2.0
     mutation_rate: float = 1.0
     step: float = 0.5
-    replacement: bool = True
 
     def __post_init__(self) -> None:
         check_positive("generations", self.generations)
@@ -54,7 +53,7 @@ class Evolution:
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         initial = min(max(1, round(self.initial_fraction * samples)), samples - self.generations)
-        candidates = problem.evaluate(problem.noise(initial), replacement=self.replacement)
+        candidates = problem.evaluate(problem.noise(initial), replacement=True)
         population = Population(candidates.noise, candidates.returns)
         for number in range(self.generations):
             population = best(population, self.parents)

@@ -19,7 +19,7 @@ class MPPI:
     iterations: number of iterations, which share the samples equally. temperature: temperature of the weights, in units
     of the return; None adapts it to `effective_sample_size`. effective_sample_size: effective sample size of the
     weights with an adapted temperature, as a fraction of the candidates. shrink: factor from one iteration's scale to
-    the next's. replacement: failed candidates become copies of active ones, as in shooting.
+    the next's. Failed candidates become copies of active ones, as in shooting.
 
     Raises ValueError for counts below 1 and numbers outside of their range.
     """
@@ -28,7 +28,6 @@ class MPPI:
     temperature: float | None = None
     effective_sample_size: float = 0.05
     shrink: float = 0.6
-    replacement: bool = True
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
@@ -45,7 +44,7 @@ class MPPI:
                 noise = mean + self.shrink**number * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
-            candidates = problem.evaluate(noise, replacement=self.replacement)
+            candidates = problem.evaluate(noise, replacement=True)
             if self.temperature is None:
                 _, logarithms = adapt_temperature(candidates.returns, self.effective_sample_size)
             else:
