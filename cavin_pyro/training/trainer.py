@@ -28,7 +28,7 @@ from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.storage.progress import ScalarLog, progress_bar
+from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.training.cuda_graphs import CapturedLoss, capturable
 from cavin_pyro.training.elbo import elbo_terms, first_nonfinite, term_counts
 from cavin_pyro.training.objectives import Objective
@@ -102,7 +102,6 @@ class Trainer:
             warnings.catch_warnings(),
             unchecked_programs(),
             progress_bar("training", total=steps, initial=self.step) as bar,
-            ScalarLog(self.folder / "tensorboard", self.rows) as board,
         ):
             # Pyro warns many times about one NaN; this loop checks and stops.
             warnings.filterwarnings("ignore", "Encountered", UserWarning)
@@ -121,7 +120,6 @@ class Trainer:
                     windows_per_second = count * config.batch_size / (time.perf_counter() - since)
                     row = self._validate(running / count, windows_per_second)
                     self._keep(row)
-                    board.add(row)
                     bar.set_postfix(validation=f"{row['validation_loss']:.1f}", best=f"{self.best:.1f}")
                     running, since = 0.0, time.perf_counter()
 
