@@ -1,15 +1,7 @@
 """Samples of a model and its guide for ArviZ: a netCDF file with a group for each kind of samples.
 
-    posterior              codes of the guide: effect_code, motion_code
-    prior                  the same codes from the prior at the first state
-    posterior_predictive   what the model generates with codes of the guide: subgoal_centers, actions, next_centers
-    prior_predictive       the same with codes of the prior
-    observed_data          the same, as observed
-    sample_stats           log_weight: log p(observed, codes) / q(codes), to reweight the posterior (Pareto smoothing)
-    constant_data          first_centers and mask, which generation reads
-
-Dimensions: `chain` (one), `draw`, `window`, `object`, `push`, `axis`, `parameter` (of a push), `effect_dimension`,
-`motion_dimension`. Centres are metres; padding is NaN. Features are left out, because they are twenty times the rest.
+docs/how-to/check-a-model.md lists the groups. Centres are metres, and padding is NaN. Features are left out, because
+they are twenty times the rest.
 """
 
 from __future__ import annotations

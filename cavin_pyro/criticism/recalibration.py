@@ -1,12 +1,7 @@
 """Repair of a guide that is not calibrated, and of intervals of f that do not hold what they say.
 
 The guide: the sleep phase of wake-sleep (Hinton, Dayan, Frey and Neal, 1995; Bornschein and Bengio, "Reweighted
-wake-sleep", 2015). It learns the codes of windows that its own model generates: E log q(codes | window) over the
-model's joint is largest where q is the posterior, and a guide that is too narrow loses most. The ELBO, on real windows,
-prefers too narrow to too wide.
-
-The scales that f predicts: split conformal prediction. f's errors on windows that training did not see are larger than
-on those that its scales were fitted to; one number widens them, so that intervals cover what they should.
+wake-sleep", 2015). The scales that f predicts: split conformal prediction. docs/how-to/check-a-model.md says why.
 """
 
 from __future__ import annotations

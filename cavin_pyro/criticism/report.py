@@ -1,15 +1,6 @@
 """The report: sections as one page that needs nothing else, `report.html`, and as data, `report.json`.
 
-Keys of report.json:
-
-    about       what was checked: `checkpoint` (path), `weights` (hash of the file), `model`, `guide`
-                and `prior` (classes), `trained` (the checkpoint's provenance), `data` (a folder each, with
-                `same` and `verdict`: whether training saw it), `windows` (how many were read), `windows_digest` (hash
-                of which ones), `run` (of this check)
-    sections    by name: `title`, `verdict` (`level`: good, inspect, bad, too few or none; `rule`; `advice`, what to do
-                next), `number` (`mean`, `low`, `high`) of what `measure` says, `findings` (sentences) and `values`
-
-Floats have six significant digits; non-finite numbers are null.
+docs/how-to/check-a-model.md lists the keys. Floats have six significant digits; non-finite numbers are null.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Another effect where no motion moves anything (our addition to Algorithm 1, between lines 10 and 7).
 
-Line 7 chooses an effect without checking that a motion can achieve it. If an obstacle occupies the place from which to
-push the target, f predicts that no motion without a failure moves anything, and the next plan chooses the same effect
-again.
+For example because an obstacle occupies the place from which to push the target.
 """
 
 from __future__ import annotations

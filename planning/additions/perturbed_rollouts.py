@@ -23,12 +23,7 @@ RETURN_WEIGHT = 0.0015
 
 @dataclass(frozen=True)
 class PerturbedRollouts(Addition):
-    """Ranks the best motions by rollouts whose pushes start at perturbed places.
-
-    The best of a thousand motions often exploits an error of f: a push just meets the object according to f, and just
-    misses it on the table. A perturbed start reveals such pushes.
-
-    The baselines' presets have more candidates: there, motions of one plan are not for one effect.
+    """Ranks the best motions by rollouts whose pushes start at perturbed places (docs/explanation/planning.md).
 
     Without a tracking cost, in the baselines, the score of a plan is its return minus `failure_cost / RETURN_WEIGHT`
     times the fraction of failed rollouts, by default 200 times: about the expected return of a plan with predicted

@@ -1,7 +1,6 @@
 """No push that would touch down on an object (our addition to Algorithm 1, line 10, and to the baselines).
 
-A robot does not execute such a push. f's training data contain such failures, but f reads an object's centre and
-feature only, and the search exploits its errors. The observed points show where the objects are.
+f reads an object's centre and feature only, and the search exploits its errors; the observed points show where it is.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """Layouts: files that list the tiles of a task's fields.
 
-`TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout.
-
-    task: crossing            # optional
-    region: [[2, 2], [2, 3]]  # the fields of `cavin_pyro.envs.tabletop.tasks.crossing.Crossing`
-    goal: [[2, 2]]
-    target_start: [[2, 3]]
-    obstacle_start: [[1, 3]]
+`TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout
+(docs/how-to/your-own-layout.md).
 
 Source of the layouts of the paper's three tasks: appendix "Task Details"; the published implementation.
 """
