@@ -37,9 +37,9 @@ def main(config: DictConfig) -> None:
             recalibration.print_change(before, after)
         if "guide" in config.parts:
             before = assess_guide(context, **sizes)
-            losses = recalibration.calibrate_guide(config, loaded, device)
+            recalibration.calibrate_guide(config, loaded, device)
             after = assess_guide(context, **sizes)
-            measured |= {"before": before.values, "after": after.values, "losses": losses}
+            measured |= {"before": before.values, "after": after.values}
             recalibration.print_change(before, after)
         print(f"written: {recalibration.write_calibrated(folder, config, loaded, measured)}")
 

@@ -244,8 +244,6 @@ class GeneratedConfig:
 
     tiles: int = option(GENERATED.tiles, "4 to 14 tiles of the bridge, of the region, or of the way to the slot (to 8)")
     shape: str = option(GENERATED.shape, f"shape of the bridge or of the region: {', '.join((*SHAPES, ANY_SHAPE))}")
-    obstacles: str = option(GENERATED.obstacles, "where obstacles start: anywhere, or beside the bridge")
-    seed: int | None = option(GENERATED.seed, "seed of one layout for all scenes; null generates one for each scene")
 
 
 @dataclass

@@ -183,14 +183,8 @@ def _figure(differences: Mapping[str, Interval]) -> Figure:
     terms = list(differences)
     figure = Figure(figsize=(6.5, 0.9 + 0.34 * len(terms)), layout="constrained")
     panel = figure.subplots()
-    for place, interval in enumerate(differences.values()):
-        panel.errorbar(
-            interval.mean,
-            place,
-            xerr=[[interval.mean - interval.low], [interval.high - interval.mean]],
-            fmt="o",
-            color="#0072B2",
-        )
+    mean, low, high = torch.tensor(list(differences.values())).T
+    panel.errorbar(mean, range(len(terms)), xerr=torch.stack((mean - low, high - mean)), fmt="o", color="#0072B2")
     panel.axvline(0.0, color="#9A9A9A", linestyle="--", linewidth=1.0)
     panel.set(yticks=range(len(terms)), yticklabels=terms, xlabel="held-out minus training (nats per window)")
     panel.invert_yaxis()

@@ -40,7 +40,6 @@ from cavin_pyro.training.trainer import unchecked_programs
 
 CPU = torch.device("cpu")
 OPTIONS = ("steps", "batch_size", "learning_rate", "wake_weight", "seed", "device")
-REPORTS = 10  # rows of losses that a run returns
 
 
 def load_calibration(config: DictConfig) -> tuple[Loaded, CheckContext]:
@@ -69,7 +68,7 @@ def write_calibrated(folder: Path, config: DictConfig, loaded: Loaded, measured:
     """Write the checkpoint with guide and f's scales as they are now, and `calibration.json` beside it.
 
     Its provenance has a record for every calibration in `calibrated`: program, options, the SHA-256 of the file that
-    was calibrated (`checkpoint`), fingerprints of the data, and what was `measured`, without `losses`.
+    was calibrated (`checkpoint`), fingerprints of the data, and what was `measured`.
     """
     checkpoint, path = loaded.checkpoint, folder / "checkpoint.safetensors"
     parts = {"guide": checkpoint.guide, "model": checkpoint.model}
@@ -81,13 +80,13 @@ def write_calibrated(folder: Path, config: DictConfig, loaded: Loaded, measured:
         **{name: config[name] for name in OPTIONS},
         "checkpoint": file_digest(checkpoint.path),
         "data": [one["fingerprint"] for data in loaded.folders for one in content_records(data)],
-        **{name: value for name, value in measured.items() if name != "losses"},
+        **measured,
     }
     earlier = checkpoint.provenance.get("calibrated")
     about = {**checkpoint.provenance, "calibrated": [*(earlier if isinstance(earlier, list) else []), record]}
     with atomic_write(path) as temporary:
         temporary.write_bytes(checkpoint_bytes({**checkpoint.tensors, **changed}, checkpoint.config, about))
-    write_json(folder / "calibration.json", {**record, **measured})
+    write_json(folder / "calibration.json", record)
     return path
 
 
@@ -97,8 +96,8 @@ def print_change(before: Section, after: Section) -> None:
         print("\n  ".join([f"{when}:", *section.findings]))
 
 
-def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = CPU) -> list[dict[str, float]]:
-    """Fit the guide in place on the windows that its training saw, on a device; returns the losses.
+def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = CPU) -> None:
+    """Fit the guide in place on the windows that its training saw, on a device.
 
     Model and guide are on the CPU before and after.
     """
@@ -112,9 +111,8 @@ def calibrate_guide(config: DictConfig, loaded: Loaded, device: torch.device = C
 
     options = {name: config[name] for name in ("steps", "learning_rate", "wake_weight")}
     with unchecked_programs():
-        losses = sleep(model, guide, batch, **options)
+        sleep(model, guide, batch, **options)
     model.to(CPU), guide.to(CPU)
-    return losses
 
 
 def sleep_loss(model: Model, guide: Program, window: Window) -> Tensor:
@@ -132,15 +130,12 @@ def sleep(
     steps: int = 1500,
     learning_rate: float = 3e-3,
     wake_weight: float = 0.03,
-) -> list[dict[str, float]]:
+) -> None:
     """Fit a guide by Adam, with training's cosine schedule and clipping of gradients; the model stays as it is.
 
     Args:
         batch: gives real windows `[B]`, other ones for each step. wake_weight: of -ELBO on these, beside the sleep
             loss on windows that are simulated from their first states.
-
-    Returns:
-        The losses after each tenth of the run: step, sleep, and wake if it counts.
 
     Raises:
         UserError: a loss that is not finite.
@@ -149,17 +144,15 @@ def sleep(
     guide.requires_grad_(True)
     optimizer = torch.optim.Adam(guide.parameters(), lr=learning_rate)
     as_training = TrainerConfig(steps=steps, learning_rate=learning_rate, schedule="cosine")
-    rows: list[dict[str, float]] = []
     with progress_bar("sleeping", total=steps) as bar:
         for step in range(steps):
             for group in optimizer.param_groups:
                 group["lr"] = as_training.rate(step)
             window = batch()
-            losses = {"sleep": sleep_loss(model, guide, window)}
+            total = sleep_loss(model, guide, window)
             if wake_weight:
                 terms = elbo_terms(model, guide, window).values()
-                losses["wake"] = torch.stack(list(terms)).sum() / len(window.actions)
-            total = losses["sleep"] + wake_weight * losses.get("wake", 0.0)
+                total = total + wake_weight * (torch.stack(list(terms)).sum() / len(window.actions))
             if not math.isfinite(total.item()):
                 raise UserError(f"calibration stopped after step {step}: the loss is not finite: lower learning_rate")
             optimizer.zero_grad(set_to_none=True)
@@ -167,10 +160,7 @@ def sleep(
             nn.utils.clip_grad_norm_(guide.parameters(), as_training.clip_norm)
             optimizer.step()
             bar.update()
-            if (step + 1) * REPORTS // steps > step * REPORTS // steps:
-                rows.append({"step": step + 1} | {name: loss.item() for name, loss in losses.items()})
     guide.requires_grad_(False)
-    return rows
 
 
 @runtime_checkable

@@ -20,7 +20,6 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, contiguous_format, nn
 
-from cavin_pyro.config.commands import CHECKPOINTS
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model, construct, describe
 from cavin_pyro.guides.guide import Guide
@@ -220,12 +219,6 @@ def find_checkpoint(name: str | Path) -> Path:
     shipped = shipped_folder() / f"{name}.safetensors"
     if not _is_file(shipped):
         names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.safetensors")))
-        if name in CHECKPOINTS:
-            model, guide = CHECKPOINTS[name]
-            raise UserError(
-                f"there is no checkpoint {name} in {shipped_folder()}, which has {names}: train one with "
-                f"python -m cavin_pyro.train model={model} guide={guide}, and give the path of its .safetensors file"
-            )
         raise UserError(f"unknown checkpoint {name!r}: choose from {names}, or give the path of a .safetensors file")
     return shipped
 

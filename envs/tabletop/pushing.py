@@ -52,7 +52,7 @@ class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     Args:
         task, layout, tiles: see `possible_tasks` in `envs.tabletop.layouts`; `tiles` replaces fields of the layout.
             `layout="random"` is sampled at every reset. A `Task` object has its own layout.
-        generated: what is wanted of `layout="generated"`, which is generated at every reset, unless it has a seed.
+        generated: what is wanted of `layout="generated"`, which is generated at every reset.
         reward: dense or sparse. criterion: what ends an episode as a violation, see `TaskReward`. Scenes and
             observations do not depend on it.
         objects: how many, 1 to 10. ranges: object parameters, or a mapping of them, which JSON can hold.

@@ -81,19 +81,16 @@ def generate_task(
     generator: np.random.Generator | None = None,
     tiles: Mapping[str, Any] | None = None,
 ) -> Task:
-    """A task in a generated layout: that of `wanted.seed`, or without one a new one.
+    """A task in a new generated layout.
 
     Args:
-        generator: for a new one; None generates that of seed 0. tiles: fields that are no lists of tiles, as in
-            `possible_tasks`.
+        generator: None generates that of seed 0. tiles: fields that are no lists of tiles, as in `possible_tasks`.
 
     Raises:
         ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
     """
     options = _options(task, GENERATED, tiles)
-    if wanted.seed is not None or generator is None:
-        generator = np.random.default_rng(wanted.seed or 0)
-    generated = task_class(task).generate(wanted, generator)
+    generated = task_class(task).generate(wanted, generator or np.random.default_rng(0))
     return replace(generated, **options) if options else generated
 
 

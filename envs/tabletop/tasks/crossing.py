@@ -56,11 +56,9 @@ class Crossing(Task):
         starts = starting_tiles()
         bridges = {shape: [path for path in found if path[0] in starts] for shape, found in paths(wanted.tiles).items()}
         bridge = wanted.sample("bridge", bridges, generator)
-        anywhere = reachable_tiles()
-        beside = [tile for tile in anywhere if tile not in bridge]
         return cls(
             region=TileSet(sorted(bridge)),
             goal=TileSet(bridge[-1:]),
             target_start=TileSet(bridge[:1]),
-            obstacle_start=TileSet(beside if wanted.obstacles == "beside" else anywhere),
+            obstacle_start=TileSet(reachable_tiles()),
         )

@@ -22,7 +22,6 @@ ROOM = 0.05  # metres that the tool's reach extends beyond the centre of a tile 
 ROOM_AT_START = 0.12
 SHAPES = ("straight", "l", "u", "s", "winding", "block")
 ANY_SHAPE = "any"
-OBSTACLES = ("anywhere", "beside")
 FEWEST, MOST = 4, 14  # tiles
 
 Path = tuple[Tile, ...]
@@ -39,8 +38,6 @@ class GeneratedLayouts:
         way to a slot, its own included (at most 8).
     shape: of a bridge or a region: straight, l, u, s (two turns to different sides), winding (more turns), or any, all
         equally likely; of a region also block, a rectangle.
-    obstacles: where obstacles of a crossing start: anywhere, or beside the bridge.
-    seed: of one layout for all scenes; None generates one for each, from the scene's seed.
 
     Raises:
         ValueError: a number out of its range, or an unknown name.
@@ -48,16 +45,12 @@ class GeneratedLayouts:
 
     tiles: int = 6
     shape: str = ANY_SHAPE
-    obstacles: str = "anywhere"
-    seed: int | None = None
 
     def __post_init__(self) -> None:
         if self.tiles not in range(FEWEST, MOST + 1):
             raise ValueError(f"generated.tiles must be a whole number from {FEWEST} to {MOST}, not {self.tiles}")
         if self.shape not in (*SHAPES, ANY_SHAPE):
             raise ValueError(f"unknown generated.shape {self.shape!r}: choose from {', '.join((*SHAPES, ANY_SHAPE))}")
-        if self.obstacles not in OBSTACLES:
-            raise ValueError(f"unknown generated.obstacles {self.obstacles!r}: choose {' or '.join(OBSTACLES)}")
 
     def sample(self, what: str, by_shape: Mapping[str, Sequence[Choice]], generator: np.random.Generator) -> Choice:
         """One of the choices of the wanted shape; of any shape, all shapes that there are are equally likely.

@@ -82,11 +82,8 @@ def test_a_guide_that_fails_is_mended(
     context = scenes.context(guide)
     assert level(context) == "bad"
     with seeded(0):
-        rows = sleep(context.model, guide, batches(context), steps=250, learning_rate=0.03, wake_weight=wake_weight)
+        sleep(context.model, guide, batches(context), steps=250, learning_rate=0.03, wake_weight=wake_weight)
     assert level(context) == "good"
-    assert [row["step"] for row in rows] == list(range(25, 251, 25))
-    assert rows[-1]["sleep"] < rows[0]["sleep"]
-    assert ("wake" in rows[0]) == bool(wake_weight)
 
 
 def test_the_loss_is_least_where_the_guide_is_the_posterior(scenes: SimpleNamespace) -> None:
@@ -210,8 +207,8 @@ def test_the_command_changes_the_guide_and_one_number_of_f_and_says_what_it_brou
     (record,) = after.provenance["calibrated"]
     assert record["steps"] == 3 and record["wake_weight"] == 0.03 and record["checkpoint"] == file_digest(trained)
     assert record["scales"]["factor"] > 0 and record["before"]["joint"] and record["after"]["joint"]
-    losses = json.loads((path.parent / "calibration.json").read_text())["losses"]
-    assert [row["step"] for row in losses] == [1, 2, 3]
+    told = json.loads((path.parent / "calibration.json").read_text())
+    assert told.keys() == record.keys() and told["scales"]["factor"] == record["scales"]["factor"]
     assert after.guide
     again = shell.run_command("calibrate", *line, folder=tmp_path)
     assert again.status == 0, again.errors

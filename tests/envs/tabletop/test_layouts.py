@@ -201,8 +201,6 @@ def test_every_scene_has_its_own_layout_with_room_for_five_objects(task: str, ti
         assert seen.setdefault(seed, env.task) == env.task
     env.close()
     assert len(set(seen.values())) > 1
-    fixed = GeneratedLayouts(tiles=6, seed=5)
-    assert len({generate_task(task, fixed, np.random.default_rng(seed)) for seed in range(4)}) == 1
 
 
 @pytest.mark.parametrize(
