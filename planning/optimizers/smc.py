@@ -25,14 +25,9 @@ from cavin_pyro.planning.sampling import noise_each, uniform_each
 class SMC:
     """Extends, weights, resamples and moves particles, a segment at a time.
 
-    After segment k of K the particles target p(codes) exp(return so far / temperature_k). A segment's weight is the
-    ratio of this to the one before. Z is the normalising constant after segment K: the prior's
-    expectation of exp(return / temperature). Its estimate, the product over segments of the mean weight, is in the
-    plan's `evidence`.
-
-    With a `temperature` the estimate of Z is unbiased for any number of particles. Without one, every
-    temperature is chosen by the weights that it gives. The estimate is then biased, its Z is of that temperature, and
-    failed particles count as impossible while others have not failed.
+    After segment k of K the particles target p(codes) exp(return so far / temperature_k); docs/explanation/planning.md
+    says more. The estimate of Z, the prior's expectation of exp(return / temperature), is in the plan's `evidence`. It
+    is unbiased with a `temperature`; without one, failed particles count as impossible while others have not failed.
 
     effective_sample_size: without a `temperature`, the one after a segment is the lowest at which the weights'
     effective sample size is this fraction of the particles that have not failed. moves: number for every particle

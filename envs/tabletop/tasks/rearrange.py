@@ -28,10 +28,7 @@ class Rearrange(Task):
     """Push every object to its place, in any order. Only falls off the table are forbidden.
 
     Places are for centres as observed: the mean of an object's visible points. Orientations do not count. Places in a
-    file are assigned once, when the episode starts, to the objects of the most similar shape, and among objects of
-    equal shape to the nearest ones (`assign`). A new assignment after every push would let two objects of
-    equal shape trade places, but noise in the outlines could then also swap objects that differ. A random goal samples
-    a place for each object.
+    file are assigned once, when the episode starts (`assign`); a random goal samples a place for each object.
 
     A margin makes the tolerance smaller for planners, and keeps objects within reach until they have arrived.
 
