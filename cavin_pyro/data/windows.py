@@ -102,9 +102,9 @@ class WindowTable:
         Raises:
             UserError: shapes that do not fit together, numbers that are not finite, or nothing to train on.
         """
-        pushes = _checked("actions", actions, torch.float32, (None, None, 4))
+        pushes = _checked("actions", actions, torch.float32, (None, None, None))
         W, T = pushes.shape[:2]
-        places = _checked("centers", centers, torch.float32, (W, T + 1, None, 3))
+        places = _checked("centers", centers, torch.float32, (W, T + 1, None, None))
         real = _checked("mask", mask, torch.bool, places.shape[:3])
         outlines = _checked("features", features, torch.float32, (*places.shape[:3], None))
         transitions = _checked("transition_mask", transition_mask, torch.bool, (W, T))
