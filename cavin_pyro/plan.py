@@ -11,6 +11,7 @@ def main(config: DictConfig) -> Figures:
     import copy
 
     from cavin_pyro.config.device import choose_device
+    from cavin_pyro.envs.tabletop.pushing import PushingEnv
     from cavin_pyro.evaluation.factory import announce_objects, make_runner
     from cavin_pyro.evaluation.statistics import counted, plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
@@ -26,17 +27,19 @@ def main(config: DictConfig) -> Figures:
         write_config(folder, config)
         announce_objects(config)
         row = render_episode(runner, folder, seed=config.seed, video=config.video)
-        if config.save_goal is not None:
+        if config.save_goal is not None and isinstance(runner.env, PushingEnv):
             write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
-        pushes = counted(row["steps"], "push", "pushes")
+        steps = ("push", "pushes") if isinstance(runner.env, PushingEnv) else ("step", "steps")
+        pushes = counted(row["steps"], *steps)
         idle = f", {row['ineffective']} of which moved nothing" if row["ineffective"] else ""
-        print(f"{runner.task.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
+        print(f"{runner.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)
         for name in episode_files(video=config.video):
-            print(f"  {folder / name}")
+            if (folder / name).exists():
+                print(f"  {folder / name}")
         return {name: row[name] for name in ("outcome", "steps", "return")}
 
 

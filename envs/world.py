@@ -41,14 +41,16 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     state       of an observation
     goal        of the current episode
     policy      that collects; a world whose data come from elsewhere has none
-    decimals    to which a plan's actions are rounded; None: as they are
     pixels      where positions lie in the picture of `render`, for drawings; None: they are drawn on axes
+
+    A caller may set `render_mode`, and `on_frame`, which a world may call during a step, to film it.
     """
 
     space: ClassVar[Space]
-    features: ClassVar[int]
-    objects: ClassVar[int]
-    decimals: ClassVar[int | None] = 3
+    features: int
+    objects: int
+    maximum_steps: int
+    on_frame: Callable[[], None] | None = None
 
     @abstractmethod
     def state(self, observation: Any, geometry: Geometry | None = None) -> State:
@@ -57,10 +59,14 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
         `geometry`: of the checkpoint, in worlds that see point clouds.
         """
 
-    @property
     @abstractmethod
-    def goal(self) -> Goal:
-        """Of the current episode."""
+    def goal(self, device: str | torch.device = "cpu") -> Any:
+        """The reward of the current episode, for plans on a device: a `Goal`."""
+
+    def positions(self, observation: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """The centres `[M, P]` and the mask `[M]` of an observation, without features."""
+        state = self.state(observation)
+        return state.centers.numpy(), state.mask.numpy()
 
     def policy(self, generator: np.random.Generator) -> Policy:
         """What collects an episode; `generator`: all of its randomness.
@@ -117,6 +123,7 @@ class Goal(ABC):
 
     def distance_to_goal(self) -> None:
         """None: guidance has no map of this world."""
+        return
 
     def __call__(self, previous: Tensor, values: Tensor, mask: Tensor) -> Outcome:
         """The outcome of steps from `previous` to `values: [..., M, P + F]`, `mask: [..., M]`: `[...]`."""
@@ -136,3 +143,49 @@ class Goal(ABC):
     def _state(self, values: Tensor, mask: Tensor) -> State:
         size = self.space.positions
         return State(values[..., :size], values[..., size:], mask)
+
+
+def executed(action: NDArray[np.floating], decimals: int | None = 3) -> NDArray[np.float32]:
+    """The action that is made: clipped to [-1, 1], and rounded.
+
+    Without rounding, an error of 1e-7 in a plan, of another processor or of compiled code, makes another episode.
+
+    Args:
+        action: [..., A]. decimals: of the result [..., A]; None does not round.
+    """
+    clipped = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+    return (clipped if decimals is None else np.round(clipped, decimals)).astype(np.float32)
+
+
+def check_world(world: World) -> None:
+    """Begin an episode, and check what the world says of it.
+
+    Raises:
+        ValueError: its actions, a state or its goal have another shape than the world declares.
+    """
+    name, space = type(world).__name__, world.space
+    box = world.action_space
+    if not isinstance(box, gymnasium.spaces.Box) or box.shape != (space.actions,):
+        raise ValueError(f"{name}: its space has {space.actions} numbers in an action, and its action_space is {box}")
+    if not (np.all(box.low == -1) and np.all(box.high == 1)):
+        raise ValueError(f"{name}: its action_space must be a box from -1 to 1, not {box}")
+    observation, _ = world.reset(seed=0)
+    state, M = world.state(observation), world.objects
+    shapes = [(M, space.positions), (M, world.features), (M,)]
+    if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
+        found = [list(field.shape) for field in state]
+        raise ValueError(f"{name}: a state must have centers, features and mask of {shapes}, not {found}")
+    plans = 5
+    one = state.map(lambda field: field.expand(plans, *field.shape))
+    goal = world.goal()
+    values = one.values(goal.reads_features)
+    outcome = goal(values, values, one.mask)
+    for field in ("reward", "success", "failure"):
+        value = getattr(outcome, field)
+        if (
+            not isinstance(value, Tensor)
+            or value.shape != (plans,)
+            or (value.dtype == torch.bool) == (field == "reward")
+        ):
+            shape = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"{name}: for states [{plans}] its goal must give {field} [{plans}], not {shape}")

@@ -9,7 +9,7 @@ from typing import Any
 
 from cavin_pyro.config.options import option, preset_defaults, seed_option
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
-from cavin_pyro.envs.tabletop.pushing import PushingEnv
+from cavin_pyro.envs.tabletop.pushing import PLANNING_MARGIN, PushingEnv
 from cavin_pyro.envs.tabletop.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
 from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
 
@@ -20,6 +20,7 @@ CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of
     "mpc": ("dynamics", "none"),
 }
 DEFAULT_CHECKPOINT = "cavin"
+PLANNERS_CHECKPOINT = "${oc.select:world.default_checkpoint,${oc.select:planner.default_checkpoint,cavin}}"
 PAPER_TASKS = ["clearing", "insertion", "crossing"]
 SECTIONS = ("elbo", "guide", "prior", "predictive", "intervals", "subgoals")  # of the report of check
 COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of an episode
@@ -35,6 +36,7 @@ HELD_OUT = "names of objects, [mug,banana]; training omits what shows one of the
 PRECISION = "precision of the factors of matrix products; bfloat16 is TF32 on a GPU"
 TRUST = "modules of your own whose classes the checkpoint may name"
 ENVS, REPRODUCE = "cavin_pyro.envs.tabletop", "cavin_pyro.reproduction"  # where the choices of options are listed
+MARGIN = "margin of the planner's reward"
 PRECISIONS = "cavin_pyro.config.device.MATMUL_PRECISIONS"
 
 
@@ -107,11 +109,12 @@ class CollectionOptions:
 class CollectConfig(LaunchOptions, CollectionOptions):
     """Options of `python -m cavin_pyro.collect`."""
 
-    defaults: list[Any] = preset_defaults("env/ranges=paper")
+    defaults: list[Any] = preset_defaults("env/ranges=paper world=tabletop")
     transitions: int = option(100_000, "pushes to collect, at least; whole files of episodes are written", minimum=1)
     output: str | None = option(None, "folder for the dataset, in which an unfinished one resumes; by default in data/")
     repair: bool = option(False, "collect missing or corrupt files again")
     env: WorldConfig = field(default_factory=collection_world)
+    world: Any = None
 
 
 @dataclass
@@ -250,7 +253,7 @@ class GeneratedConfig:
 class SceneConfig(DeviceOptions):
     """Options of commands that run episodes of one task or of several."""
 
-    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper")
+    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop")
     layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
     reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
     criterion: str = option(ENV["criterion"], CRITERION, choices=f"{ENVS}.tasks.reward.CRITERIA")
@@ -259,11 +262,12 @@ class SceneConfig(DeviceOptions):
     planner: Any = None
     pushes_per_plan: int | None = option(1, "executed pushes per plan; null: all T (Algorithm 1, line 11)", minimum=1)
     push_decimals: int | None = option(PUSH_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
-    margin: float = option(0.02, "margin of the planner's reward", unit="metres", minimum=0, maximum=TILE_SIDE / 2)
+    margin: float = option(PLANNING_MARGIN, MARGIN, unit="metres", minimum=0, maximum=TILE_SIDE / 2)
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
-    checkpoint: str = option("${oc.select:planner.default_checkpoint,cavin}", f"{CHECKPOINT}; by default the planner's")
+    checkpoint: str = option(PLANNERS_CHECKPOINT, f"{CHECKPOINT}; by default the planner's or the world's")
     trust: list[str] = option([], TRUST)
     generated: GeneratedConfig = field(default_factory=GeneratedConfig)
+    world: Any = None
     env: WorldConfig = field(default_factory=WorldConfig)
     seed: int = seed_option("seed of the scene and of the planner")
 
@@ -272,7 +276,7 @@ class SceneConfig(DeviceOptions):
 class EpisodeConfig(SceneConfig):
     """Options of commands that run episodes of one task."""
 
-    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper task=" + ENV["task"])
+    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop task=" + ENV["task"])
     task: Any = None
     tiles: TilesConfig = field(default_factory=TilesConfig)
 

@@ -36,6 +36,7 @@ OUTPUT = {  # the folder of a run for which the user names none
 SAME_RUN = {"output", "workers", "launcher", "address", "transitions", "repair", "sections", "video"}
 SAME_RUN |= {"episodes", "compare", "merge"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
+OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")
 
 
 def compose(name: str, *overrides: str, **options: Any) -> DictConfig:
@@ -65,7 +66,7 @@ def composed(name: str, overrides: Sequence[str], config_dir: str | None = None)
         raise UserError(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
     register(name)
     words = [f"hydra.searchpath=['file://{Path(config_dir).resolve()}']"] if config_dir else []
-    words += rewritten(overrides)
+    words += rewritten(overrides, plans=hasattr(COMMANDS[name], "planner"))
     running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None  # also within a sweep
     try:
         with hydra.initialize(version_base="1.3", config_path=None):
@@ -147,13 +148,17 @@ def of_sweep(overrides: Sequence[str]) -> tuple[set[str], list[str]]:
     return {one.get_key_element() for one in parsed if one.is_sweep_override()}, folder
 
 
-def rewritten(overrides: Sequence[str]) -> list[str]:
+def rewritten(overrides: Sequence[str], *, plans: bool = False) -> list[str]:
     """The overrides in Hydra's form.
 
     `planner.optimizer=cem` becomes `planner/optimizer=cem`, which brings cem's options with it. Parts of the world that
     are ours have a name and no section, which a class of the user's and its arguments need: `env.camera._target_=Mine`
-    becomes `env.camera={} ++env.camera._target_=Mine`.
+    becomes `env.camera={} ++env.camera._target_=Mine`. Another world is a section of its own: `env=pusht env.ahead=25`
+    becomes `world=pusht world.ahead=25`, and `planner=search`, where a command has planners and the user chose none.
+
+    A `UserError`: an unknown world, or an option of the tabletop for another one.
     """
+    overrides = _of_other_world(overrides, plans=plans)
     parts = dict.fromkeys(one[1] for word in overrides if (one := USER_CLASS.match(word)))
     words = [f"{part}={{}}" for part in parts]
     for word in overrides:
@@ -164,6 +169,31 @@ def rewritten(overrides: Sequence[str]) -> list[str]:
         elif "." in key and (PRESETS / group).is_dir() and re.fullmatch(r"(?!null$)[A-Za-z_][\w.,]*", value):
             word = f"{group}={value}"
         words.append(word)
+    return words
+
+
+def _of_other_world(overrides: Sequence[str], *, plans: bool) -> list[str]:
+    """The overrides with those of `env` as those of `world`, if they choose another world than the tabletop."""
+    chosen = next((word for word in overrides if re.match(r"\+{0,2}env(\._target_)?=", word)), "")
+    choice = chosen.partition("=")[2]
+    if not chosen or choice == "tabletop":
+        return [word for word in overrides if word != chosen]
+    own = "_target_" in chosen
+    if not own and choice not in presets("world"):
+        raise UserError(
+            f"unknown env {choice!r}: choose from {', '.join(presets('world'))}, or give env._target_=CLASS"
+        )
+    words = [] if own else [f"world={choice}"]
+    for word in overrides:
+        key, _, value = word.lstrip("+").partition("=")
+        if key.partition(".")[0] in OF_TABLETOP:
+            raise UserError(f"{key} is an option of env=tabletop: leave it out, or give one of env.* with {chosen}")
+        if key.startswith("env."):
+            word = f"{'++' if own else ''}world.{key.removeprefix('env.')}={value}"
+        if word != chosen:
+            words.append(word)
+    if plans and not any(word.startswith(("planner=", "planner._target_=")) for word in words):
+        words.append("planner=search")
     return words
 
 

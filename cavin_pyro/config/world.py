@@ -17,6 +17,7 @@ from cavin_pyro.envs.tabletop.objects.object_sets import chosen, load_object_set
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.robots import robot_factory
 from cavin_pyro.envs.tabletop.tasks import Task
+from cavin_pyro.envs.world import World, check_world
 
 LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
     "scale": (0.1, 10.0),
@@ -42,6 +43,20 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
         if not issubclass(kind, Task):
             raise ValueError(f"{kind.__name__} is no task: derive it from cavin_pyro.envs.tabletop.tasks.Task")
     return kind, tiles | {name: value for name, value in section.items() if value is not None}
+
+
+def world_of(config: Mapping[str, Any] | DictConfig) -> World | None:
+    """The world of the section `world`; None for the tabletop. One that is no `World` is a `UserError`."""
+    section = dict(config.get("world") or {})
+    section.pop("default_checkpoint", None)
+    if not section.get("_target_"):
+        return None
+    with user_input("env"):
+        world = construct(section)
+        if not isinstance(world, World):
+            raise ValueError(f"env {type(world).__name__} is no world: derive it from cavin_pyro.envs.world.World")
+        check_world(world)
+    return world
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:

@@ -9,35 +9,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavin_pyro.envs.tabletop.observation import state_of
 from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions.touchdown import ObservedPoints
 
 
-@torch.inference_mode()
 def observed_state(
     observation: Mapping[str, NDArray[Any]], geometry: Geometry, device: str | torch.device = "cpu"
 ) -> State:
-    """The planner's state, a batch of one, from an observation, without needless padding.
+    """The planner's state, a batch of one, from an observation; see `cavin_pyro.envs.tabletop.observation.state_of`.
 
-    Args:
-        observation: `centers`, `clouds` and `mask` of `cavin_pyro.envs.tabletop.observation.Observation`, [M, ...].
-        device: of the state; `geometry` is on the CPU.
-
-    Raises:
-        ValueError: no object, or numbers of one that are not finite.
+    `device`: of the state; `geometry` is on the CPU.
     """
-    real = np.flatnonzero(observation["mask"])
-    for name in ("clouds", "centers"):
-        if not (observation[name][real].size and np.isfinite(observation[name][real]).all()):
-            raise ValueError(f"{name} of an observation must be finite numbers of at least one object")
-    objects = int(real.max()) + 1
-    centers = torch.from_numpy(observation["centers"][:objects])
-    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
-    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
-    state = State(centers[None], geometry(clouds)[None], mask[None])
-    return state.map(lambda field: field.to(device))
+    return state_of(observation, geometry).map(lambda field: field.unsqueeze(0).to(device))
 
 
 def observed_points(observation: Mapping[str, NDArray[Any]], device: str | torch.device = "cpu") -> ObservedPoints:

@@ -19,11 +19,12 @@ from cavin_pyro.config.device import choose_device, keep_freed_memory, set_matmu
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import About, check_value
 from cavin_pyro.config.parts import check_sizes, class_of, construct
-from cavin_pyro.config.world import object_ranges, part_of, task_of
+from cavin_pyro.config.world import object_ranges, part_of, task_of, world_of
 from cavin_pyro.envs.tabletop.layouts import GENERATED
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts, Task, TaskReward
 from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, PUSH_DECIMALS, SPACE
+from cavin_pyro.envs.world import World
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
@@ -31,8 +32,9 @@ from cavin_pyro.planning import Planner
 from cavin_pyro.planning.additions import ADDITIONS, Addition
 from cavin_pyro.planning.backends import GRAPHS
 from cavin_pyro.planning.optimizers import Shooting
+from cavin_pyro.planning.protocol import Reward
 from cavin_pyro.planning.searching import SearchingPlanner
-from cavin_pyro.storage.checkpoint import load
+from cavin_pyro.storage.checkpoint import Checkpoint, load
 
 CPU = torch.device("cpu")
 PARTS_OF_WORLD = ("objects", "camera", "segmentation", "robot")
@@ -45,17 +47,23 @@ class EpisodeRunner:
     `env` belongs to this process.
     """
 
-    env: PushingEnv
+    env: World
     planner: Planner
-    geometry: Geometry
-    reward: Callable[[Task], TaskReward]
+    geometry: Geometry | None
+    reward: Callable[[Any], Reward] | None
     pushes_per_plan: int | None  # as in `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
     push_decimals: int | None = PUSH_DECIMALS  # as in `cavin_pyro.evaluation.rollout.rollout`
 
     @property
+    def name(self) -> str:
+        """The task of the current episode, or the world."""
+        return self.task.name if isinstance(self.env, PushingEnv) else type(self.env).__name__
+
+    @property
     def task(self) -> Task:
-        """The task of the current episode."""
+        """The task of the current episode on the table."""
+        assert isinstance(self.env, PushingEnv)
         return self.env.task
 
     def rollout(self, seed: int, **options: Any) -> Episode:
@@ -89,7 +97,7 @@ def planner_name(config: DictConfig) -> str:
 
 def announce_objects(config: DictConfig) -> None:
     """Say on standard error, before the first plan, that scenes have more objects than the model was trained with."""
-    if config.planner.get("model_free"):
+    if config.planner.get("model_free") or config.world.get("_target_"):
         return
     trained_before = load(config.checkpoint, trust=list(config.trust))
     path, model = trained_before.path, trained_before.config["model"]
@@ -102,10 +110,11 @@ def announce_objects(config: DictConfig) -> None:
         )
 
 
-def make_env(config: DictConfig | None = None, *, render: bool = False, **options: Any) -> PushingEnv:
+def make_env(config: DictConfig | None = None, *, render: bool = False, **options: Any) -> World:
     """Build an environment as the command `plan` does.
 
     env = cavin_pyro.make_env(task="crossing", reward="sparse", objects=3, env={"camera": "kinect2"})
+    env = cavin_pyro.make_env(env="pusht")
 
     Args:
         config: of a command; by default that of `options`, which are the command's options of the task and the world:
@@ -116,6 +125,9 @@ def make_env(config: DictConfig | None = None, *, render: bool = False, **option
         UserError: an unknown task, layout or object, or a part of the world that lacks files.
     """
     config = compose("plan", **options) if config is None else config
+    if (world := world_of(config)) is not None:
+        world.render_mode = "rgb_array" if render else None
+        return world
     task, tiles = task_of(config)
     with user_input():
         parts = {name: part_of(name, config.env[name], config.env.assets) for name in PARTS_OF_WORLD}
@@ -162,13 +174,15 @@ def make_planner(
     return planner_of(config, model, choose_device(config.device))
 
 
-def planner_of(config: DictConfig, model: Model | None, device: torch.device) -> Planner:
+def planner_of(
+    config: DictConfig, model: Model | None, device: torch.device, *, action_dimension: int = SPACE.actions
+) -> Planner:
     """The planner of a configuration; for `model` and errors see `make_planner`."""
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free", False):
         with user_input("planner"):
-            return construct(options, action_dimension=SPACE.actions)
+            return construct(options, action_dimension=action_dimension)
     if model is None:
         raise UserError(f"{planner_name(config)} needs a model: give one, or choose planner=random")
     pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
@@ -190,30 +204,49 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     set_matmul_precision(config.matmul_precision)
     keep_freed_memory()
     env = make_env(config, render=render)
+    table, reward, trained = isinstance(env, PushingEnv), None, None
     try:
-        with user_input():
-            reward = episode_rewards(env.tasks, reward=config.reward, margin=config.margin, device=device)
-        trained = load(config.checkpoint, trust=list(config.trust))
-        geometry = trained.geometry  # on the CPU, so that states are the same for every device
-        planner = planner_of(config, None if config.planner.get("model_free") else trained.model, device)
+        if isinstance(env, PushingEnv):
+            with user_input():
+                reward = episode_rewards(env.tasks, reward=config.reward, margin=config.margin, device=device)
+        if table or not config.planner.get("model_free"):
+            trained = load(config.checkpoint, trust=list(config.trust))
+            check_space(trained, env)
+        model = None if trained is None or config.planner.get("model_free") else trained.model
+        # On the CPU, so that states are the same for every device.
+        geometry = None if trained is None else trained.geometry if table else None
+        planner = planner_of(config, model, device, action_dimension=env.space.actions)
         if config.pushes_per_plan is not None:
             check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
-        with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
-            for number in range(len(env.tasks)):
-                env.reset(seed=config.seed, options={"layout": number})
-        if len(env.tasks) > 1:
-            env.reset(seed=config.seed)  # in the layout that the seed samples
+        if isinstance(env, PushingEnv):
+            with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
+                for number in range(len(env.tasks)):
+                    env.reset(seed=config.seed, options={"layout": number})
+            if len(env.tasks) > 1:
+                env.reset(seed=config.seed)  # in the layout that the seed samples
     except BaseException:
         env.close()
         raise
     return EpisodeRunner(env, planner, geometry, reward, config.pushes_per_plan, device, config.get("push_decimals"))
 
 
-def episode_rewards(tasks: Sequence[Task], **options: Any) -> Callable[[Task], TaskReward]:
-    """The reward of a task, by `options` of `TaskReward`: one object for each of `tasks`, which serves all episodes."""
+def check_space(trained: Checkpoint, env: World) -> None:
+    """Raise a `UserError` if a checkpoint was trained in a world of other dimensions or units."""
+    space = construct(trained.config["space"]) if trained.config.get("space") else SPACE
+    if space != env.space:
+        own = (trained.config.get("world") or {}).get("_target_")
+        raise UserError(
+            f"checkpoint {trained.path} was trained in {own or 'env=tabletop'}, whose actions, positions or units are "
+            f"not those of {type(env).__name__}: choose another checkpoint, or its env"
+        )
+
+
+def episode_rewards(tasks: Sequence[Task], **options: Any) -> Callable[[PushingEnv], TaskReward]:
+    """The reward of an episode's task, by `options` of `TaskReward`: one object for each of `tasks`."""
     known = {id(task): (task, TaskReward(task, **options)) for task in tasks}  # with its task, so that its id stays
 
-    def reward(task: Task) -> TaskReward:
+    def reward(env: PushingEnv) -> TaskReward:
+        task = env.task
         return known[id(task)][1] if id(task) in known else TaskReward(task, **options)
 
     return reward

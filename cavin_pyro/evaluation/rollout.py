@@ -13,14 +13,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cavin_pyro.config.commands import PlanConfig
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.observed import observed_points, observed_state
+from cavin_pyro.data.observed import observed_points
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.tabletop.objects.sampling import NoRoomError
-from cavin_pyro.envs.tabletop.pushing import ObservationDict, PushingEnv
-from cavin_pyro.envs.tabletop.tasks import Task, TaskReward
-from cavin_pyro.envs.tabletop.workspace import PUSH_DECIMALS, executed_push
+from cavin_pyro.envs.tabletop.workspace import PUSH_DECIMALS
+from cavin_pyro.envs.world import World, executed
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
@@ -45,7 +43,7 @@ class PlanRecord:
     mask: NDArray[np.bool_]
     plan: Plan
     milliseconds: float
-    photograph: NDArray[np.uint8] | None = None
+    photograph: Any = None
     clouds: NDArray[np.float32] | None = None
 
     @property
@@ -98,7 +96,7 @@ class Episode:
     outcome: str = "timeout"
     plan_records: list[PlanRecord] = field(default_factory=list)
     transitions: list[Transition] = field(default_factory=list)
-    photograph: NDArray[np.uint8] | None = None
+    photograph: Any = None
     clouds: NDArray[np.float32] | None = None
 
     @property
@@ -126,7 +124,7 @@ class Episode:
 class EpisodeCallback:
     """Callbacks of `rollout` during an episode. A subclass overrides the methods that it needs."""
 
-    def on_observation(self, observation: ObservationDict) -> None:
+    def on_observation(self, observation: Any) -> None:
         """Called with the first observation and with the one after every push."""
 
     def on_plan(self, record: PlanRecord) -> None:
@@ -143,19 +141,19 @@ class EpisodeCallback:
 
 
 def rollout(
-    env: PushingEnv,
+    env: World,
     planner: Planner,
-    geometry: Geometry,
+    geometry: Geometry | None = None,
     *,
     seed: int,
-    reward: Callable[[Task], Reward] | None = None,
+    reward: Callable[[World], Reward] | None = None,
     pushes_per_plan: int | None = 1,
     push_decimals: int | None = PUSH_DECIMALS,
     photograph: bool = False,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
 ) -> Episode:
-    """Run one episode from depth images, which the environment segments.
+    """Run one episode in a world.
 
     trained, env = cavin_pyro.load("contact"), cavin_pyro.make_env(task="crossing")
     episode = cavin_pyro.rollout(env, cavin_pyro.make_planner(trained.model), trained.geometry, seed=1)
@@ -163,14 +161,13 @@ def rollout(
 
     Args:
         env: as `make_env` makes it. planner: as `make_planner`, or with its method `plan`.
-        geometry: which makes the features of the model's states; with `planner=random`, any.
+        geometry: which makes the features of the model's states, in worlds that see point clouds.
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
-        reward: by which plans are made, from the episode's task; by default of the environment's kind, with
-            the margin that `plan` has by default.
+        reward: by which plans are made, of the world when its episode has begun; by default the world's goal.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
             planner with the addition `first_push` is for 1.
-        push_decimals: to which planned pushes are rounded (`executed_push`), so that an episode does not
-            depend on how a machine rounds; None executes them as planned.
+        push_decimals: to which planned actions are rounded (`cavin_pyro.envs.world.executed`), so that an episode does
+            not depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
         callbacks: called in this order; without any, no frame is computed.
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
@@ -182,31 +179,30 @@ def rollout(
     """
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
-    env.scene.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
+    env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
     with _refusals(seed):
         observation, _ = env.reset(seed=seed)
-    if reward is None:
-        kind = "dense" if env.reward.dense else "sparse"
-        reward = partial(TaskReward, reward=kind, margin=PlanConfig.margin, device=device)
-    task_reward = reward(env.task)
+    goal = env.goal(device) if reward is None else reward(env)
     for callback in callbacks:
         callback.on_observation(observation)
     ended = False
     while not ended:
         began = time.perf_counter()
-        state = observed_state(observation, geometry, device)
-        points = observed_points(observation, device)
+        state = env.state(observation, geometry).map(lambda field: field.unsqueeze(0).to(device))
+        seen = isinstance(observation, Mapping) and "clouds" in observation
+        points = observed_points(observation, device) if seen else None
         with _refusals(seed):
-            plan = planner.plan(state, reward=task_reward, generators=[generator], observed=points)
+            plan = planner.plan(state, reward=goal, generators=[generator], observed=points)
         plan = apply(plan, lambda field: field.cpu())
+        centers, mask = env.positions(observation)
         record = PlanRecord(
             step=len(episode.transitions),
-            centers=observation["centers"],
-            mask=observation["mask"].astype(np.bool_),
+            centers=centers,
+            mask=mask,
             plan=plan,
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
-            clouds=observation["clouds"] if photograph else None,
+            clouds=observation["clouds"] if photograph and seen else None,
         )
         episode.plan_records.append(record)
         for callback in callbacks:
@@ -215,18 +211,21 @@ def rollout(
         if not 1 <= (len(actions) if pushes_per_plan is None else pushes_per_plan) <= len(actions):
             raise UserError(f"pushes_per_plan must be between 1 and {len(actions)}, not {pushes_per_plan}")
         for number, action in enumerate(actions[:pushes_per_plan]):
-            action = executed_push(action, push_decimals)
+            action = executed(action, push_decimals)
             observation, earned, terminated, truncated, info = env.step(action)
             last = number == len(actions) - 1
+            centers, _ = env.positions(observation)
+            ends = info if "violation" in info else {**info, "violation": terminated and not info["success"]}
+            strict = {**ends, "reward": earned, **info.get("strict", {})}
             transition = Transition(
-                step=info["steps"],
+                step=len(episode.transitions) + 1,
                 action=action,
                 reward=float(earned),
-                centers=observation["centers"],
-                subgoal_distance=_subgoal_distance(record, observation["centers"]) if last else float("nan"),
-                strict_reward=info["strict"]["reward"],
-                strict_end=_end(info["strict"]),
-                **{name: info[name] for name in ("success", "violation", "fall", "unsafe", "ineffective")},
+                centers=centers,
+                subgoal_distance=_subgoal_distance(record, centers) if last else float("nan"),
+                strict_reward=float(strict["reward"]),
+                strict_end=_end(strict),
+                **{name: ends.get(name, False) for name in ("success", "violation", "fall", "unsafe", "ineffective")},
             )
             episode.transitions.append(transition)
             for callback in callbacks:
@@ -234,10 +233,10 @@ def rollout(
                 callback.on_transition(transition)
             ended = terminated or truncated
             if ended:
-                episode.outcome = _end(info) or "timeout"
+                episode.outcome = _end(ends) or "timeout"
                 break
     if photograph:
-        episode.photograph, episode.clouds = env.render(), observation["clouds"]
+        episode.photograph, episode.clouds = env.render(), observation["clouds"] if seen else None
     for callback in callbacks:
         callback.on_end(episode)
     return episode
@@ -261,7 +260,7 @@ def _call_on_frame(callbacks: Sequence[EpisodeCallback]) -> None:
 
 def _end(flags: Mapping[str, Any]) -> str:
     """Which of the outcomes a step came to, "" if the episode goes on."""
-    return next((name for name in OUTCOMES[:3] if flags[name]), "")
+    return next((name for name in OUTCOMES[:3] if flags.get(name)), "")
 
 
 def _subgoal_distance(record: PlanRecord, centers: NDArray[np.float32]) -> float:

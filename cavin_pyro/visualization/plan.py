@@ -57,7 +57,7 @@ RETURNS = ListedColormap(colormaps["Purples"](np.linspace(0.2, 1.0, 128)))
 
 Style = dict[str, Any]
 _HALO = [withStroke(linewidth=2.8, foreground="white", alpha=0.85)]
-_OBSERVED: Style = {"marker": "o", "markersize": 4.5, "color": "white", "markeredgecolor": "black", "linestyle": ""}
+OBSERVED: Style = {"marker": "o", "markersize": 4.5, "color": "white", "markeredgecolor": "black", "linestyle": ""}
 _CANDIDATE: Style = {"marker": "o", "markersize": 3.5, "color": "#6A51A3", "linestyle": ""}
 _SUBGOALS: Style = {"marker": "o", "markersize": 5.5, "color": SUBGOAL_COLOR, "linewidth": 2.2}
 _SUBGOALS |= {"markeredgecolor": "black", "markeredgewidth": 0.7}
@@ -86,16 +86,21 @@ def draw_overlay(
     if scale is not None:
         dots, returns = candidate_subgoals(record, task, view, count=CANDIDATES)
         panel.scatter(dots[:, 0], dots[:, 1], s=9, c=returns, norm=scale, cmap=RETURNS, alpha=0.8, zorder=2)
-    for path in predicted_paths(record, view).values():
-        panel.plot(path[:, 0], path[:, 1], **_PREDICTED, path_effects=_HALO, zorder=3)
-    for number, chain in subgoal_chains(record, view).items():
-        style = _SUBGOALS if number == 0 else _OBSTACLES
-        panel.plot(chain[:, 0], chain[:, 1], **style, markevery=slice(1, None), zorder=4 if number == 0 else 3.5)
+    draw_predictions(panel, record, view)
     _draw_pushes(panel, record, view)
     if reached is not None:
         draw_paths(panel, object_paths(record, reached, view))
     draw_objects(panel, record.centers, record.mask, view)
     draw_places(panel, task, view)
+
+
+def draw_predictions(panel: Axes, record: PlanRecord, view: View) -> None:
+    """Draw the paths that f predicts, and the chosen subgoals."""
+    for path in predicted_paths(record, view).values():
+        panel.plot(path[:, 0], path[:, 1], **_PREDICTED, path_effects=_HALO, zorder=3)
+    for number, chain in subgoal_chains(record, view).items():
+        style = _SUBGOALS if number == 0 else _OBSTACLES
+        panel.plot(chain[:, 0], chain[:, 1], **style, markevery=slice(1, None), zorder=4 if number == 0 else 3.5)
 
 
 def draw_paths(panel: Axes, paths: Mapping[int, Pixels]) -> None:
@@ -107,7 +112,7 @@ def draw_paths(panel: Axes, paths: Mapping[int, Pixels]) -> None:
 def draw_objects(panel: Axes, centers: NDArray[np.float32], mask: NDArray[np.bool_], view: View) -> None:
     """Draw the centres [M, 3] metres of the objects in the mask [M], with a ring around the target."""
     pixels = view.project(centers[mask])
-    panel.plot(pixels[:, 0], pixels[:, 1], **_OBSERVED, zorder=6)
+    panel.plot(pixels[:, 0], pixels[:, 1], **OBSERVED, zorder=6)
     if mask[0]:
         center, radius = circle(centers[0], view)
         panel.add_patch(Circle(center, radius, fill=False, path_effects=_HALO, zorder=6, **_TARGET))
@@ -130,7 +135,7 @@ def legend(task: Task, plan_records: Sequence[PlanRecord], *, candidates: bool) 
         ring: Style = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": ""}
         entries.append(Line2D([], [], label="places", color=COLORS[0], **ring))
     entries.append(Line2D([], [], label="target", **_TARGET))
-    entries.append(Line2D([], [], label="observed", **_OBSERVED))
+    entries.append(Line2D([], [], label="observed", **OBSERVED))
     if candidates:
         entries.append(Line2D([], [], label="candidates", **_CANDIDATE))
     if any(record.plan.subgoals.centers.shape[1] for record in plan_records):

@@ -12,7 +12,7 @@ import numpy as np
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.envs.tabletop.goals import SUFFIX, save_goal
-from cavin_pyro.envs.tabletop.pushing import ObservationDict
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
@@ -20,6 +20,7 @@ from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, 
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.plan import draw_plan
 from cavin_pyro.visualization.video import episode_video
+from cavin_pyro.visualization.world import render_world
 
 SAID = {  # of a push, for people
     "success": "goal reached",
@@ -42,7 +43,7 @@ class EpisodeProgress(EpisodeCallback):
         self._began: float | None = None
         self._planned: PlanRecord | None = None  # a plan whose first push is not made yet
 
-    def on_observation(self, observation: ObservationDict) -> None:
+    def on_observation(self, observation: Any) -> None:
         self._began = self._began or time.perf_counter()
 
     def on_plan(self, record: PlanRecord) -> None:
@@ -84,6 +85,8 @@ def write_goal(path: str, scene: Scene) -> None:
 def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: bool) -> dict[str, Any]:
     """Run one episode, print its pushes and write `episode_files` about it; returns its results' row."""
     env = runner.env
+    if not isinstance(env, PushingEnv):
+        return render_world(runner, folder, seed=seed, video=video)
     with ExitStack() as stack:
         callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
         if video:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cavin_pyro.envs.tabletop.segmentation import Pixels
 from cavin_pyro.envs.tabletop.sensors import DepthImage
 from cavin_pyro.envs.tabletop.sensors.camera import sample_cloud
 from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT
+from cavin_pyro.models.state import State
 
 MINIMUM_PIXELS = 8  # minimum to locate an object
 
@@ -58,3 +62,24 @@ class LatestClouds:
                 visible[slot] = True
         self._mask |= visible
         return Observation(self._clouds.copy(), self._centers.copy(), self._mask.copy(), visible)
+
+
+@torch.inference_mode()
+def state_of(observation: Mapping[str, NDArray[Any]], geometry: Callable[[Tensor], Tensor]) -> State:
+    """The state `[M]` of an observation, without needless padding.
+
+    Args:
+        observation: `centers`, `clouds` and `mask` of `Observation`, [M, ...]. geometry: on the CPU.
+
+    Raises:
+        ValueError: no object, or numbers of one that are not finite.
+    """
+    real = np.flatnonzero(observation["mask"])
+    for name in ("clouds", "centers"):
+        if not (observation[name][real].size and np.isfinite(observation[name][real]).all()):
+            raise ValueError(f"{name} of an observation must be finite numbers of at least one object")
+    objects = int(real.max()) + 1
+    centers = torch.from_numpy(observation["centers"][:objects])
+    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
+    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
+    return State(centers, geometry(clouds), mask)

@@ -16,7 +16,7 @@ from cavin_pyro.envs.randomness import GOAL, LAYOUT, named_stream
 from cavin_pyro.envs.tabletop.layouts import GENERATED, generate_task, possible_tasks
 from cavin_pyro.envs.tabletop.objects.object_sets import ObjectSet, load_object_set, plain_name
 from cavin_pyro.envs.tabletop.objects.sampling import Area, ObjectRanges
-from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.observation import Observation, state_of
 from cavin_pyro.envs.tabletop.physics import Uncopied
 from cavin_pyro.envs.tabletop.robots import RobotFactory
 from cavin_pyro.envs.tabletop.scene import Scene
@@ -25,9 +25,19 @@ from cavin_pyro.envs.tabletop.sensors import DepthSensor
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.envs.tabletop.tasks import TASKS, GeneratedLayouts, Outcome, Task, TaskReward, TileSet
 from cavin_pyro.envs.tabletop.tasks.task import check_functions
-from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, POINTS_PER_OBJECT, TILE_SIDE, object_slots, tile_center
+from cavin_pyro.envs.tabletop.workspace import (
+    MAXIMUM_OBJECTS,
+    POINTS_PER_OBJECT,
+    SPACE,
+    TILE_SIDE,
+    object_slots,
+    tile_center,
+)
+from cavin_pyro.envs.world import Geometry, World
+from cavin_pyro.models.state import State
 
 EPISODE_STEPS = 60
+PLANNING_MARGIN = 0.02  # metres; of the reward by which plans are made
 TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
 OBSTACLE_JITTER = TILE_SIDE / 2  # metres; obstacles start anywhere on their tiles
 VIDEO_SIZE = (512, 424)  # pixels
@@ -35,7 +45,7 @@ VIDEO_SIZE = (512, 424)  # pixels
 ObservationDict = dict[str, NDArray[Any]]
 
 
-class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
+class PushingEnv(Uncopied, World):
     """Push objects on a table until a task's goal is reached, observed by a depth camera from above.
 
     Observation: `clouds` [M, 256, 3] metres, `centers` [M, 3] metres, `mask` [M] (known objects, object 0 is
@@ -69,6 +79,8 @@ class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    space = SPACE
+    features = 64  # of `geometry=`, which makes them of the clouds
 
     def __init__(
         self,
@@ -123,8 +135,7 @@ class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets, slots=slots
         )
         shape = (slots, POINTS_PER_OBJECT, 3)
-        # Gymnasium declares that a Dict space's elements are spaces.
-        self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
+        self.observation_space = gymnasium.spaces.Dict(
             {
                 "clouds": gymnasium.spaces.Box(-10.0, 10.0, shape, np.float32),
                 "centers": gymnasium.spaces.Box(-10.0, 10.0, (slots, 3), np.float32),
@@ -200,6 +211,30 @@ class PushingEnv(Uncopied, gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         if self.render_mode != "rgb_array":
             return None
         return self.scene.photograph(self.scene.camera.resized(*VIDEO_SIZE))
+
+    def state(self, observation: Mapping[str, NDArray[Any]], geometry: Geometry | None = None) -> State:
+        """See `World` and `cavin_pyro.envs.tabletop.observation.state_of`."""
+        if geometry is None:
+            raise ValueError("the state of the table needs a geometry, which makes features of clouds")
+        return state_of(observation, geometry)
+
+    def positions(self, observation: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """See `World`."""
+        return observation["centers"], observation["mask"].astype(np.bool_)
+
+    def goal(self, device: str | torch.device = "cpu") -> TaskReward:
+        """The task's reward with the margin that commands give planners; `reward` is that of the episode."""
+        kind = "dense" if self.reward.dense else "sparse"
+        return TaskReward(self.task, reward=kind, margin=PLANNING_MARGIN, device=device)
+
+    @property
+    def on_frame(self) -> Callable[[], None] | None:
+        """Called a few times during every push, to film it."""
+        return self.scene.on_frame
+
+    @on_frame.setter
+    def on_frame(self, function: Callable[[], None] | None) -> None:
+        self.scene.on_frame = function
 
     def close(self) -> None:
         """Free the simulator."""

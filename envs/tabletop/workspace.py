@@ -75,19 +75,6 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
     return start, end
 
 
-def executed_push(action: NDArray[np.floating], decimals: int | None = PUSH_DECIMALS) -> NDArray[np.float32]:
-    """The push that a robot is told to make: clipped to [-1, 1], and rounded to about what an arm repeats.
-
-    Without rounding, an error of 1e-7 in a plan, of another processor or of native code, moves an object by less than
-    anybody sees, but changes single pixels of the next image, and so the plans after it.
-
-    Args:
-        action: [..., 4] (x, y, dx, dy), normalised. decimals: of the result [..., 4]; None does not round.
-    """
-    clipped = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
-    return (clipped if decimals is None else np.round(clipped, decimals)).astype(np.float32)
-
-
 def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.float64]:
     """The action [..., 4] that starts at `start` [..., 2] metres and moves by `motion` [..., 2] metres."""
     low, high = np.array(REACH_LOW), np.array(REACH_HIGH)

@@ -15,7 +15,7 @@ import cavin_pyro
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
-from cavin_pyro.envs.tabletop.workspace import executed_push
+from cavin_pyro.envs.world import executed
 from cavin_pyro.evaluation.evaluation import episode_row, run_missing
 from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, Episode, EpisodeCallback, PlanRecord, Transition
@@ -122,7 +122,7 @@ def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) 
     for transition in episode.transitions:
         record = episode.plan_records[(transition.step - 1) // 3]
         planned = record.plan.actions[0, (transition.step - 1) % 3].numpy()
-        np.testing.assert_array_equal(transition.action, executed_push(planned))
+        np.testing.assert_array_equal(transition.action, executed(planned))
     assert episode.outcome in OUTCOMES
     assert episode.total_reward == sum(transition.reward for transition in episode.transitions)
 
@@ -148,7 +148,7 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
     assert len(episode.transitions) == 4
     for record, end in zip(episode.plan_records, [*steps[1:], 4], strict=True):
         made = episode.transitions[record.step : end]
-        planned = executed_push(record.plan.actions[0, : len(made)].numpy())
+        planned = executed(record.plan.actions[0, : len(made)].numpy())
         np.testing.assert_array_equal([transition.action for transition in made], planned)
         np.testing.assert_array_equal(episode.reached(record), [transition.centers for transition in made])
 
@@ -217,7 +217,7 @@ def test_an_evaluation_runs_only_what_is_missing(configure: Any, tmp_path: Path)
 
 def parts(runner: EpisodeRunner) -> SimpleNamespace:
     runner.env.close()
-    return SimpleNamespace(**{**vars(runner), "task": runner.task, "reward": runner.reward(runner.task)})
+    return SimpleNamespace(**{**vars(runner), "task": runner.task, "reward": runner.reward(runner.env)})
 
 
 def test_options_reach_the_parts(configure: Any) -> None:

@@ -1,0 +1,444 @@
+"""Push-T as `gym-pusht` simulates it: a disc pushes a T-shaped block in a plane, from states instead of pictures.
+
+Source: Chi et al. 2023 (Diffusion Policy) and `gym-pusht`; the pose criterion is `eval_state` of
+`stable-worldmodel`, which goal-conditioned world models are evaluated by. All lengths are pixels of a window of 512.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cavin_pyro.envs.randomness import named_stream
+from cavin_pyro.envs.world import Geometry, Goal, World
+from cavin_pyro.models.space import Space
+from cavin_pyro.models.state import State
+
+REPEAT = 5  # steps of the simulator, 0.1 s each, in one step of the environment
+REACH = 100.0  # pixels; how far an action of 1 puts the disc's target, on each axis
+SIZE, RADIUS = 512.0, 15.0  # pixels; of the window, and of the disc
+WALLS = 8.0, 503.0  # pixels; within them nothing touches a wall
+POSE_DISTANCE, POSE_ANGLE = 20.0, math.pi / 9  # pixels of disc and block together, radians of the block
+COVERAGE = 0.95  # of the goal's area
+COVERAGE_DISTANCE, COVERAGE_ANGLE = 4.0, 0.05  # pixels, radians of the block, within which that is so
+FIXED_GOAL = 256.0, 400.0, 256.0, 256.0, math.pi / 4  # gym-pusht's block; the disc counts for the pose criterion only
+CRITERIA = ("pose", "coverage", "none")
+OUTLINE = np.array([(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)], dtype=float)
+CENTER = np.array([0.0, 45.0])  # pixels in the block's frame; its centre of mass
+_GOAL = 1  # last entry of a spawn key: the stream of random goals
+
+SPACING = 5.0  # pixels between the points of the outline that the policy knows
+ARRIVED = 6.0  # pixels from where a push begins
+APPROACHES = 6  # steps on the way to a push, at most
+ASTRAY = 0.1  # of the intents are random moves
+STRAIGHT = 0.15  # of the approaches go straight, through the block if it is in the way
+CARELESS = 0.05  # of the pushes may press the block into a wall
+CANDIDATES = 12  # pushes to choose one from
+ROUND = 110.0  # pixels from the block's centre of mass, on the way round it
+NOISE = 3.0  # pixels; standard deviation of a push's displacement, on each axis
+
+EPISODE = 60  # steps of an episode from which a start and its goal are taken
+PICTURE = 680.0  # pixels of the simulator's picture
+
+ObservationDict = dict[str, NDArray[np.float64]]
+
+
+def reached(agent: NDArray[Any], block: NDArray[Any], goal: NDArray[Any]) -> NDArray[np.bool_]:
+    """The pose criterion: disc [..., 2] and block [..., 3] near a goal [..., 5] (both positions, the block's angle).
+
+    The four coordinates' joint distance is below 20 pixels, and the angles differ by less than 20 degrees.
+    """
+    distance = np.linalg.norm(np.concatenate([agent, block[..., :2]], axis=-1) - goal[..., :4], axis=-1)
+    turn = np.abs(np.remainder(block[..., 2] - goal[..., 4] + np.pi, 2 * np.pi) - np.pi)
+    return (distance < POSE_DISTANCE) & (turn < POSE_ANGLE)
+
+
+class PoseGoal(Goal):
+    """The pose criterion, or within smaller distances; without `disc`, of the block alone."""
+
+    def __init__(self, space: Space, goal: NDArray[Any], *, distance: float, angle: float, disc: bool, weight: float):
+        super().__init__(space, weight=weight)
+        self._goal, self._limits, self._disc = [float(number) for number in goal], (distance, angle), disc
+
+    def success(self, state: State) -> Tensor:
+        distance, turn = self._errors(state)
+        return (distance < self._limits[0]) & (turn < self._limits[1])
+
+    def distance(self, state: State) -> Tensor:
+        """In units of the two limits: 2 at both."""
+        distance, turn = self._errors(state)
+        return distance / self._limits[0] + turn / self._limits[1]
+
+    def _errors(self, state: State) -> tuple[Tensor, Tensor]:
+        """Pixels and radians, `[...]` each."""
+        x, y, block_x, block_y, angle = self._goal
+        squared = (state.centers - state.centers.new_tensor([[block_x, block_y], [x, y]])).square().sum(-1)
+        cosine, sine = state.features[..., 0, 0], state.features[..., 0, 1]
+        across = sine * math.cos(angle) - cosine * math.sin(angle)
+        turn = torch.atan2(across, cosine * math.cos(angle) + sine * math.sin(angle))
+        return (squared.sum(-1) if self._disc else squared[..., 0]).sqrt(), turn.abs()
+
+
+class PushT(World):
+    """Push a T to a goal pose. One step here is five of the simulator's, with the same target of the disc.
+
+    Observation: `agent` [2] pixels, `velocity` [2] of the agent in pixels per second, `block` [3] (x, y in pixels,
+    angle in radians from -pi to pi; the origin is the middle of the T's top edge).
+    Action: the displacement [2] in [-1, 1] of the disc's target from the disc, in units of 100 pixels; the target is
+    kept in the window. The simulator is deterministic: equal seeds and actions give equal bits.
+
+    The criterion is judged after each of the simulator's steps, as published; a success ends the step there.
+    `info` of a reset: `goal` [5], `excluded`. `info` of a step: `steps` so far, `simulator_steps` of this one,
+    `success`.
+
+    Its state has two objects, the block and the disc; a feature is the cosine and the sine of the angle.
+
+    Args:
+        ahead: steps of the simulator from the start to the goal in an episode of `PushTPolicy`, from which a reset
+            takes both; starts at their goal are excluded, and counted in `excluded`. 0: both are random.
+        criterion: "pose" (see `reached`), "coverage" (more than 95 % of the goal's area, as `gym-pusht` ends an
+            episode; the disc may be anywhere), or "none".
+        maximum_steps: after how many steps an episode is truncated; published, 18 for `ahead=75` and 10 for 25.
+        weight: of progress in the planner's reward, in units of the criterion's two limits. margin: the part of these
+            limits within which a plan has to end.
+
+    Raises:
+        ImportError: gym-pusht is not installed.
+        ValueError: an argument is not one of those above.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}
+    space = Space(
+        origin=(256.0, 256.0),
+        length=100.0,
+        step_range=150.0,
+        subgoal_range=400.0,
+        action_sizes=(2,),
+        center_scale=2.0,
+        feature_scale=0.03,
+        action_scales=(0.05,),
+        turning=True,
+        frequencies=4,
+    )
+    features, objects = 2, 2
+
+    def __init__(
+        self,
+        *,
+        criterion: str = "pose",
+        ahead: int = 75,
+        maximum_steps: int = 18,
+        weight: float = 1.0,
+        margin: float = 0.7,
+        render_mode: str | None = None,
+    ) -> None:
+        if criterion not in CRITERIA:
+            raise ValueError(f"unknown criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
+        if maximum_steps < 1:
+            raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
+        if ahead % REPEAT or not 0 <= ahead <= EPISODE * REPEAT:
+            raise ValueError(f"ahead must be a multiple of {REPEAT} up to {EPISODE * REPEAT}, not {ahead}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        try:
+            from gym_pusht.envs import pusht
+        except ImportError as error:
+            raise ImportError(
+                f"Push-T needs gym-pusht ({error}): pip install -c constraints.txt -e '.[pusht]'"
+            ) from error
+        self.criterion, self.maximum_steps, self.render_mode = criterion, maximum_steps, render_mode
+        self.ahead, self._weight, self._margin = ahead // REPEAT, weight, margin
+        self._module, self._simulator = pusht, pusht.PushTEnv(obs_type="state")
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        low, high = -SIZE, 2 * SIZE  # the simulator's disc and block may be pressed into a wall
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                "agent": gymnasium.spaces.Box(low, high, (2,), np.float64),
+                "velocity": gymnasium.spaces.Box(-1e4, 1e4, (2,), np.float64),
+                "block": gymnasium.spaces.Box(
+                    np.array([low, low, -np.pi]), np.array([high, high, np.pi]), dtype=np.float64
+                ),
+            }
+        )
+        self.pose = np.array(FIXED_GOAL)
+        self._steps = -1
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObservationDict, dict[str, Any]]:
+        """Begin at a state; the disc and the block are apart and within the walls unless told otherwise.
+
+        The state is set exactly, and the block rests: from a state that was recorded while the block was pushed, the
+        same actions give nearly the same states, because the simulator keeps the block's speed for 0.01 s.
+
+        Args:
+            options: `state`, 5 numbers (agent, block) or 7 (agent, block, the agent's velocity), and `goal`, 5
+                numbers; instead of a random state, and of a random goal ("pose") or gym-pusht's ("coverage").
+
+        Raises:
+            ValueError: `state` or `goal` has another length, or a number is not finite.
+        """
+        super().reset(seed=seed)
+        (generator,) = self.np_random.spawn(1)
+        given, excluded = options or {}, 0
+        if self.criterion == "pose" and self.ahead and not {"state", "goal"} & set(given):
+            state, self.pose, excluded = self._pair(generator)
+        else:
+            state = _numbers("state", given["state"], 5, 7) if "state" in given else self._sample(generator)
+            if "goal" in given:
+                self.pose = _numbers("goal", given["goal"], 5)
+            else:
+                fixed = self.criterion != "pose"
+                self.pose = np.array(FIXED_GOAL) if fixed else self._sample(named_stream(generator, _GOAL))
+        self._set(state)
+        self._steps = 0
+        return self._observe(), {"goal": self.pose.copy(), "excluded": excluded}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
+        """Hold one target for five steps of the simulator, or until the criterion is met.
+
+        Raises:
+            ValueError: the action is not two finite numbers.
+            RuntimeError: called before `reset`.
+        """
+        if self._steps < 0:
+            raise RuntimeError("call reset() before step()")
+        simulator, agent = self._simulator, self._simulator.agent
+        displacement = REACH * np.clip(_numbers("action", action, 2), -1.0, 1.0)
+        x, y = np.clip(np.array(agent.position) + displacement, 0.0, SIZE).tolist()
+        for done in range(1, REPEAT + 1):  # noqa: B007 -- says when the step ended
+            if self.on_frame is not None:
+                self.on_frame()
+            for _ in range(round(1.0 / (simulator.control_hz * simulator.dt))):  # as gym-pusht's step, 5 times faster
+                (px, py), (vx, vy) = agent.position, agent.velocity
+                ax = simulator.k_p * (x - px) + simulator.k_v * (0 - vx)
+                ay = simulator.k_p * (y - py) + simulator.k_v * (0 - vy)
+                agent.velocity = vx + ax * simulator.dt, vy + ay * simulator.dt
+                simulator.space.step(simulator.dt)
+            success = self._is_success()
+            if success:
+                break
+        self._steps += 1
+        info = {"steps": self._steps, "simulator_steps": done, "success": success}
+        return self._observe(), float(success), success, not success and self._steps >= self.maximum_steps, info
+
+    def state(self, observation: ObservationDict, geometry: Geometry | None = None) -> State:
+        """See `World`: the block, then the disc, whose angle is always 0."""
+        x, y, angle = observation["block"]
+        centers = torch.tensor([[x, y], observation["agent"].tolist()], dtype=torch.float32)
+        features = torch.tensor([[math.cos(angle), math.sin(angle)], [1.0, 0.0]], dtype=torch.float32)
+        return State(centers, features, torch.ones(2, dtype=torch.bool))
+
+    def goal(self, device: str | torch.device = "cpu") -> PoseGoal:
+        """See `World`. For coverage the block alone has to be near the goal's pose."""
+        limits = (POSE_DISTANCE, POSE_ANGLE) if self.criterion == "pose" else (COVERAGE_DISTANCE, COVERAGE_ANGLE)
+        distance, angle = (self._margin * limit for limit in limits)
+        disc = self.criterion == "pose"
+        return PoseGoal(self.space, self.pose, distance=distance, angle=angle, disc=disc, weight=self._weight)
+
+    def policy(self, generator: np.random.Generator) -> PushTPolicy:
+        """See `World`."""
+        return PushTPolicy(generator)
+
+    def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
+        """See `World`."""
+        return np.asarray(centers, dtype=np.float64) * (PICTURE / SIZE)
+
+    def coverage(self) -> float:
+        """The part of the goal's area that the block covers, from 0 to 1."""
+        block = self._simulator.block
+        shapes = [self._module.pymunk_to_shapely(body, block.shapes) for body in (block, self._goal_body())]
+        return float(shapes[0].intersection(shapes[1]).area / shapes[1].area)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a colour image [680, 680, 3] in mode rgb_array."""
+        if self.render_mode is None:
+            return None
+        self._simulator.goal_pose = self.pose[2:]
+        return np.array(self._simulator.render())
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._simulator.close()
+
+    def _is_success(self) -> bool:
+        if self.criterion == "coverage":
+            return self.coverage() > COVERAGE
+        observed = self._observe()
+        return self.criterion == "pose" and bool(reached(observed["agent"], observed["block"], self.pose))
+
+    def _goal_body(self) -> Any:
+        return self._simulator.get_goal_pose_body(self.pose[2:])
+
+    def _set(self, state: NDArray[np.float64]) -> None:
+        """Put disc and block (5 or 7 numbers) into a fresh space; whatever is set, it has the same past."""
+        simulator = self._simulator
+        simulator.reset(seed=0, options={"reset_to_state": [50.0, 50.0, 256.0, 256.0, 0.0]})
+        agent, block = simulator.agent, simulator.block
+        numbers = state.tolist()
+        agent.position, agent.velocity = tuple(numbers[:2]), tuple(numbers[5:]) or (0.0, 0.0)
+        block.angle = numbers[4]  # turns about the centre of mass, so before the position
+        block.position = tuple(numbers[2:4])
+        for body in (agent, block):
+            simulator.space.reindex_shapes_for_body(body)
+
+    def _observe(self) -> ObservationDict:
+        agent, block = self._simulator.agent, self._simulator.block
+        angle = math.remainder(block.angle, 2 * math.pi)
+        return {
+            "agent": np.array(agent.position),
+            "velocity": np.array(agent.velocity),
+            "block": np.array([*block.position, angle]),
+        }
+
+    def _pair(self, generator: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+        """A start [7] and a goal [5] that is `ahead` of it in an episode of the policy, and how many were excluded."""
+        criterion, self.criterion = self.criterion, "none"
+        try:
+            for excluded in range(100):
+                policy, states = PushTPolicy(generator), []
+                self._set(self._sample(generator))
+                self._steps, first = 0, int(generator.integers(EPISODE - self.ahead + 1))
+                for _ in range(first + self.ahead + 1):
+                    observed = self._observe()
+                    states.append(np.concatenate([observed["agent"], observed["block"], observed["velocity"]]))
+                    self.step(policy.act(observed).astype(np.float32))
+                start, goal = states[first], states[-1][:5]
+                inside = all(bool(((_outline(one) > 0) & (_outline(one) < SIZE)).all()) for one in (start, goal))
+                if inside and not reached(start[:2], start[2:5], goal):
+                    return start, goal, excluded
+        finally:
+            self.criterion = criterion
+        raise RuntimeError("no start apart from its goal in 100 episodes: choose a larger ahead")
+
+    def _sample(self, generator: np.random.Generator) -> NDArray[np.float64]:
+        """A random state [5] in which nothing touches anything."""
+        while True:
+            pose = np.array([*generator.uniform(*WALLS, size=2), generator.uniform(-np.pi, np.pi)])
+            agent = generator.uniform(WALLS[0] + RADIUS, WALLS[1] - RADIUS, size=2)
+            outline = in_window(pose, _SKIN[0])
+            # The disc's centre is outside if the nearest point of the outline shows it its outer side.
+            nearest = int(np.linalg.norm(outline - agent, axis=-1).argmin())
+            height = float((agent - outline[nearest]) @ (_rotation(float(pose[2])) @ _SKIN[1][nearest]))
+            apart = height > 0 and float(np.linalg.norm(outline[nearest] - agent)) > RADIUS + SPACING
+            if (outline > WALLS[0]).all() and (outline < WALLS[1]).all() and apart:
+                return np.concatenate([agent, pose])
+
+
+class PushTPolicy:
+    """Collects data: goes to a random point of the block's outline, pushes there in a line or a curve, and so on.
+
+    Args:
+        generator: all of the policy's randomness.
+    """
+
+    def __init__(self, generator: np.random.Generator) -> None:
+        self._generator = generator
+        self._approaches = self._pushes = self._moves = 0  # steps left of each kind
+        self._straight = False
+        self._contact, self._displacement = np.zeros((2, 2))  # in the block's frame; of the next push, in the window's
+        self._turn = 0.0  # radians from one push to the next
+
+    def act(self, observation: ObservationDict) -> NDArray[np.float64]:
+        """Choose the next action [2] from an observation."""
+        generator, agent, block = self._generator, observation["agent"], observation["block"]
+        if self._pushes + self._moves == 0:
+            self._choose(agent, block)
+        if self._moves:
+            self._moves -= 1
+            return generator.uniform(-1.0, 1.0, size=2)
+        start = in_window(block, self._contact)
+        if self._approaches and np.linalg.norm(start - agent) > ARRIVED:
+            self._approaches -= 1
+            way = (start if self._straight else _way(agent, start, block)) - agent
+            return way / max(REACH, float(np.abs(way).max()))
+        self._approaches = 0
+        self._pushes -= 1
+        action = (self._displacement + generator.normal(scale=NOISE, size=2)) / REACH
+        self._displacement = self._displacement @ _rotation(self._turn).T
+        return np.clip(action, -1.0, 1.0)
+
+    def _choose(self, agent: NDArray[np.float64], block: NDArray[np.float64]) -> None:
+        """Choose random moves, or one of some pushes: mostly one that leaves the block inside, often a near one."""
+        generator = self._generator
+        if generator.random() < ASTRAY:
+            self._moves = int(generator.integers(1, 4))
+            return
+        steps, length = int(generator.integers(1, 6)), generator.uniform(20.0, REACH)
+        points, normals = _SKIN
+        chosen = generator.integers(len(points), size=CANDIDATES)
+        gaps = RADIUS + generator.uniform(1.0, 15.0, size=(CANDIDATES, 1))
+        contacts = points[chosen] + gaps * normals[chosen]
+        starts, outline = in_window(block, contacts), in_window(block, points)
+        inward = -normals[chosen] @ _rotation(float(block[2])).T
+        angles = np.arctan2(inward[:, 1], inward[:, 0]) + generator.normal(scale=0.5, size=CANDIDATES)
+        headings = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        room = np.where(headings > 0, WALLS[1] - outline.max(axis=0), outline.min(axis=0) - WALLS[0])
+        room = (np.maximum(room, 0.0) / np.maximum(np.abs(headings), 1e-6)).min(axis=-1) + gaps[:, 0] - RADIUS
+        reachable = ((starts > WALLS[0] + RADIUS) & (starts < WALLS[1] - RADIUS)).all(axis=-1)
+        cost = np.linalg.norm(starts - agent, axis=-1) * generator.integers(2)
+        cost += generator.uniform(0.0, 100.0, CANDIDATES) + 4 * SIZE * ~reachable
+        if generator.random() > CARELESS:
+            cost += SIZE * (room < 40.0)
+            length = np.minimum(length, room / steps)
+        best = int(cost.argmin())
+        self._contact = contacts[best]
+        self._displacement = np.broadcast_to(length, CANDIDATES)[best] * headings[best]
+        self._approaches, self._pushes, self._turn = APPROACHES, steps, float(generator.normal(scale=0.25))
+        self._straight = bool(generator.random() < STRAIGHT)
+
+
+def _outline(state: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points [P, 2] of the block's outline in a state [5 or more]."""
+    return in_window(state[2:5], _SKIN[0])
+
+
+def in_window(block: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points [..., 2] of the block's frame, in the window's, for a block [3] (x, y, angle)."""
+    return points @ _rotation(float(block[2])).T + block[:2]
+
+
+def _rotation(angle: float) -> NDArray[np.float64]:
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+def _way(agent: NDArray[np.float64], start: NDArray[np.float64], block: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where to go next [2] from the disc to the start of a push: there, or round the block if it is in between."""
+    line = start - agent
+    outline = in_window(block, _SKIN[0])
+    along = np.clip((outline - agent) @ line / max(float(line @ line), 1e-9), 0.0, 1.0)
+    if np.linalg.norm(agent + along[:, None] * line - outline, axis=-1).min() >= RADIUS - 2.0:
+        return start
+    center = in_window(block, CENTER)
+    bearing, wanted = (math.atan2(*(point - center)[::-1]) for point in (agent, start))
+    bearing += float(np.clip(math.remainder(wanted - bearing, 2 * math.pi), -1.0, 1.0))
+    around = center + ROUND * np.array([math.cos(bearing), math.sin(bearing)])
+    return np.clip(around, WALLS[0] + RADIUS, WALLS[1] - RADIUS)
+
+
+def _numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
+    return array
+
+
+def _skin() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points [P, 2] of the block's outline in its frame, and the outward normals there."""
+    points, normals = [], []
+    for begin, end in zip(OUTLINE, np.roll(OUTLINE, -1, axis=0), strict=True):
+        edge = end - begin
+        length = float(np.linalg.norm(edge))
+        fractions = (np.arange(round(length / SPACING)) + 0.5) / round(length / SPACING)
+        points.append(begin + fractions[:, None] * edge)
+        normals.append(np.tile(np.array([edge[1], -edge[0]]) / length, (len(fractions), 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+_SKIN = _skin()
