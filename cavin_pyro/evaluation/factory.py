@@ -232,8 +232,7 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
 
 def check_space(trained: Checkpoint, env: World) -> None:
     """Raise a `UserError` if a checkpoint was trained in a world of other dimensions or units."""
-    space = construct(trained.config["space"]) if trained.config.get("space") else SPACE
-    if space != env.space:
+    if "model" in trained.config and trained.model.space != env.space:
         own = (trained.config.get("world") or {}).get("_target_")
         raise UserError(
             f"checkpoint {trained.path} was trained in {own or 'env=tabletop'}, whose actions, positions or units are "

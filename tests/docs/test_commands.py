@@ -70,6 +70,8 @@ def small(line: Line) -> Case:
     more = SMALL[line.command].split()
     given = {option.partition("=")[0] for option in line.options}
     more = [option for option in more if not (option.startswith("seed=") and "seed" in given)]
+    if "env" in given or any("pusht" in option for option in line.options):  # another world has its own options
+        more = [f"env.{one}" if one.startswith("maximum_steps") else one for one in more if "minimum_move" not in one]
     if "planner=random" in line.options:
         more.remove("planner.samples=8")
     more += ["device=cpu"] if "device=cuda" in line.options else []
