@@ -125,6 +125,7 @@ def predictions(path: str, episodes: Sequence[tuple[list[str], list[Push]]]) -> 
     """Centres that a checkpoint predicts, by the number of pushes and the predictor."""
     trained = load(path)
     model, guide, geometry = trained.model, trained.guide, trained.geometry
+    assert geometry is not None, "a checkpoint of the tabletop"
 
     def state(seen: Observation) -> State:
         features = torch.from_numpy(cloud_features(geometry, (seen.clouds - seen.centers[:, None])[None]))

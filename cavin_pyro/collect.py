@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
 from cavin_pyro.config.application import DictConfig, command
 
@@ -11,33 +13,67 @@ from cavin_pyro.config.application import DictConfig, command
 def main(config: DictConfig) -> None:
     """Collect pushes by the heuristic policy, or by a model, into a dataset folder, with their statistics.
 
-    Resumes an interrupted run.
+    In another world than the tabletop, episodes of its own policy. Resumes an interrupted run.
     """
-    from cavin_pyro.config.commands import CollectionOptions
     from cavin_pyro.config.errors import UserError
-    from cavin_pyro.data.collection import check_policy, collect, collecting_world, repair
-    from cavin_pyro.data.summary import summarize_data
+    from cavin_pyro.data.collection import collect, repair
     from cavin_pyro.launching.launcher import chosen_launcher
-    from cavin_pyro.storage.files import output_folder, write_json
+    from cavin_pyro.storage.files import output_folder
 
-    if config.minimum_objects > config.maximum_objects:
-        raise UserError(f"minimum_objects must be at most maximum_objects={config.maximum_objects}")
-    given = {one.name: config[one.name] for one in fields(CollectionOptions)}
-    collection = replace(collecting_world(config.env), **given)
-    check_policy(collection)
+    collection = _collection(config)
     with output_folder(config.output) as folder:
         launcher = chosen_launcher(config)
         if config.repair:
             print(f"{repair(collection, folder, workers=launcher)} files collected again")
         metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)
-        figures = summarize_data(folder)
-        write_json(folder / "statistics.json", figures)
-        if lost := metadata["episodes"] - figures["episodes"]:
+        if lost := metadata["episodes"] - _summarized(folder, metadata):
             raise UserError(
                 f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "
                 "run the same command with repair=true, which collects them again"
             )
         print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
+
+
+def _collection(config: DictConfig) -> Any:
+    """What determines the data, checked before anything is written."""
+    from numpy.random import default_rng
+    from omegaconf import OmegaConf
+
+    from cavin_pyro.config.commands import CollectionOptions
+    from cavin_pyro.config.errors import UserError, user_input
+    from cavin_pyro.config.world import world_of
+    from cavin_pyro.data.collection import check_policy, collecting_world
+    from cavin_pyro.data.episodes import WorldCollection
+
+    given = {one.name: config[one.name] for one in fields(CollectionOptions)}
+    world = world_of(config)
+    if world is None:
+        if config.minimum_objects > config.maximum_objects:
+            raise UserError(f"minimum_objects must be at most maximum_objects={config.maximum_objects}")
+        collection = replace(collecting_world(config.env), **given)
+        check_policy(collection)
+        return collection
+    own = {name: given.pop(name) for name in ("seed", "steps", "episodes_per_shard")}
+    for name, value in given.items():
+        if value != getattr(CollectionOptions, name):
+            raise UserError(f"{name}={value} is of the tabletop, and not of {type(world).__name__}: leave it")
+    with user_input("env"):
+        world.policy(default_rng())
+    section: Any = OmegaConf.to_container(config.world)
+    return WorldCollection(section, **own)
+
+
+def _summarized(folder: Path, metadata: dict[str, Any]) -> int:
+    """Write statistics of a dataset of the tabletop; returns how many episodes could be read."""
+    from cavin_pyro.data.dataset import iterate_shards
+    from cavin_pyro.data.summary import summarize_data
+    from cavin_pyro.storage.files import write_json
+
+    if "world" in metadata["configuration"]:
+        return sum(len(arrays["episode"]) for _, arrays in iterate_shards(folder, (), skip_corrupt=True))
+    figures = summarize_data(folder)
+    write_json(folder / "statistics.json", figures)
+    return int(figures["episodes"])
 
 
 if __name__ == "__main__":

@@ -144,7 +144,8 @@ def describe(*, model: Model, guide: Guide | None = None, geometry: Geometry | N
     if guide is not None and guide.model is not model:
         raise UserError("the guide was built for another model: give guide.model, or build a guide for this one")
     parts = {"model": model, "guide": guide, "geometry": geometry}
-    return {name: _described(part, name, model) for name, part in parts.items() if part is not None}
+    none = {"geometry": {"_target_": None}} if geometry is None and model.space != SPACE else {}
+    return none | {name: _described(part, name, model) for name, part in parts.items() if part is not None}
 
 
 def _described(value: Any, place: str, model: Model) -> Any:

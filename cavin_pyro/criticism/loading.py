@@ -117,6 +117,8 @@ def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
     `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
     """
     checkpoint = load(config.checkpoint, trust=list(config.trust))
+    if (checkpoint.config.get("geometry") or {}).get("_target_", "") is None:
+        raise UserError(f"checkpoint {checkpoint.path} is of another world: choose one of the tabletop")
     if accept is not None:
         accept(checkpoint.model)
     check_fit(checkpoint.model, checkpoint.geometry)
@@ -137,7 +139,8 @@ def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
 def context_of(config: DictConfig, loaded: Loaded, world: CollectionConfig) -> tuple[CheckContext, dict[str, Any]]:
     """The context of a checkpoint and its data, and `about`."""
     checkpoint, selection, table, folders = loaded
-    path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
+    path, model, guide, geometry = checkpoint.path, checkpoint.model, checkpoint.guide, checkpoint.geometry
+    assert geometry is not None  # as `load_trained` has checked
     chosen = {
         "training": sample_windows(table, table.training, config.windows, seed=[config.seed, 0]),
         "validation": sample_windows(table, table.validation, config.windows, seed=[config.seed, 1]),
@@ -146,7 +149,7 @@ def context_of(config: DictConfig, loaded: Loaded, world: CollectionConfig) -> t
     context = CheckContext(
         model,
         guide,
-        checkpoint.geometry,
+        geometry,
         table.batch(chosen["training"]),
         table.batch(chosen["validation"]),
         seed=config.seed,

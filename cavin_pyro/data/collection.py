@@ -20,6 +20,7 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.world import object_ranges, part_of
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
+from cavin_pyro.data.episodes import WorldCollection
 from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
 from cavin_pyro.envs.randomness import collection_streams
 from cavin_pyro.envs.tabletop.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
@@ -56,6 +57,24 @@ class CollectionConfig(CollectionOptions):
     camera: Any = WorldConfig.camera
     segmentation: Any = WorldConfig.segmentation
 
+    def stored(self) -> dict[str, Any]:
+        """The configuration in the metadata, with the SHA-256 of a checkpoint that chooses the pushes for its name."""
+        made: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # with lists in place of tuples, as it is stored
+        del made["assets"]
+        chooser = find_checkpoint(self.checkpoint or PUSHER) if self.policy == "model" else None
+        return made | {"checkpoint": chooser and file_digest(chooser)}
+
+    def shard(self, number: int) -> Arrays:
+        """The arrays of a shard, which its number and the configuration determine."""
+        parts = ("object_set", "assets", "camera", "segmentation", "maximum_objects")
+        scene = _scene(json.dumps({name: getattr(self, name) for name in parts}))
+        numbers = range(number * self.episodes_per_shard, (number + 1) * self.episodes_per_shard)
+        episodes = [collect_episode(scene, self, episode) for episode in numbers]
+        return {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
+
+
+Collection = CollectionConfig | WorldCollection
+
 
 def collecting_world(env: DictConfig) -> CollectionConfig:
     """The configuration of a collection in the world of `env.*`, with default options.
@@ -80,7 +99,7 @@ def collecting_world(env: DictConfig) -> CollectionConfig:
 
 
 def collect(
-    config: CollectionConfig,
+    config: Collection,
     folder: Path,
     *,
     transitions: int = CollectConfig.transitions,
@@ -227,18 +246,12 @@ def _pusher(checkpoint: str) -> tuple[Model, Geometry]:
     return load_pusher(checkpoint)
 
 
-def _collect_shard(job: tuple[CollectionConfig, int]) -> Arrays:
-    config, shard = job
-    parts = ("object_set", "assets", "camera", "segmentation", "maximum_objects")
-    scene = _scene(json.dumps({name: getattr(config, name) for name in parts}))
-    first = shard * config.episodes_per_shard
-    episodes = [collect_episode(scene, config, episode) for episode in range(first, first + config.episodes_per_shard)]
-    return {name: np.stack([episode[name] for episode in episodes]) for name in episodes[0]}
+def _collect_shard(job: tuple[Collection, int]) -> Arrays:
+    config, number = job
+    return config.shard(number)
 
 
-def _shards(
-    config: CollectionConfig, numbers: Iterable[int], *, workers: int | Launcher
-) -> Generator[Arrays, None, None]:
+def _shards(config: Collection, numbers: Iterable[int], *, workers: int | Launcher) -> Generator[Arrays, None, None]:
     """The shards with these numbers, in their order."""
     launcher = as_launcher(workers)
     if launcher.here:
@@ -248,15 +261,16 @@ def _shards(
         yield from (shard for _, shard in made)
 
 
-def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
+def _begin(config: Collection, folder: Path) -> dict[str, Any]:
     """Metadata of the dataset so far, checked against the requested configuration."""
-    wanted = json.loads(json.dumps(asdict(config)))  # with lists in place of tuples, as it is stored
-    del wanted["assets"]
-    wanted["checkpoint"] = _digest(config)
+    wanted = config.stored()
     if not (folder / "metadata.json").exists():
+        names = {}
+        if isinstance(config, CollectionConfig):
+            names = {"shape_names": list(part_of("objects", config.object_set, config.assets).names)}
         return {
             "configuration": wanted,
-            "shape_names": list(part_of("objects", config.object_set, config.assets).names),
+            **names,
             "made_by": f"cavin_pyro {__version__}",
             **dict.fromkeys(dataset.COUNTS, 0),
         }
@@ -273,14 +287,7 @@ def _begin(config: CollectionConfig, folder: Path) -> dict[str, Any]:
     return metadata
 
 
-def _digest(config: CollectionConfig) -> str | None:
-    """The SHA-256 of the checkpoint that chooses the pushes, which counts in place of its name."""
-    if config.policy != "model":
-        return None
-    return file_digest(find_checkpoint(config.checkpoint or PUSHER))
-
-
-def repair(config: CollectionConfig, folder: Path, *, workers: int | Launcher = 1) -> int:
+def repair(config: Collection, folder: Path, *, workers: int | Launcher = 1) -> int:
     """Collect again the shards that are missing or corrupt; returns how many there were.
 
     Args:

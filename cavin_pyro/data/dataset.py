@@ -11,6 +11,10 @@ checksums find a shard that was damaged later. Letters: E episodes, S pushes, M 
     shape, scale, mass, friction [E, M] object parameters; shape indexes `shape_names` in the metadata
     episode [E]                         number of the episode, which with the root seed makes its seed
 
+Episodes of another world have no clouds, and of each object a feature in their place (`WORLD_ARRAYS`). Their
+metadata hold its `space`, so that training needs no simulator. Letters: P numbers of a position, F of a feature, A of
+an action.
+
 A merged dataset has the shards of several collections one after another. What these have in common is in
 `configuration`; what each has for itself, its seed above all, is in its entry of `sources`.
 """
@@ -28,13 +32,15 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, object_slots
+from cavin_pyro.models.space import Space
 from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write_json
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
 COUNTS = ("shards", "episodes", "transitions")
 FARTHEST = 100.0  # metres; the table ends before 1
-LARGEST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, "F": 4096}  # of each dimension
+FINITE = 3e38  # the largest of float32, about
+LARGEST = {"E": 10_000, "S": 10_000, "M": MAXIMUM_OBJECTS, "P": POINTS_PER_OBJECT, "F": 4096, "A": 4096}
 
 Arrays = dict[str, NDArray[Any]]
 UNREADABLE = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError)  # what h5py raises
@@ -76,7 +82,33 @@ FEATURES = {  # of files beside the shards, see `cavin_pyro.data.features`
     "features": Declared("float32", (*STATES, "F"), -2.0, 2.0),
     "shard_digest": Declared("uint8", (32,), 0, 255),
 }
+WORLD_ARRAYS = {
+    "centers": Declared("float32", (*STATES, "P"), -FINITE, FINITE),
+    "features": Declared("float32", (*STATES, "F"), -FINITE, FINITE),
+    "mask": ARRAYS["mask"],
+    "actions": Declared("float32", (*PUSHES, "A"), -1.0, 1.0),
+    "length": ARRAYS["length"],
+    "episode": ARRAYS["episode"],
+}
 DECLARED = ARRAYS | FEATURES
+
+
+def arrays_of(metadata: Mapping[str, Any]) -> dict[str, Declared]:
+    """The arrays of a dataset's shards: of the tabletop, or of another world."""
+    return WORLD_ARRAYS if "space" in metadata["configuration"] else ARRAYS
+
+
+def space_of(metadata: Mapping[str, Any]) -> Space | None:
+    """The space of a dataset's world; None of the tabletop, whose geometry makes the features."""
+    section = metadata["configuration"].get("space")
+    return None if section is None else Space(**section)
+
+
+def check_tabletop(folders: Sequence[Path], what: str) -> None:
+    """Raise a `UserError` for a dataset of another world; `what` says why it must be of the tabletop."""
+    for folder in folders:
+        if "world" in (made := read_metadata(folder)["configuration"]):
+            raise UserError(f"{folder} has episodes of {made['world']['_target_']}, and {what}: choose another dataset")
 
 
 class CorruptShardError(UserError):
@@ -126,11 +158,13 @@ def find_damage(path: Path, names: Iterable[str] | None, metadata: Mapping[str, 
     """What is wrong with a file by itself, for `read_shard`; what can be read of it goes into `arrays`."""
     try:
         with h5py.File(path, "r") as file:
-            check_file(file, metadata.get("configuration", {}))
+            configuration = metadata.get("configuration", {})
+            declared = WORLD_ARRAYS if "space" in configuration else DECLARED
+            check_file(file, configuration, declared)
             for name in sorted(file) if names is None else names:
                 try:
                     array = file[name][()]
-                    check_values(name, array)
+                    check_values(name, array, declared)
                     arrays[name] = array
                 except UNREADABLE as error:
                     yield f"array {name}: {str(error).splitlines()[0]}"
@@ -150,29 +184,33 @@ def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str
         yield "array visible: an object that mask denies is visible"
 
 
-def check_file(file: h5py.File, configuration: Mapping[str, Any]) -> None:
+def check_file(file: h5py.File, configuration: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
     """Check types and shapes of all declared arrays of a file, before any is read.
 
     Args:
-        configuration: of the collection, which tells E, S and M. What it lacks, the arrays must agree on.
+        configuration: of the collection, which tells E, S and M, and of a world P, F and A. What it lacks, the arrays
+            must agree on.
 
     Raises:
         ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
     """
     options = {"E": "episodes_per_shard", "S": "steps", "M": "maximum_objects"}
+    if space := space_of({"configuration": configuration}):
+        options |= {"M": "objects", "F": "features"}
     sizes = {name: configuration[option] for name, option in options.items() if option in configuration}
-    if "M" in sizes:
+    if space:
+        sizes |= {"P": space.positions, "A": space.actions}
+    elif "M" in sizes:
         sizes["M"] = object_slots(sizes["M"])
-    for name in sorted(file, key=lambda one: list(DECLARED).index(one) if one in DECLARED else -1):
+    for name in sorted(file, key=lambda one: list(declared).index(one) if one in declared else -1):
         array = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
         if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external:
             raise ValueError(f"{name} is no array in this file")
-        if name in DECLARED:
-            _check_shape(name, array, sizes)
+        if name in declared:
+            _check_shape(name, array, declared[name], sizes)
 
 
-def _check_shape(name: str, array: h5py.Dataset, sizes: dict[str, int]) -> None:
-    declared = DECLARED[name]
+def _check_shape(name: str, array: h5py.Dataset, declared: Declared, sizes: dict[str, int]) -> None:
     if array.dtype != np.dtype(declared.dtype):
         raise ValueError(f"{name} has type {array.dtype}, not {declared.dtype}")
     if len(array.shape) == len(declared.dimensions):
@@ -187,13 +225,13 @@ def _check_shape(name: str, array: h5py.Dataset, sizes: dict[str, int]) -> None:
         raise ValueError(f"{name} has shape {list(array.shape)}, not {wanted}")
 
 
-def check_values(name: str, array: NDArray[Any]) -> None:
-    """Check that the values of a declared array are finite and within their range.
+def check_values(name: str, array: NDArray[Any], table: Mapping[str, Declared] = DECLARED) -> None:
+    """Check that the values of an array that `table` declares are finite and within their range.
 
     Raises:
         ValueError: some are not.
     """
-    declared = DECLARED.get(name)
+    declared = table.get(name)
     if declared is None or array.dtype == np.bool_ or array.size == 0:
         return
     low, high = array.min(), array.max()  # NaN if any is
@@ -267,7 +305,7 @@ def _check_metadata(metadata: Mapping[str, Any], *, files: int) -> None:
         raise ValueError("its sources must be a list of collections")
     for source in sources:
         _check_collection(source)
-        if type(source["configuration"].get("seed")) is not int:
+        if type(seed_of(source)) is not (str if "sha256" in source["configuration"] else int):
             raise ValueError("seed must be a whole number")
     if "sources" in metadata:
         totals = [sum(source[name] for source in sources) for name in COUNTS]
@@ -281,6 +319,14 @@ def _check_collection(metadata: Any) -> None:
     if not isinstance(configuration, dict) or not all(map(_is_count, (metadata.get(name) for name in COUNTS))):
         raise ValueError("configuration or counts are missing")
     usual = {"steps": None, "episodes_per_shard": 1, "maximum_objects": 1}
+    if "space" in configuration:
+        try:
+            space_of(metadata)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"its space cannot be used ({error})") from error
+        usual = {"objects": None, "features": None, **usual}
+        if not isinstance(configuration.get("world"), dict) or "_target_" not in configuration["world"]:
+            raise ValueError("its world has no _target_")
     sizes: dict[str, Any] = {name: configuration.get(name, value) for name, value in usual.items()}
     if not all(map(_is_count, sizes.values())) or sizes["maximum_objects"] > MAXIMUM_OBJECTS:
         raise ValueError(f"{', '.join(sizes)} must be whole numbers, the last {MAXIMUM_OBJECTS} at most")
@@ -302,13 +348,15 @@ def source_of_shards(metadata: Mapping[str, Any]) -> list[int]:
     return [number for number, source in enumerate(sources_of(metadata)) for _ in range(source["shards"])]
 
 
-def seed_of(source: Mapping[str, Any]) -> int:
-    """The root seed of a collection."""
-    return source["configuration"]["seed"]
+def seed_of(source: Mapping[str, Any]) -> Any:
+    """The root seed of a collection; of imported episodes the SHA-256 of what they were read from."""
+    return source["configuration"].get("sha256", source["configuration"].get("seed"))
 
 
 def slots_of(metadata: Mapping[str, Any]) -> int:
     """M, for how many objects the files of a dataset have room; of a merged one, the widest."""
+    if "space" in metadata["configuration"]:
+        return int(metadata["configuration"]["objects"])
     most = (source["configuration"].get("maximum_objects", OBJECT_SLOTS) for source in sources_of(metadata))
     return max(map(object_slots, most))
 

@@ -53,6 +53,7 @@ def export(folder: Path, target: Path) -> int:
     if not re.fullmatch(r"[\w-]+-v\d+", target.resolve().name):
         raise UserError(f"--to {target} must end in a name and a version, as Minari wants: --to {target}-v0")
     metadata = dataset.read_metadata(folder)
+    dataset.check_tabletop([folder], "export writes those of the tabletop")
     with output_folder(target):
         written, partial = target / "data", target / ".data.partial"
         if written.exists():

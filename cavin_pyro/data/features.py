@@ -108,6 +108,7 @@ def sample_clouds(
     Raises:
         UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
     """
+    dataset.check_tabletop(folders, "there are no clouds in it")
     excluded = find_held_out(held_out_objects, folders, option="held_out_objects")
     dataset.check_distinct(folders)
     shards = [

@@ -42,7 +42,7 @@ def find_defects(folder: Path) -> Iterator[str]:
     with progress_bar("verifying", total=metadata["shards"], unit="file") as bar:
         for number, source in enumerate(dataset.source_of_shards(metadata)):
             path, arrays = dataset.shard_path(folder, number), Arrays()
-            found = [*dataset.find_damage(path, dataset.ARRAYS, metadata, arrays)]
+            found = [*dataset.find_damage(path, dataset.arrays_of(metadata), metadata, arrays)]
             if "episode" in arrays and (repetition := dataset.repeated_episode(known, source, arrays["episode"])):
                 found.append(f"it {repetition}")
             yield from (f"{path}: {defect}" for defect in found)

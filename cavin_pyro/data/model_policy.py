@@ -75,9 +75,10 @@ def load_pusher(name: str) -> tuple[Model, Geometry]:
         UserError: it cannot be used, or its model has not both codes.
     """
     trained = load(name)
-    model = trained.model
-    if model.codes != ("effect_code", "motion_code"):
+    model, geometry = trained.model, trained.geometry
+    if model.codes != ("effect_code", "motion_code") or geometry is None:
+        of = "" if geometry else " of another world"
         raise UserError(
-            f"policy=model needs a cascade, and checkpoint {trained.path} has model {model.name}: choose cavin"
+            f"policy=model needs a cascade, and checkpoint {trained.path} has model {model.name}{of}: choose cavin"
         )
-    return model, trained.geometry
+    return model, geometry

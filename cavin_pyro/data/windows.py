@@ -18,11 +18,13 @@ from torch.nn import functional
 
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.device import send
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
+from cavin_pyro.data.episodes import checked, checked_episode, packed
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
 from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.progress import progress_bar
 
@@ -91,8 +93,8 @@ class WindowTable:
         windows = WindowTable.from_arrays(centers=centers, features=features, actions=actions)
 
         Args:
-            centers: metres, `[W, T + 1, M, 3]`. features: of unit length, `[W, T + 1, M, F]`.
-            actions: normalised pushes, `[W, T, 4]`.
+            centers: in the world's unit, `[W, T + 1, M, P]`. features: such as of unit length, `[W, T + 1, M, F]`.
+            actions: in [-1, 1], `[W, T, A]`.
             mask: real objects, `[W, T + 1, M]` bool; by default all.
             transition_mask: pushes that f learns from, `[W, T]` bool. sequence_mask: windows that h, g and the guide
                 learn from, `[W]` bool. By default all.
@@ -102,22 +104,14 @@ class WindowTable:
         Raises:
             UserError: shapes that do not fit together, numbers that are not finite, or nothing to train on.
         """
-        pushes = _checked("actions", actions, torch.float32, (None, None, None))
+        pushes = checked("actions", actions, torch.float32, (None, None, None))
         W, T = pushes.shape[:2]
-        places = _checked("centers", centers, torch.float32, (W, T + 1, None, None))
-        real = _checked("mask", mask, torch.bool, places.shape[:3])
-        outlines = _checked("features", features, torch.float32, (*places.shape[:3], None))
-        transitions = _checked("transition_mask", transition_mask, torch.bool, (W, T))
-        sequences = _checked("sequence_mask", sequence_mask, torch.bool, (W,))
-        numbers = _checked("episodes", range(W) if episodes is None else episodes, torch.int64, (W,))
-        distinct = numbers.unique()
-        if len(distinct) < 2 or not 0 < validation_fraction < 1 or T == 0:
-            raise UserError(
-                f"windows of {len(distinct)} episodes with {T} pushes and validation_fraction={validation_fraction:g}: "
-                "give at least two episodes and a push, and a fraction between 0 and 1"
-            )
-        count = min(max(1, round(validation_fraction * len(distinct))), len(distinct) - 1)
-        order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
+        places = checked("centers", centers, torch.float32, (W, T + 1, None, None))
+        real = checked("mask", mask, torch.bool, places.shape[:3])
+        outlines = checked("features", features, torch.float32, (*places.shape[:3], None))
+        transitions = checked("transition_mask", transition_mask, torch.bool, (W, T))
+        sequences = checked("sequence_mask", sequence_mask, torch.bool, (W,))
+        numbers = checked("episodes", range(W) if episodes is None else episodes, torch.int64, (W,))
         return cls(
             State(places, outlines, real).map(lambda field: field.flatten(0, 1)),
             functional.pad(pushes, (0, 0, 0, 1)).flatten(0, 1),  # after a window's last state there is no push
@@ -125,9 +119,49 @@ class WindowTable:
             starts=torch.arange(W) * (T + 1),
             sequence_mask=sequences,
             episodes=numbers,
-            held_out=torch.isin(numbers, distinct[order[:count]]),
+            held_out=_held_out(numbers, T, validation_fraction, seed),
             segment_length=T,
         )
+
+    @classmethod
+    def from_episodes(
+        cls,
+        space: Space,
+        *,
+        centers: Sequence[ArrayLike],
+        features: Sequence[ArrayLike],
+        actions: Sequence[ArrayLike],
+        mask: Sequence[ArrayLike] | None = None,
+        segment_length: int = SEGMENT_LENGTH,
+        negative_fraction: float = WindowConfig.negative_fraction,
+        validation_fraction: float = WindowConfig.validation_fraction,
+        seed: int = 0,
+    ) -> WindowTable:
+        """All windows of episodes of one's own, such as lists of arrays, chosen and split as those of a dataset.
+
+        windows = WindowTable.from_episodes(world.space, centers=centers, features=features, actions=actions)
+
+        Args:
+            space: of the world.
+            centers, features, actions: of each episode of S steps, `[S + 1, M, P]`, `[S + 1, M, F]`, and `[S, A]` from
+                -1 to 1. mask: real objects, `[M]` of each; by default all.
+            negative_fraction: share that is kept of windows in which nothing moves. For the others see `from_arrays`.
+
+        Raises:
+            UserError: shapes that do not fit, numbers that are not finite, an action out of its box, or no window.
+        """
+        masks: Any = [None] * len(actions) if mask is None else mask
+        with user_input():
+            every: Any = zip(centers, features, actions, masks, strict=True)
+            episodes = [checked_episode(space, *one) for one in every]
+            longest = max((len(one["actions"]) for one in episodes), default=0)
+            held = _held_out(torch.arange(len(episodes)), longest, validation_fraction, seed).numpy()
+            together = packed(episodes, range(len(episodes)), longest)
+        config = WindowConfig(negative_fraction=negative_fraction)
+        states, slots = len(episodes) * (longest + 1), together["mask"].shape[1]
+        found = _Finder(config, segment_length, seed, "of these episodes", slots, states, None, space)
+        found.add(together, held)
+        return found.table()
 
     def move(self, device: torch.device, room: int) -> bool:
         """Give batches on a device; also keep states and pushes there if they take at most `room` bytes.
@@ -183,7 +217,7 @@ class WindowTable:
 
 def load_windows(
     folders: Sequence[Path],
-    geometry: Geometry,
+    geometry: Geometry | None,
     config: WindowConfig | None = None,
     *,
     segment_length: int = SEGMENT_LENGTH,
@@ -194,6 +228,7 @@ def load_windows(
     """Read one or more datasets, compute missing features, and find the windows.
 
     Args:
+        geometry: of features; None for datasets of other worlds than the tabletop, which have their own.
         segment_length: T. seed: of the split into training and validation.
         storage: folder for a temporary file with all states, which need not fit in memory; by default the system's.
 
@@ -201,22 +236,29 @@ def load_windows(
         UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
     """
     config = config or WindowConfig()
-    fingerprint = geometry_fingerprint(geometry)
     every = [dataset.read_metadata(folder) for folder in folders]
-    steps = [metadata["configuration"]["steps"] for metadata in every]
-    if len(set(steps)) > 1:
-        raise UserError(
-            "datasets with episodes of different length cannot be joined: "
-            + ", ".join(f"{folder} has steps={one}" for folder, one in zip(folders, steps, strict=True))
-        )
+    space = shared_space(folders)
+    if geometry is None and space is None:
+        raise UserError("datasets of the tabletop need a geometry, which makes features of their clouds")
+    if geometry is not None:
+        dataset.check_tabletop(folders, f"there are no clouds in it for {type(geometry).__name__}")
+    for name in ("maximum_step", "minimum_move", "maximum_move") if space else ():
+        if getattr(config, name) != getattr(WindowConfig, name):
+            raise UserError(f"windows.{name} is of the tabletop; elsewhere the space's scales say what moves: leave it")
+    fingerprint = "" if geometry is None else geometry_fingerprint(geometry)
     dataset.check_distinct(folders)
     excluded = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
-    states = sum(metadata["episodes"] for metadata in every) * (max(steps) + 1)
-    found = _Finder(config, segment_length, seed, where, max(map(dataset.slots_of, every)), states, storage)
+    states = sum(metadata["episodes"] * (metadata["configuration"]["steps"] + 1) for metadata in every)
+    found = _Finder(config, segment_length, seed, where, max(map(dataset.slots_of, every)), states, storage, space)
+    names = NEEDED if space is None else tuple(dataset.WORLD_ARRAYS)
     with progress_bar("reading", total=sum(metadata["shards"] for metadata in every), unit="file") as bar:
         for folder, numbers in zip(folders, excluded, strict=True):
-            for number, arrays in dataset.iterate_shards(folder, NEEDED, skip_corrupt=skip_corrupt):
+            for number, arrays in dataset.iterate_shards(folder, names, skip_corrupt=skip_corrupt):
+                bar.update()
+                if geometry is None:
+                    found.add(arrays)
+                    continue
                 try:
                     arrays["features"] = shard_features(folder, number, geometry, fingerprint)
                 except dataset.CorruptShardError as error:  # its clouds, which are read here alone, are corrupt
@@ -226,20 +268,38 @@ def load_windows(
                     continue
                 kept = ~held_out(arrays, numbers).any(axis=-1)
                 found.add({name: array[kept] for name, array in arrays.items()})
-                bar.update()
     return found.table()
 
 
-def _checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | None]) -> Tensor:
-    """The array as a tensor of this shape, in which None stands for any size; without an array, ones."""
-    tensor = torch.as_tensor(np.ones(shape, bool) if array is None else array, dtype=dtype)
-    fits = tensor.dim() == len(shape)
-    if not fits or any(want not in (None, have) for have, want in zip(tensor.shape, shape, strict=True)):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise UserError(f"{name} has shape {[*tensor.shape]}, and must have [{wanted}]")
-    if not tensor.isfinite().all():
-        raise UserError(f"{name} has numbers that are not finite: leave those windows out")
-    return tensor
+def shared_space(folders: Sequence[Path]) -> Space | None:
+    """The space of the world that all datasets are of; None for the tabletop.
+
+    Raises:
+        UserError: no dataset, or they are of different worlds.
+    """
+    every = [dataset.read_metadata(folder) for folder in folders]
+    for name in ("world", "space", "objects", "features"):
+        first, *others = (one["configuration"].get(name) for one in every)
+        for folder, other in zip(folders[1:], others, strict=True):
+            if other != first:
+                raise UserError(
+                    f"{folders[0]} and {folder} are not of the same world ({name} is {first} and {other}): "
+                    "train on datasets of one world"
+                )
+    return dataset.space_of(every[0])
+
+
+def _held_out(numbers: Tensor, steps: int, fraction: float, seed: int) -> Tensor:
+    """Which of the windows or episodes, by the number of their episode, are for validation: at least of one episode."""
+    distinct = numbers.unique()
+    if len(distinct) < 2 or not 0 < fraction < 1 or steps == 0:
+        raise UserError(
+            f"windows of {len(distinct)} episodes with {steps} pushes and validation_fraction={fraction:g}: "
+            "give at least two episodes and a push, and a fraction between 0 and 1"
+        )
+    count = min(max(1, round(fraction * len(distinct))), len(distinct) - 1)
+    order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
+    return torch.isin(numbers, distinct[order[:count]])
 
 
 class _Finder:
@@ -254,9 +314,14 @@ class _Finder:
         slots: int,
         states: int,
         storage: Path | None,
+        space: Space | None = None,
     ) -> None:
-        """`slots`: M, that of the dataset with the most objects. `states`: how many there are at most."""
+        """`slots`: M, that of the dataset with the most objects. `states`: how many there are at most.
+
+        `space`: of the world; None of the tabletop.
+        """
         self._config, self._length, self._seed, self._where = config, segment_length, seed, where
+        self._space = space
         self._slots, self._states, self._storage = slots, states, storage
         self._turns = np.random.default_rng(seed)
         self._stored: Arrays = {}  # positions in time, episode after episode
@@ -265,44 +330,50 @@ class _Finder:
         }
         self._episodes = self._filled = 0
 
-    def add(self, episodes: Arrays) -> None:
-        """Add the episodes of a shard.
+    def add(self, episodes: Arrays, held_out: NDArray[np.bool_] | None = None) -> None:
+        """Add the episodes of a shard; `held_out`: which are for validation, `[E]`, by default by their number.
 
         Raises:
             UserError: they are too short, or not shaped as the metadata say.
         """
-        T, config, positions = self._length, self._config, episodes["visible"].shape[1]
+        T, config, positions = self._length, self._config, episodes["centers"].shape[1]
         if positions <= T:
             raise UserError(
                 f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
                 f"T={T}: collect with steps of at least that many"
             )
         episodes = dataset.padded(episodes, self._slots)
-        mask, centers, length = episodes["mask"], episodes["centers"], episodes["length"]
-        visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
-        counts = _transitions_that_count(episodes, visible, config.maximum_step)
-
-        first, last = slice(0, positions - T), slice(T, None)
-        moved = np.where(mask[:, None], np.linalg.norm(centers[:, last] - centers[:, first], axis=-1), 0.0).max(axis=-1)
-        flawed = episodes["unsafe"] | episodes["fallen"]
-        safe = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
-        informative = safe & visible[:, first] & visible[:, last]
-        informative &= (moved > config.minimum_move) & (moved < config.maximum_move)
+        mask, length = episodes["mask"], episodes["length"]
+        made = np.arange(positions - 1)[None] < length[:, None]
+        if self._space is None:
+            visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
+            counts = made & _transitions_that_count(episodes, visible, config.maximum_step)
+            moved = _moves(episodes["centers"], mask, T)
+            flawed = episodes["unsafe"] | episodes["fallen"]
+            informative = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
+            informative &= visible[:, :-T] & visible[:, T:]
+            informative &= (moved > config.minimum_move) & (moved < config.maximum_move)
+        else:
+            counts = made
+            informative = _moves(episodes["centers"], mask, T) > self._space.center_scale
+            informative |= _moves(episodes["features"], mask, T) > self._space.feature_scale
         exists = np.arange(positions - T)[None] + T <= length[:, None]
 
         # The split depends on the episode's number alone, so more data does not change it.
-        shares = np.array([np.random.default_rng([self._seed, int(number)]).random() for number in episodes["episode"]])
-        validation = np.broadcast_to((shares < config.validation_fraction)[:, None], exists.shape)
+        if held_out is None:
+            numbers = [[self._seed, int(number)] for number in episodes["episode"]]
+            shares = np.array([np.random.default_rng(number).random() for number in numbers])
+            held_out = shares < config.validation_fraction
+        validation = np.broadcast_to(held_out[:, None], exists.shape)
         chosen = exists & (informative | (self._turns.random(exists.shape) < config.negative_fraction))
 
         episode, start = np.nonzero(chosen)
-        episode += self._episodes
-        found = {"starts": episode * positions + start, "sequence_mask": informative[chosen]}
-        for name, values in {**found, "episodes": episode, "held_out": validation[chosen]}.items():
+        found = {"starts": self._filled + episode * positions + start, "sequence_mask": informative[chosen]}
+        for name, values in {**found, "episodes": self._episodes + episode, "held_out": validation[chosen]}.items():
             self._windows[name].append(values)
         self._episodes += len(mask)
         self._store(
-            centers=centers,
+            centers=episodes["centers"],
             features=episodes["features"],
             mask=np.repeat(mask[:, None], positions, axis=1),
             actions=np.pad(episodes["actions"], ((0, 0), (0, 1), (0, 0))),
@@ -335,9 +406,10 @@ class _Finder:
         table = WindowTable(states, stored["actions"], stored["counts"], **windows, segment_length=self._length)
         for name in ("training", "validation"):
             if not table.sequence_mask[getattr(table, name)].any():
+                least = f"{self._config.minimum_move:g} m" if self._space is None else "the space's scales"
                 raise UserError(
-                    f"dataset {self._where} has no {name} window in which an object moved more than "
-                    f"{self._config.minimum_move:g} m: collect more transitions"
+                    f"dataset {self._where} has no {name} window in which an object moved more than {least}: "
+                    "collect more transitions"
                 )
         return table
 
@@ -351,8 +423,12 @@ def _mapped(folder: Path | None, shape: tuple[int, ...], dtype: np.dtype[Any]) -
 
 
 def _transitions_that_count(episodes: Arrays, visible: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:
-    """Which pushes [E, S] the dynamics f learns from."""
-    step = np.linalg.norm(np.diff(episodes["centers"], axis=1), axis=-1)
-    small = (np.where(episodes["mask"][:, None], step, 0.0) < maximum_step).all(axis=-1)
-    made = np.arange(step.shape[1])[None] < episodes["length"][:, None]
-    return made & small & ~episodes["fallen"] & visible[:, :-1] & visible[:, 1:]
+    """Which pushes [E, S] the dynamics f learns from, if they were made."""
+    small = _moves(episodes["centers"], episodes["mask"], 1) < maximum_step
+    return small & ~episodes["fallen"] & visible[:, :-1] & visible[:, 1:]
+
+
+def _moves(values: NDArray[np.float32], mask: NDArray[np.bool_], steps: int) -> NDArray[np.float32]:
+    """How far the object goes in some steps that goes farthest: `[E, S+1, M, ...]`, `[E, M]` -> `[E, S+1 - steps]`."""
+    distance = np.linalg.norm(values[:, steps:] - values[:, :-steps], axis=-1)
+    return np.where(mask[:, None], distance, 0.0).max(axis=-1)

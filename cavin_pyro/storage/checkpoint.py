@@ -78,9 +78,14 @@ class Checkpoint:
         return self._filled("guide", guide)
 
     @cached_property
-    def geometry(self) -> Geometry:
-        """What turns an object's point cloud into its geometric feature, frozen: `pointnet`, or another class."""
+    def geometry(self) -> Geometry | None:
+        """What turns an object's point cloud into its geometric feature, frozen: `pointnet`, or another class.
+
+        None in other worlds than the tabletop.
+        """
         section = self.config.get("geometry") or {}
+        if section.get("_target_", POINTNET) is None:
+            return None
         if section.get("_target_", POINTNET) == POINTNET:
             return self.pointnet
         return self._filled("geometry", checked_geometry(construct(section)))

@@ -13,16 +13,22 @@ from cavin_pyro.storage.checkpoint import POINTNET, checked_geometry, load
 
 
 @user_input(*PARTS)
-def check_fit(model: Model, geometry: Geometry, objects: int | None = None) -> None:
-    """Check that a model takes these features, and says that it is trained on scenes of up to `objects`."""
-    name, features = type(geometry).__name__, geometry.feature_dimension
+def check_fit(
+    model: Model, geometry: Geometry | None, objects: int | None = None, *, features: int | None = None
+) -> None:
+    """Check that a model takes these features, and says that it is trained on scenes of up to `objects`.
+
+    `geometry`: None in other worlds than the tabletop, whose states have `features` numbers of their own.
+    """
+    name = "world" if geometry is None else type(geometry).__name__
     wanted = model.dynamics.geometry
     if wanted is not None and not isinstance(geometry, wanted):
         raise UserError(
             f"{type(model.dynamics).__name__} reads the features of {wanted.__name__}, not of {name}: "
             f"pass geometry={wanted.__name__.lower()}"
         )
-    if model.feature_dimension != features:
+    features = features if geometry is None else geometry.feature_dimension
+    if features is not None and model.feature_dimension != features:
         raise UserError(f"model.feature_dimension={model.feature_dimension}, but the {name}'s features have {features}")
     if objects is not None and model.maximum_objects < objects:
         raise UserError(

@@ -14,18 +14,19 @@ from pyro.infer import ELBO, Trace_ELBO
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from cavin_pyro.config.commands import TrainerConfig, WindowConfig
+from cavin_pyro.config.commands import DEFAULT_CHECKPOINT, TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.options import configured, shown
+from cavin_pyro.config.options import configured, constructor_options, shown
 from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, describe
 from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
-from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.storage.checkpoint import load, read_checkpoint, save
+from cavin_pyro.models.space import Space
+from cavin_pyro.storage.checkpoint import POINTNET, load, read_checkpoint, save
 from cavin_pyro.storage.files import file_digest, output_folder, write_json
 from cavin_pyro.storage.geometry import check_fit, chosen_geometry
 from cavin_pyro.storage.provenance import provenance as of_this_process
@@ -44,17 +45,19 @@ def train(config: DictConfig) -> Trainer:
     with output_folder(config.output) as folder:
         config.device = choose_device(config.device).type
         selection = configured(WindowConfig, config.windows, "windows")
+        data = data_folders(config.data)
+        made = of_world(config, data)
         torch.manual_seed(config.seed)
         model = build_model(config)
         guide = build_guide(config, model)
         objective = build_objective(config, model, guide)
-        geometry, origin = chosen_geometry(config)
-        data = data_folders(config.data)
+        geometry, origin = chosen_geometry(config) if made is None else (None, {})
         started = start_from(config, model, guide, geometry) if config.initial else {}
         train_only(config.trained, model, guide)
         _mirror_signs(config.trainer.reflect, geometry, guide)
         check_same_run(folder, config, ignore=free(config.trainer.schedule))
-        check_fit(model, geometry, max(slots_of(read_metadata(one)) for one in data))
+        most = max(slots_of(read_metadata(one)) for one in data)
+        check_fit(model, geometry, most, features=made["features"] if made else None)
         options = {name: config[name] for name in ("seed", "skip_corrupt")}
         length = config.model.segment_length
         windows = load_windows(data, geometry, selection, segment_length=length, storage=folder, **options)
@@ -94,7 +97,8 @@ def fit(
     run = cavin_pyro.fit(model, guide, windows, steps=2000, learning_rate=1e-3, output="runs/mine")
 
     Args:
-        windows: of data (`cavin_pyro.data.windows.load_windows`) or of arrays (`WindowTable.from_arrays`).
+        windows: of data (`cavin_pyro.data.windows.load_windows`) or of arrays (`WindowTable.from_arrays`, or
+            `from_episodes`).
         objective: a bound of Pyro's or `cavin_pyro.training.objectives.Objective`, by default `Trace_ELBO`.
         geometry: what made the windows' features, for the checkpoint and for `reflect`.
         output: folder for `checkpoint.safetensors`, which `load` and the commands read, and for metrics; by default
@@ -187,6 +191,25 @@ def data_folders(data: str | Sequence[str]) -> list[Path]:
     return [Path(folder) for folder in folders]
 
 
+def of_world(config: DictConfig, folders: Sequence[Path]) -> dict[str, Any] | None:
+    """What datasets say of another world than the tabletop, None of that: its space and sizes become the model's.
+
+    No dataset, datasets of different worlds, or geometric features where there are no clouds are a `UserError`.
+    """
+    space, made = shared_space(folders), read_metadata(folders[0])["configuration"]
+    if space is None:
+        return None
+    if config.geometry.get("_target_") != POINTNET or config.pointnet != DEFAULT_CHECKPOINT:
+        raise UserError(f"data of {made['world']['_target_']} have no point clouds: leave geometry= and pointnet=")
+    config.geometry = {"_target_": None}
+    config.space, config.world = {"_target_": f"{Space.__module__}.Space", **made["space"]}, made["world"]
+    usual = constructor_options(config.model["_target_"])
+    for name, own in (("feature_dimension", made["features"]), ("maximum_objects", made["objects"])):
+        if name in usual and config.model[name] == usual[name].default:  # the user chose no other
+            config.model[name] = own
+    return dict(made)
+
+
 def build_objective(config: Config, model: Model, guide: Guide | None = None) -> Objective:
     """The objective, from the section `objective`; one that model or guide cannot have is a `UserError`."""
     section = config["objective"]
@@ -197,7 +220,7 @@ def build_objective(config: Config, model: Model, guide: Guide | None = None) ->
     return objective
 
 
-def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometry) -> dict[str, Any]:
+def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometry | None) -> dict[str, Any]:
     """Copy the weights of the checkpoint `config.initial` into model and guide; other parts are a `UserError`.
 
     Returns:
@@ -207,7 +230,8 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
     checkpoint = load(config.initial)
     checkpoint.load_into("model", model)
     checkpoint.load_into("guide", guide)
-    if geometry_fingerprint(checkpoint.geometry) != geometry_fingerprint(geometry):
+    theirs, ours = (one and geometry_fingerprint(one) for one in (checkpoint.geometry, geometry))
+    if theirs != ours:
         raise UserError(
             f"checkpoint {checkpoint.path} was trained with other geometric features: give its geometry= or pointnet="
         )
@@ -230,7 +254,8 @@ def _mirror_signs(reflect: bool, geometry: Geometry | None, guide: Guide) -> Ten
     if reflect and signs is None:
         raise UserError(
             f"trainer.reflect needs geometric features whose mirror image is known, and those of "
-            f"{type(geometry).__name__} have none: pass geometry=outline, or leave trainer.reflect"
+            f"{type(geometry).__name__ if geometry else 'these data'} have none: "
+            f"{'pass geometry=outline, or ' if geometry else ''}leave trainer.reflect"
         )
     if reflect and not guide.amortized:
         raise UserError(f"trainer.reflect needs a guide that infers any window, and {type(guide).__name__} does not")

@@ -40,6 +40,7 @@ NOT_RUN = {  # a part of a command, and why it does not run here
     "launcher=ray": "needs a cluster",
     "export=": "needs an extra; tests/cavin_pyro/criticism runs it",
     "cavin_pyro.data export": "needs an extra; tests/cavin_pyro/data runs it",
+    "cavin_pyro.data import": "needs an extra; tests/cavin_pyro/data runs it",
     "reproduce scale=": "trains for minutes; tests/cavin_pyro/reproduction runs it on tiny models",
     "rsync ": "of the shell",
 }
@@ -74,6 +75,8 @@ def small(line: Line) -> Case:
         more = [f"env.{one}" if one.startswith("maximum_steps") else one for one in more if "minimum_move" not in one]
     if "planner=random" in line.options:
         more.remove("planner.samples=8")
+    if "data=data/pusht" in line.options:
+        more.remove("windows.minimum_move=0.001")  # metres
     more += ["device=cpu"] if "device=cuda" in line.options else []
     more += ["planner.compile=false"] if "planner.compile=true" in line.options else []
     return Case(line.command, [*line.options, *more])

@@ -12,7 +12,7 @@ import torch
 
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.dataset import Arrays, write_metadata
+from cavin_pyro.data.dataset import Arrays, read_metadata, write_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.models.networks.pointnet import PointNet
 from tests.cavin_pyro.data.conftest import OBJECTS, STEPS, made_up_episodes, write_dataset
@@ -139,7 +139,7 @@ def test_a_batch_holds_what_the_arrays_hold_from_a_file_without_a_name(tmp_path:
     assert len(set(table.batch(bucket).states.mask.sum(-1).flatten().tolist())) == 1
 
 
-def test_datasets_can_be_joined_if_their_episodes_have_equal_length(tmp_path: Path) -> None:
+def test_datasets_of_longer_and_shorter_episodes_can_be_joined(tmp_path: Path) -> None:
     others = made_up_episodes(5, first=70)
     first, second = write_dataset(tmp_path / "a", made_up_episodes()), write_dataset(tmp_path / "b", others)
     table = load_windows([first, second], PointNet(), EVERY)
@@ -149,10 +149,14 @@ def test_datasets_can_be_joined_if_their_episodes_have_equal_length(tmp_path: Pa
     np.testing.assert_array_equal(joined.actions[1], others["actions"][4, 2:5])
     with pytest.raises(UserError, match="data names the same episodes twice, .* name them once"):
         load_windows([first, second, first], PointNet())
-    counts = {"shards": 1, "episodes": 5, "transitions": 1}
-    write_metadata(second, {"configuration": {"steps": 7, "seed": 0}, **counts})
-    with pytest.raises(UserError, match=r"cannot be joined: .*a has steps=5, .*b has steps=7"):
-        load_windows([first, second], PointNet(), EVERY)
+    ends = {"centers": 5, "clouds": 5, "visible": 5, "actions": 4, "unsafe": 4, "fallen": 4}
+    shorter = {name: array[:, : ends[name]] if name in ends else array for name, array in others.items()}
+    third = write_dataset(tmp_path / "c", shorter | {"length": np.full(5, 4)})
+    write_metadata(third, {**read_metadata(third), "configuration": {"steps": 4, "seed": 1}})
+    table = load_windows([third, first], PointNet(), EVERY)
+    joined = table.batch(torch.tensor([9, 10]))
+    np.testing.assert_array_equal(joined.actions[0], others["actions"][4, 1:4])
+    np.testing.assert_array_equal(joined.actions[1], made_up_episodes()["actions"][0, :3])
 
 
 def test_datasets_without_a_window_are_refused(tmp_path: Path) -> None:

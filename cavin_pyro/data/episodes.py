@@ -1,0 +1,142 @@
+"""Episodes of other worlds than the tabletop: by a world's own policy, or from observations that others made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.world import world_of
+from cavin_pyro.data.dataset import Arrays
+from cavin_pyro.envs.randomness import collection_streams
+from cavin_pyro.envs.world import World
+from cavin_pyro.models.space import Space
+
+
+@dataclass(frozen=True)
+class WorldCollection:
+    """Everything that determines the data of a world's own policy; `world`: its section, `_target_` and options."""
+
+    world: Mapping[Any, Any]
+    seed: int
+    steps: int
+    episodes_per_shard: int
+
+    def stored(self) -> dict[str, Any]:
+        """The configuration in the metadata."""
+        return {**asdict(self), **described(_opened(json.dumps(self.world)), self.world)}
+
+    def shard(self, number: int) -> Arrays:
+        """The arrays of a shard, which its number and the configuration determine."""
+        numbers = range(number * self.episodes_per_shard, (number + 1) * self.episodes_per_shard)
+        world = _opened(json.dumps(self.world))
+        return packed([collected(world, self.seed, one, self.steps) for one in numbers], numbers, self.steps)
+
+
+@cache
+def _opened(section: str) -> World:
+    """One per worker process; `section` as JSON."""
+    world = world_of({"world": json.loads(section)})
+    assert world is not None
+    return world
+
+
+def described(world: World, section: Mapping[Any, Any]) -> dict[str, Any]:
+    """What a dataset's metadata say of its world, as plain data."""
+    own = {name: value for name, value in section.items() if name != "default_checkpoint"}
+    about = {"world": own, "space": asdict(world.space), "objects": world.objects, "features": world.features}
+    return dict(json.loads(json.dumps(about)))
+
+
+@user_input("env")
+def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
+    """One episode by the world's policy, of at most `steps`; it ends where the world ends it.
+
+    Raises:
+        UserError: the world has no policy, its action leaves the box, or as `recorded`.
+    """
+    scene, choices = collection_streams(seed, number)
+    policy, world.maximum_steps = world.policy(choices), steps  # an episode of data is no attempt at a goal
+    observation, _ = world.reset(seed=int(scene.integers(2**32)))
+    states, actions, ended = [world.state(observation)], list[Any](), False
+    while len(actions) < steps and not ended:
+        actions.append(np.array(policy.act(observation), np.float32))
+        observation, _, terminated, truncated, _ = world.step(actions[-1])
+        states.append(world.state(observation))
+        ended = terminated or truncated
+    return _of_states(world, states, actions)
+
+
+@user_input("env")
+def recorded(world: World, observations: Sequence[Any], actions: ArrayLike) -> Arrays:
+    """An episode of S `actions` `[S, A]` as the world reads its S + 1 observations.
+
+    Raises:
+        UserError: the world cannot read one, a state or an action has another shape than the world says, numbers that
+            are not finite, or an action out of the box.
+    """
+    return _of_states(world, [world.state(one) for one in observations], actions)
+
+
+def _of_states(world: World, states: Sequence[Any], actions: Any) -> Arrays:
+    centers, features, masks = (torch.stack(parts) for parts in zip(*states, strict=True))
+    if (masks != masks[0]).any():
+        raise ValueError("its state's mask changes within an episode: pad objects that are not there from the start")
+    sizes = {"objects": world.objects, "feature_dimension": world.features}
+    return checked_episode(world.space, centers, features, actions, masks[0], **sizes)
+
+
+def checked_episode(
+    space: Space,
+    centers: Any,
+    features: Any,
+    actions: Any,
+    mask: Any = None,
+    *,
+    objects: int | None = None,
+    feature_dimension: int | None = None,
+) -> Arrays:
+    """An episode `[S + 1, M, P]`, `[S + 1, M, F]`, `[S, A]` and `[M]`, whose shapes and numbers are a space's.
+
+    A `UserError` says what is not.
+    """
+    motions = checked("actions", actions, torch.float32, (None, space.actions))
+    if len(motions) and (largest := float(motions.abs().max())) > 1:
+        raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
+    places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
+    others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
+    real = checked("mask", mask, torch.bool, (places.shape[1],))
+    made = {"centers": places, "features": others, "actions": motions, "mask": real}
+    return {name: tensor.numpy() for name, tensor in made.items()}
+
+
+def checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | None]) -> Tensor:
+    """The array as a tensor of this shape, in which None stands for any size; without an array, ones."""
+    given: Any = np.ones([size or 0 for size in shape], bool) if array is None else array
+    tensor = torch.as_tensor(np.array(given) if isinstance(given, list) else given, dtype=dtype)
+    fits = tensor.dim() == len(shape)
+    if not fits or any(want not in (None, have) for have, want in zip(tensor.shape, shape, strict=True)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise UserError(f"{name} has shape {[*tensor.shape]}, and must have [{wanted}]")
+    if not tensor.isfinite().all():
+        raise UserError(f"{name} has numbers that are not finite: leave them out")
+    return tensor
+
+
+def packed(episodes: Sequence[Arrays], numbers: Sequence[int], steps: int) -> Arrays:
+    """The arrays of a shard (`cavin_pyro.data.dataset.WORLD_ARRAYS`), in which episodes are padded to `steps`."""
+    arrays: Arrays = {"mask": np.stack([one["mask"] for one in episodes])}
+    for name, size in (("centers", steps + 1), ("features", steps + 1), ("actions", steps)):
+        ends = [((0, size - len(one[name])), *[(0, 0)] * (one[name].ndim - 1)) for one in episodes]
+        arrays[name] = np.stack([np.pad(one[name], end) for one, end in zip(episodes, ends, strict=True)])
+    arrays["length"] = np.array([len(one["actions"]) for one in episodes], np.int64)
+    arrays["episode"] = np.array(numbers, np.int64)
+    return arrays
