@@ -30,6 +30,19 @@ class Policy(Protocol):
         """The next action `[A]` in [-1, 1]."""
 
 
+class RandomBursts:
+    """Random actions `[size]`, each held for some steps, 4 on average, and one in eight numbers at the box's border."""
+
+    def __init__(self, generator: np.random.Generator, size: int) -> None:
+        self._generator, self._action = generator, generator.uniform(-1.0, 1.0, size)
+
+    def act(self, observation: Any) -> NDArray[np.float64]:
+        """See `Policy`."""
+        if self._generator.random() < 0.25:
+            self._action = self._generator.uniform(-1.15, 1.15, self._action.shape).clip(-1.0, 1.0)
+        return self._action
+
+
 class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     """An environment of Gymnasium that models can learn and planners can act in.
 
@@ -40,7 +53,7 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     features    F, numbers of an object's feature. objects: M
     state       of an observation
     goal        of the current episode
-    policy      that collects; a world whose data come from elsewhere has none
+    policy      that collects; by default random actions, each for a while
     pixels      where positions lie in the picture of `render`, for drawings; None: they are drawn on axes
 
     A caller may set `render_mode`, and `on_frame`, which a world may call during a step, to film it.
@@ -69,12 +82,8 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
         return state.centers.numpy(), state.mask.numpy()
 
     def policy(self, generator: np.random.Generator) -> Policy:
-        """What collects an episode; `generator`: all of its randomness.
-
-        Raises:
-            ValueError: this world collects none.
-        """
-        raise ValueError(f"{type(self).__name__} has no policy that collects: train on data from elsewhere")
+        """What collects an episode, by default `RandomBursts`; `generator`: all of its randomness."""
+        return RandomBursts(generator, self.space.actions)
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64] | None:
         """Columns and rows `[..., 2]` of positions `[..., P]` in the picture of `render`."""
@@ -158,10 +167,10 @@ def executed(action: NDArray[np.floating], decimals: int | None = 3) -> NDArray[
 
 
 def check_world(world: World) -> None:
-    """Begin an episode, and check what the world says of it.
+    """Begin an episode, make a step, and check what the world says of them.
 
     Raises:
-        ValueError: its actions, a state or its goal have another shape than the world declares.
+        ValueError: its actions, a state or its goal have another shape than the world declares, or other numbers.
     """
     name, space = type(world).__name__, world.space
     box = world.action_space
@@ -169,18 +178,18 @@ def check_world(world: World) -> None:
         raise ValueError(f"{name}: its space has {space.actions} numbers in an action, and its action_space is {box}")
     if not (np.all(box.low == -1) and np.all(box.high == 1)):
         raise ValueError(f"{name}: its action_space must be a box from -1 to 1, not {box}")
-    observation, _ = world.reset(seed=0)
-    state, M = world.state(observation), world.objects
-    shapes = [(M, space.positions), (M, world.features), (M,)]
-    if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
-        found = [list(field.shape) for field in state]
-        raise ValueError(f"{name}: a state must have centers, features and mask of {shapes}, not {found}")
+    state = world.state(world.reset(seed=0)[0])
+    _check_state(world, state)
+    observation, *_, info = world.step(np.zeros(space.actions, np.float32))
+    _check_state(world, world.state(observation))
+    if "success" not in info:
+        raise ValueError(f"{name}: info of a step must have success, and has {', '.join(info) or 'nothing'}")
     plans = 5
     one = state.map(lambda field: field.expand(plans, *field.shape))
     goal = world.goal()
     values = one.values(goal.reads_features)
     outcome = goal(values, values, one.mask)
-    for field in ("reward", "success", "failure"):
+    for field in ("success", "failure", "reward"):  # the reward is made of the others
         value = getattr(outcome, field)
         if (
             not isinstance(value, Tensor)
@@ -189,3 +198,20 @@ def check_world(world: World) -> None:
         ):
             shape = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
             raise ValueError(f"{name}: for states [{plans}] its goal must give {field} [{plans}], not {shape}")
+
+
+def _check_state(world: World, state: State) -> None:
+    name, space, M = type(world).__name__, world.space, world.objects
+    shapes = [(M, space.positions), (M, world.features), (M,)]
+    if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
+        found = [list(field.shape) for field in state]
+        raise ValueError(f"{name}: a state must have centers, features and mask (bool) of {shapes}, not {found}")
+    for part, values in (("centers", state.centers), ("features", state.features)):
+        if values.dtype != torch.float32 or not values.isfinite().all():
+            raise ValueError(f"{name}: {part} must be finite float32 numbers, not {values.dtype} {values.tolist()}")
+    if not torch.allclose(space.project(state.features), state.features, atol=1e-3):
+        unit = "all numbers" if space.unit_features is None else f"the first {space.unit_features}"
+        raise ValueError(
+            f"{name}: {unit} of a feature must be a vector of length 1 (unit_features of the space), "
+            f"not {state.features.tolist()}"
+        )

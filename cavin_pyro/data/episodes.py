@@ -61,7 +61,7 @@ def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
     """One episode by the world's policy, of at most `steps`; it ends where the world ends it.
 
     Raises:
-        UserError: the world has no policy, its action leaves the box, or as `recorded`.
+        UserError: an action of the policy leaves the box, or as `recorded`.
     """
     scene, choices = collection_streams(seed, number)
     policy, world.maximum_steps = world.policy(choices), steps  # an episode of data is no attempt at a goal
