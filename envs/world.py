@@ -31,7 +31,7 @@ class Policy(Protocol):
 
 
 class RandomBursts:
-    """Random actions `[size]`, each held for some steps, 4 on average, and one in eight numbers at the box's border."""
+    """Random actions `[size]`, each held for some steps, 4 on average, and one in four numbers at the box's border."""
 
     def __init__(self, generator: np.random.Generator, size: int) -> None:
         self._generator, self._action = generator, generator.uniform(-1.0, 1.0, size)
@@ -39,7 +39,7 @@ class RandomBursts:
     def act(self, observation: Any) -> NDArray[np.float64]:
         """See `Policy`."""
         if self._generator.random() < 0.25:
-            self._action = self._generator.uniform(-1.15, 1.15, self._action.shape).clip(-1.0, 1.0)
+            self._action = self._generator.uniform(-1.3, 1.3, self._action.shape).clip(-1.0, 1.0)
         return self._action
 
 

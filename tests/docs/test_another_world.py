@@ -18,14 +18,14 @@ def test_each_world_has_at_most_60_lines() -> None:
     assert len(FILES) == 3 and max(map(len, (text.splitlines() for text in FILES.values()))) <= 60
 
 
-@pytest.mark.parametrize(("name", "options"), [("Pendulum", {"hanging": False}), ("Point", {})])
+@pytest.mark.parametrize(("name", "options", "steps"), [("Pendulum", {"hanging": False}, 1000), ("Point", {}, 600)])
 def test_a_world_is_learned_and_its_goals_are_reached(
-    name: str, options: dict[str, bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, options: dict[str, bool], steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for file, text in FILES.items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     world, learn = getattr(importlib.import_module(name.lower()), name), importlib.import_module("learn")
-    planner = learn.planner_of(learn.learned(world(**options)))
+    planner = learn.planner_of(learn.learned(world(**options), steps=steps))
     outcomes = [cavin_pyro.rollout(world(), planner, seed=seed, pushes_per_plan=None).outcome for seed in range(3)]
     assert outcomes == ["success"] * 3
