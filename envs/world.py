@@ -85,6 +85,10 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
         """What collects an episode, by default `RandomBursts`; `generator`: all of its randomness."""
         return RandomBursts(generator, self.space.actions)
 
+    def render(self) -> Any:
+        """A picture `[height, width, 3]`; by default this world has none, and no video."""
+        return
+
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64] | None:
         """Columns and rows `[..., 2]` of positions `[..., P]` in the picture of `render`."""
         return None

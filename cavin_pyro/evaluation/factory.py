@@ -126,7 +126,8 @@ def make_env(config: DictConfig | None = None, *, render: bool = False, **option
     """
     config = compose("plan", **options) if config is None else config
     if (world := world_of(config)) is not None:
-        world.render_mode = "rgb_array" if render else None
+        pictures = render and type(world).render is not World.render
+        world.render_mode = "rgb_array" if pictures else None
         return world
     task, tiles = task_of(config)
     with user_input():
