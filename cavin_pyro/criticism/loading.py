@@ -17,7 +17,7 @@ from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import configured
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
-from cavin_pyro.data.dataset import content_records, read_metadata
+from cavin_pyro.data.dataset import content_record, read_metadata
 from cavin_pyro.data.windows import WindowTable, load_windows
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
@@ -181,29 +181,25 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     """Whether a checkpoint was trained on a dataset, by the fingerprints in its provenance.
 
     Returns:
-        `folder`, `transitions`, `seed`, `fingerprint` (several of a merged dataset); `same`: true or false, None where
-        it cannot be told; `verdict`.
+        `folder`, `transitions`, `seed`, `fingerprint`; `same`: true or false, None where it cannot be told; `verdict`.
 
     Raises:
         UserError: no dataset.
     """
-    records, entries = content_records(folder), trained.get("data")
+    record, entries = content_record(folder), trained.get("data")
     entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
     known = {entry["fingerprint"] for entry in entries if "fingerprint" in entry}
-    seen = [record["fingerprint"] in known for record in records]
     if not known:
         same, verdict = None, "the checkpoint does not say what it was trained on"
-    elif all(seen):
+    elif record["fingerprint"] in known:
         same, verdict = True, "the model was trained on these"
-    elif any(seen):
-        same, verdict = None, "the model was trained on some of these"
     else:
         same, verdict = False, "the model was trained on other data, on none of these episodes"
     return {
         "folder": str(folder),
         "transitions": read_metadata(folder)["transitions"],
-        "seed": ", ".join(str(record["configuration"].get("seed")) for record in records),
-        "fingerprint": ", ".join(record["fingerprint"] for record in records),
+        "seed": str(record["configuration"].get("seed")),
+        "fingerprint": record["fingerprint"],
         "same": same,
         "verdict": verdict,
     }

@@ -26,7 +26,7 @@ from cavin_pyro.criticism.loading import CheckContext, Loaded, context_of, load_
 from cavin_pyro.criticism.pushing import MOVED
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.data.collection import CollectionConfig
-from cavin_pyro.data.dataset import content_records
+from cavin_pyro.data.dataset import content_record
 from cavin_pyro.models.likelihoods import PredictedScales
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
@@ -79,7 +79,7 @@ def write_calibrated(folder: Path, config: DictConfig, loaded: Loaded, measured:
         "parts": list(config.parts),
         **{name: config[name] for name in OPTIONS},
         "checkpoint": file_digest(checkpoint.path),
-        "data": [one["fingerprint"] for data in loaded.folders for one in content_records(data)],
+        "data": [content_record(data)["fingerprint"] for data in loaded.folders],
         **measured,
     }
     earlier = checkpoint.provenance.get("calibrated")

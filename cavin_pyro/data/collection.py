@@ -275,8 +275,6 @@ def _begin(config: Collection, folder: Path) -> dict[str, Any]:
             **dict.fromkeys(dataset.COUNTS, 0),
         }
     metadata = dataset.read_metadata(folder)
-    if "sources" in metadata:
-        raise UserError(f"{folder} holds a merged dataset, which cannot grow: choose another output=DIR")
     stored = metadata["configuration"]
     for name, value in wanted.items():
         if stored.get(name) != value:

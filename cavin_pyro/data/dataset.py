@@ -14,9 +14,6 @@ checksums find a shard that was damaged later. Letters: E episodes, S pushes, M 
 Episodes of another world have no clouds, and of each object a feature in their place (`WORLD_ARRAYS`). Their
 metadata hold its `space`, so that training needs no simulator. Letters: P numbers of a position, F of a feature, A of
 an action.
-
-A merged dataset has the shards of several collections one after another. What these have in common is in
-`configuration`; what each has for itself, its seed above all, is in its entry of `sources`.
 """
 
 from __future__ import annotations
@@ -116,8 +113,8 @@ class CorruptShardError(UserError):
 
     def __str__(self) -> str:
         return (
-            f"{self.args[0]}: run its python -m cavin_pyro.collect again with repair=true, or merge again what was "
-            "merged, or train on the rest with skip_corrupt=true"
+            f"{self.args[0]}: run its python -m cavin_pyro.collect again with repair=true, "
+            "or train on the rest with skip_corrupt=true"
         )
 
 
@@ -180,8 +177,6 @@ def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str
         yield f"array length: {arrays['length'].max()} pushes in an episode of {arrays['actions'].shape[1]}"
     if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= len(metadata["shape_names"]):
         yield f"array shape: object {arrays['shape'].max()} of {len(metadata['shape_names'])} in metadata.json"
-    if {"mask", "visible"} <= set(arrays) and (arrays["visible"] & ~arrays["mask"][:, None]).any():
-        yield "array visible: an object that mask denies is visible"
 
 
 def check_file(file: h5py.File, configuration: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
@@ -282,7 +277,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     try:
         _check_metadata(metadata, files=sum(1 for _ in folder.glob("episodes-*.h5")))
     except ValueError as error:
-        raise UserError(f"{path} is damaged: {error}; collect the dataset again, or merge it again") from error
+        raise UserError(f"{path} is damaged: {error}; collect the dataset again") from error
     return metadata
 
 
@@ -300,21 +295,12 @@ def _check_metadata(metadata: Mapping[str, Any], *, files: int) -> None:
         raise ValueError(f"{shards} files have not {episodes} episodes with {transitions} pushes")
     if shards > files + 1000:  # fewer that are missing are named one by one when the rest is used
         raise ValueError(f"it counts {shards} files of episodes, but {files} are there")
-    sources = metadata.get("sources", [metadata])
-    if not isinstance(sources, list) or not sources:
-        raise ValueError("its sources must be a list of collections")
-    for source in sources:
-        _check_collection(source)
-        if type(seed_of(source)) is not (str if "sha256" in source["configuration"] else int):
-            raise ValueError("seed must be a whole number")
-    if "sources" in metadata:
-        totals = [sum(source[name] for source in sources) for name in COUNTS]
-        if totals != [shards, episodes, transitions] or len({seed_of(source) for source in sources}) < len(sources):
-            raise ValueError("its sources do not add up to the dataset")
+    if type(seed_of(metadata)) is not (str if "sha256" in configuration else int):
+        raise ValueError("seed must be a whole number")
 
 
 def _check_collection(metadata: Any) -> None:
-    """Check the counts of a dataset or of one of its sources, and what of its configuration is counted with."""
+    """Check the counts of a dataset, and what of its configuration is counted with."""
     configuration = metadata.get("configuration") if isinstance(metadata, dict) else None
     if not isinstance(configuration, dict) or not all(map(_is_count, (metadata.get(name) for name in COUNTS))):
         raise ValueError("configuration or counts are missing")
@@ -336,53 +322,32 @@ def _is_count(value: Any) -> bool:
     return type(value) is int and value >= 1
 
 
-def sources_of(metadata: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The collections in a dataset, each with `configuration`, `made_by`, `shards`, `episodes` and `transitions`."""
-    if "sources" in metadata:
-        return list(metadata["sources"])
-    return [{name: metadata.get(name) for name in ("configuration", "made_by", *COUNTS)}]
-
-
-def source_of_shards(metadata: Mapping[str, Any]) -> list[int]:
-    """For every shard of a dataset, the number of the collection that it is from."""
-    return [number for number, source in enumerate(sources_of(metadata)) for _ in range(source["shards"])]
-
-
-def seed_of(source: Mapping[str, Any]) -> Any:
+def seed_of(metadata: Mapping[str, Any]) -> Any:
     """The root seed of a collection; of imported episodes the SHA-256 of what they were read from."""
-    return source["configuration"].get("sha256", source["configuration"].get("seed"))
+    return metadata["configuration"].get("sha256", metadata["configuration"].get("seed"))
 
 
 def slots_of(metadata: Mapping[str, Any]) -> int:
-    """M, for how many objects the files of a dataset have room; of a merged one, the widest."""
-    if "space" in metadata["configuration"]:
-        return int(metadata["configuration"]["objects"])
-    most = (source["configuration"].get("maximum_objects", OBJECT_SLOTS) for source in sources_of(metadata))
-    return max(map(object_slots, most))
+    """M, for how many objects the files of a dataset have room."""
+    configuration = metadata["configuration"]
+    if "space" in configuration:
+        return int(configuration["objects"])
+    return object_slots(configuration.get("maximum_objects", OBJECT_SLOTS))
 
 
-def content_records(folder: Path) -> list[dict[str, Any]]:
-    """What identifies a dataset's content: a record for each collection in it, which is one unless it was merged.
+def content_record(folder: Path) -> dict[str, Any]:
+    """What identifies a dataset's content: `transitions`, `episodes`, `configuration`, `made_by` and `fingerprint`.
 
-    Each has `transitions`, `episodes`, `configuration`, `made_by`, and the `fingerprint` of the first shard's bytes:
-    twelve hexadecimal digits, equal for equal configuration, program and simulator.
+    The fingerprint is of the first shard's bytes: twelve hexadecimal digits, equal for equal configuration, program and
+    simulator.
 
     Raises:
-        UserError: no dataset, or one of these shards cannot be read.
+        UserError: no dataset, or this shard cannot be read.
     """
+    metadata = read_metadata(folder)
     names = ("transitions", "episodes", "configuration", "made_by")
-    return [
-        {**{name: source[name] for name in names}, "fingerprint": shard_digest(path)[:12]}
-        for source, path in _first_shards(folder)
-    ]
-
-
-def _first_shards(folder: Path) -> Iterator[tuple[dict[str, Any], Path]]:
-    """Each collection in a dataset, and the path of its first shard."""
-    first = 0
-    for source in sources_of(read_metadata(folder)):
-        yield source, shard_path(folder, first)
-        first += source["shards"]
+    known = {name: metadata.get(name) for name in names}
+    return {**known, "fingerprint": shard_digest(shard_path(folder, 0))[:12]}
 
 
 def shard_digest(path: Path) -> str:
@@ -401,23 +366,23 @@ def check_distinct(folders: Sequence[Path]) -> None:
     """Check that no dataset is given twice, so that no episode counts twice and none is in training and validation.
 
     Raises:
-        UserError: two begin with the same shard, or have parts that do.
+        UserError: two begin with the same shard.
     """
     known: dict[str, Path] = {}
     for folder in folders:
-        for _, path in _first_shards(folder):
-            content = file_digest(path) if path.exists() else str(path.resolve())
-            if content in known:
-                raise UserError(f"data names the same episodes twice, {known[content]} and {folder}: name them once")
-            known[content] = folder
+        path = shard_path(folder, 0)
+        content = file_digest(path) if path.exists() else str(path.resolve())
+        if content in known:
+            raise UserError(f"data names the same episodes twice, {known[content]} and {folder}: name them once")
+        known[content] = folder
 
 
-def repeated_episode(known: set[tuple[int, int]], source: int, episodes: NDArray[np.int64]) -> str | None:
-    """What a shard repeats of the `known` (source, number), such as "repeats episode 3"; its own are added."""
+def repeated_episode(known: set[int], episodes: NDArray[np.int64]) -> str | None:
+    """What a shard repeats of the `known` numbers, such as "repeats episode 3"; its own are added."""
     for number in episodes.tolist():
-        if (source, number) in known:
+        if number in known:
             return f"repeats episode {number}"
-        known.add((source, number))
+        known.add(number)
     return None
 
 
@@ -430,8 +395,8 @@ def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = F
     Raises:
         UserError: no dataset, a corrupt shard, one that repeats an episode of another, or none that is whole.
     """
-    metadata, known, whole = read_metadata(folder), set[tuple[int, int]](), 0
-    for number, source in enumerate(source_of_shards(metadata)):
+    metadata, known, whole = read_metadata(folder), set[int](), 0
+    for number in range(metadata["shards"]):
         path = shard_path(folder, number)
         try:
             arrays = read_shard(path, ("episode", *names), metadata=metadata)
@@ -440,7 +405,7 @@ def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = F
                 raise
             print(f"left out: {error.args[0]}", flush=True)
             continue
-        if repetition := repeated_episode(known, source, arrays["episode"]):
+        if repetition := repeated_episode(known, arrays["episode"]):
             raise UserError(f"shard {path} {repetition}: delete it and collect again with repair=true to rebuild it")
         whole += 1
         yield number, arrays

@@ -116,13 +116,12 @@ def _episodes(folder: Path) -> Iterator[Any]:
     from minari.data_collector import EpisodeBuffer
 
     metadata = dataset.read_metadata(folder)
-    seeds = [dataset.seed_of(source) for source in dataset.sources_of(metadata)]
-    sources = dataset.source_of_shards(metadata)
+    seed = dataset.seed_of(metadata)
     with progress_bar("exporting", total=metadata["episodes"], unit="episode") as bar:
-        for number, shard in dataset.iterate_shards(folder, tuple(dataset.ARRAYS)):
+        for _, shard in dataset.iterate_shards(folder, tuple(dataset.ARRAYS)):
             arrays = dataset.padded(shard, dataset.slots_of(metadata))
             for index in range(len(arrays["length"])):
-                options = {"root_seed": seeds[sources[number]], "episode": int(arrays["episode"][index])}
+                options = {"root_seed": seed, "episode": int(arrays["episode"][index])}
                 options |= {name: arrays[name][index] for name in OBJECTS}
                 yield EpisodeBuffer(options=options, **_episode({name: one[index] for name, one in arrays.items()}))
                 bar.update()

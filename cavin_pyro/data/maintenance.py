@@ -37,13 +37,13 @@ def find_defects(folder: Path) -> Iterator[str]:
         UserError: no dataset, or metadata that cannot be used.
     """
     metadata = dataset.read_metadata(folder)
-    known, lengths = set[tuple[int, int]](), list[int]()
+    known, lengths = set[int](), list[int]()
     beside = [one for one in sorted(folder.glob("features-*")) if one.is_dir()]
     with progress_bar("verifying", total=metadata["shards"], unit="file") as bar:
-        for number, source in enumerate(dataset.source_of_shards(metadata)):
+        for number in range(metadata["shards"]):
             path, arrays = dataset.shard_path(folder, number), Arrays()
             found = [*dataset.find_damage(path, dataset.arrays_of(metadata), metadata, arrays)]
-            if "episode" in arrays and (repetition := dataset.repeated_episode(known, source, arrays["episode"])):
+            if "episode" in arrays and (repetition := dataset.repeated_episode(known, arrays["episode"])):
                 found.append(f"it {repetition}")
             yield from (f"{path}: {defect}" for defect in found)
             for features in (one / path.name for one in beside if (one / path.name).exists()):

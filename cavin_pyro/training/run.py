@@ -19,7 +19,7 @@ from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import configured, constructor_options, shown
 from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, describe
-from cavin_pyro.data.dataset import content_records, read_metadata, slots_of
+from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
 from cavin_pyro.guides.guide import Guide
@@ -61,7 +61,7 @@ def train(config: DictConfig) -> Trainer:
         options = {name: config[name] for name in ("seed", "skip_corrupt")}
         length = config.model.segment_length
         windows = load_windows(data, geometry, selection, segment_length=length, storage=folder, **options)
-        record = {"data": [record for one in data for record in content_records(one)], **origin}
+        record = {"data": [content_record(one) for one in data], **origin}
         record |= {"training_windows": len(windows.training), "validation_windows": len(windows.validation)}
         return fit(
             model,

@@ -21,7 +21,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
 from cavin_pyro.criticism.loading import CheckContext, compare_data, load_context, trained_windows
 from cavin_pyro.criticism.section import Section, Verdict
-from cavin_pyro.data.dataset import content_records
+from cavin_pyro.data.dataset import content_record
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.storage.checkpoint import load, save
@@ -125,7 +125,7 @@ def test_windows_are_those_that_training_held_out_and_all_their_terms_count(
 
 
 def test_a_report_says_whether_the_model_was_trained_on_the_data(pushes: Path) -> None:
-    fingerprint = content_records(pushes)[0]["fingerprint"]
+    fingerprint = content_record(pushes)["fingerprint"]
     cases = {True: [{"fingerprint": "0"}, {"fingerprint": fingerprint}], False: [{"fingerprint": "0"}], None: []}
     for same, entries in cases.items():
         assert compare_data(pushes, {"data": entries})["same"] is same

@@ -38,7 +38,6 @@ def test_a_whole_dataset_has_no_defect(data: Callable, own_pushes: Path) -> None
         ({"shape": lambda one: one + 90}, [" of 10 in metadata.json"]),
         ({"episode": lambda one: one - 4}, ["it repeats episode 0"]),
         ({"length": lambda one: one + 7}, ["pushes in an episode of 6", "metadata.json: counts"]),
-        ({"visible": np.ones_like}, ["array visible: an object that mask denies is visible"]),
     ],
 )
 def test_each_defect_is_a_line(changes: dict[str, Any], said: list[str], data: Callable, own_pushes: Path) -> None:

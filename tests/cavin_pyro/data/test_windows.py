@@ -223,7 +223,7 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"actions": np.zeros((6, 3, 4))}, r"^centers has shape \[6, 3, 3, 3\], and must have \[6, 4, any, 3\]$"),
+        ({"actions": np.zeros((6, 3, 4))}, r"^centers has shape \[6, 3, 3, 3\], and must have \[6, 4, any, any\]$"),
         ({"mask": np.ones((6, 3))}, r"^mask has shape \[6, 3\], and must have \[6, 3, 3\]$"),
         ({"features": np.full((6, 3, 3, 64), np.nan)}, "^features has numbers that are not finite"),
         ({"episodes": [1] * 6}, "^windows of 1 episodes"),
