@@ -188,6 +188,8 @@ def planner_of(
         raise UserError(f"{planner_name(config)} needs a model: give one, or choose planner=random")
     pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
     _check_planner(options, model.to(device))
+    if options.get("feature_weight", 0.0) is None:  # features count as much as positions, by the likelihood's scales
+        options["feature_weight"] = (model.space.center_scale / model.space.feature_scale) ** 2
     if options.get("compile") is True and device.type == "cuda":
         options["compile"] = GRAPHS
     torch.manual_seed(config.seed)
