@@ -12,11 +12,10 @@ from cavin_pyro.planning.baselines import (
     RandomPlanner,
     SectarPlanner,
 )
-from cavin_pyro.planning.cavin import MOTION_HORIZONS, CavinPlanner
+from cavin_pyro.planning.cavin import CavinPlanner
 from cavin_pyro.planning.protocol import Plan, Planner, PlanningModel, Reward, RewardFunction, StepOutcome
 
 __all__ = [
-    "MOTION_HORIZONS",
     "Addition",
     "CavinPlanner",
     "CavinWithoutEffectsPlanner",

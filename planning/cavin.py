@@ -18,8 +18,6 @@ from cavin_pyro.planning.rollout import Candidates, Focus, actions_of, predict_s
 from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 
-MOTION_HORIZONS = ("full_horizon", "first_segment")
-
 
 class CavinPlanner(SearchingPlanner):
     """First *what* to achieve (effect codes, ranked by reward), then *how* (motion codes, ranked by tracking cost).
@@ -28,7 +26,7 @@ class CavinPlanner(SearchingPlanner):
     motion_share: motions to sample at line 8, as a share of N (paper: 1).
     motion_optimizer: searches motion codes instead of `optimizer`; None takes the same.
     motion_horizon: motions are planned for all K segments, `full_horizon` (paper), or for the executed `first_segment`.
-    feature_weight: of squared distances between features, in the distance to subgoals; 0: centres only.
+    feature_weight: of squared feature distances to subgoals; 0 (paper): centres only; null: by the scales of the space.
     options: of `cavin_pyro.planning.searching.SearchingPlanner`, whose optimizer searches codes at both levels.
     Raises ValueError for counts below 1, a horizon that T does not divide, unknown names, and a negative weight.
     """
@@ -45,24 +43,24 @@ class CavinPlanner(SearchingPlanner):
         *,
         motion_share: float = 1.0,
         motion_optimizer: str | Optimizer | None = None,
-        feature_weight: float = 0.0,
+        feature_weight: float | None = 0.0,
         **options: Any,
     ) -> None:
         super().__init__(model, samples, horizon, **options)
         self.model: PlanningModel = model
-        check_choice("motion_horizon", motion_horizon, MOTION_HORIZONS)
-        check_weight("feature_weight", feature_weight)
+        check_choice("motion_horizon", motion_horizon, ("full_horizon", "first_segment"))
+        self.feature_weight = feature_weight or 0.0
+        check_weight("feature_weight", self.feature_weight)
         check_fraction("motion_share", motion_share, positive=True)
         self.motion_samples = max(1, int(motion_share * samples))
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
         )
         self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
-        self.feature_weight = feature_weight
 
     def plan_scene(self, scene: Query) -> Plan:
         """Algorithm 1 for observed scenes `scene.state: [B]`."""
-        # Line 1 (K = H / T) is in the constructor; lines 2, 3 and 12, the loop over t, are the caller's. Line 4: s_t.
+        # Line 1, K = H / T, is in the constructor; lines 2, 3 and 12 are the caller's. Line 4: s_t.
         s_t, focus = scene.state, self.added("focus", Focus(), scene)
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
@@ -86,8 +84,9 @@ class CavinPlanner(SearchingPlanner):
         # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
         distance = self.added("subgoal_distance", SubgoalDistance(self.feature_weight), scene, self.motion_segments)
         tracking_cost = self.added("wrap_objective", TrackingCost(subgoals, effect.segments, distance), scene, effect)
+        space = MotionSpace(self.model, c_star, focus, self.decimals, scene.reward.reads_features)
         motions = self.search(
-            MotionSpace(self.model, c_star, focus, self.decimals, scene.reward.reads_features),
+            space,
             tracking_cost,
             scene,
             optimizer=self.motion_optimizer,

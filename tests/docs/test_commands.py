@@ -31,7 +31,7 @@ SMALL = {  # options that make each command a matter of a second
     "check": "windows=2 sections=[elbo]",
     "reproduce": "",
 }
-OTHER_WORLD = r"env\._target_=|data/pendulum"  # which refuses options of the tabletop
+OTHER_WORLD = r"env\._target_=|data/pendulum|pusht"  # which refuses options of the tabletop
 NOT_RUN = {  # a part of a command, and why it does not run here
     "make ": "installs and tests everything",
     "source ": "of the shell",
@@ -72,12 +72,8 @@ def small(line: Line) -> Case:
     more = SMALL[line.command].split()
     given = {option.partition("=")[0] for option in line.options}
     more = [option for option in more if not (option.startswith("seed=") and "seed" in given)]
-    if "env" in given or any("pusht" in option for option in line.options):  # another world has its own options
-        more = [f"env.{one}" if one.startswith("maximum_steps") else one for one in more if "minimum_move" not in one]
     if "planner=random" in line.options:
         more.remove("planner.samples=8")
-    if "data=data/pusht" in line.options:
-        more.remove("windows.minimum_move=0.001")  # metres
     if re.search(OTHER_WORLD, " ".join(line.tokens)):
         more = [option for option in more if not option.startswith(("maximum_steps=", "windows.minimum_move="))]
     more += ["device=cpu"] if "device=cuda" in line.options else []
