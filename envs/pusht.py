@@ -123,6 +123,7 @@ class PushT(World):
         center_scale=2.0,
         feature_scale=0.03,
         action_scales=(0.05,),
+        unit_features=2,
         turning=True,
         frequencies=4,
     )

@@ -77,7 +77,7 @@ class CavinPlanner(SearchingPlanner):
 
     def plan_motions(self, scene: Query, focus: Focus, effects: Candidates, i: Tensor) -> Plan:
         """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
-        chosen, T = effects.take(i.unsqueeze(-1)), self.segment_length
+        chosen, T, N = effects.take(i.unsqueeze(-1)), self.segment_length, self.motion_samples
         c_star, subgoals = chosen.codes[:, 0], focus.among(scene.state, chosen.states.map(lambda field: field[:, 0]))
         effect = ChosenEffect(subgoals, chosen.progress.segments[:, 0], chosen.progress.succeeded[:, 0])
 
@@ -86,12 +86,7 @@ class CavinPlanner(SearchingPlanner):
         tracking_cost = self.added("wrap_objective", TrackingCost(subgoals, effect.segments, distance), scene, effect)
         space = MotionSpace(self.model, c_star, focus, self.decimals, scene.reward.reads_features)
         motions = self.search(
-            space,
-            tracking_cost,
-            scene,
-            optimizer=self.motion_optimizer,
-            segments=self.motion_segments,
-            samples=self.motion_samples,
+            space, tracking_cost, scene, optimizer=self.motion_optimizer, segments=self.motion_segments, samples=N
         )
 
         # Line 10: choose z* and its actions a*, which lead to the states closest to the subgoals.

@@ -20,7 +20,6 @@ CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of
     "mpc": ("dynamics", "none"),
 }
 DEFAULT_CHECKPOINT = "cavin"
-PLANNERS_CHECKPOINT = "${oc.select:world.default_checkpoint,${oc.select:planner.default_checkpoint,cavin}}"
 PAPER_TASKS = ["clearing", "insertion", "crossing"]
 SECTIONS = ("elbo", "guide", "prior", "predictive", "intervals", "subgoals")  # of the report of check
 COLLECTION_CLEARANCE = 0.12  # metres; collected scenes are denser than those of an episode
@@ -264,7 +263,7 @@ class SceneConfig(DeviceOptions):
     push_decimals: int | None = option(PUSH_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
     margin: float = option(PLANNING_MARGIN, MARGIN, unit="metres", minimum=0, maximum=TILE_SIDE / 2)
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
-    checkpoint: str = option(PLANNERS_CHECKPOINT, f"{CHECKPOINT}; by default the planner's or the world's")
+    checkpoint: str = option("${oc.select:planner.default_checkpoint,cavin}", f"{CHECKPOINT}; by default the planner's")
     trust: list[str] = option([], TRUST)
     generated: GeneratedConfig = field(default_factory=GeneratedConfig)
     world: Any = None

@@ -48,7 +48,6 @@ def task_of(config: DictConfig) -> tuple[type[Task], dict[str, Any]]:
 def world_of(config: Mapping[str, Any] | DictConfig) -> World | None:
     """The world of the section `world`; None for the tabletop. One that is no `World` is a `UserError`."""
     section = dict(config.get("world") or {})
-    section.pop("default_checkpoint", None)
     if not section.get("_target_"):
         return None
     with user_input("env"):

@@ -51,8 +51,7 @@ def _opened(section: str) -> World:
 
 def described(world: World, section: Mapping[Any, Any]) -> dict[str, Any]:
     """What a dataset's metadata say of its world, as plain data."""
-    own = {name: value for name, value in section.items() if name != "default_checkpoint"}
-    about = {"world": own, "space": asdict(world.space), "objects": world.objects, "features": world.features}
+    about = {"world": dict(section), "space": asdict(world.space), "objects": world.objects, "features": world.features}
     return dict(json.loads(json.dumps(about)))
 
 

@@ -236,9 +236,10 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
 def check_space(trained: Checkpoint, env: World) -> None:
     """Raise a `UserError` if a checkpoint was trained in a world of other dimensions or units."""
     if "model" in trained.config and trained.model.space != env.space:
-        own = (trained.config.get("world") or {}).get("_target_")
+        own = (trained.config.get("world") or {}).get("_target_", "another world")
+        own = "env=tabletop" if trained.model.space == SPACE else own
         raise UserError(
-            f"checkpoint {trained.path} was trained in {own or 'env=tabletop'}, whose actions, positions or units are "
+            f"checkpoint {trained.path} was trained in {own}, whose actions, positions or units are "
             f"not those of {type(env).__name__}: choose another checkpoint, or its env"
         )
 

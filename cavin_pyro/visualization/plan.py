@@ -64,6 +64,10 @@ _SUBGOALS |= {"markeredgecolor": "black", "markeredgewidth": 0.7}
 _OBSTACLES: Style = {**_SUBGOALS, "marker": "s", "markersize": 4.5, "color": OBSTACLE_COLOR, "linewidth": 1.6}
 _PREDICTED: Style = {"marker": "x", "markersize": 4, "color": PREDICTION_COLOR, "linewidth": 1.2}
 _REACHED: Style = {"marker": "D", "markersize": 3, "color": REACHED_COLOR, "linewidth": 1.2}
+SHOWN = {  # in every world
+    **{"observed": OBSERVED, "candidates": _CANDIDATE, "subgoals of object 0": _SUBGOALS},
+    **{"of the others": _OBSTACLES, "predicted": _PREDICTED, "reached": _REACHED},
+}
 _PUSH: Style = {"arrowstyle": "-|>", "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4}
 _PLACE: Style = {"fill": False, "linewidth": 2.4}
 _TARGET: Style = {"color": PUSH_COLOR, "linestyle": "--", "linewidth": 1.5}

@@ -10,6 +10,7 @@ import imageio.v2 as imageio
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from cavin_pyro.envs.world import World
@@ -94,6 +95,8 @@ def draw_world(path: Path, episode: Episode, world: World, name: str) -> None:
     end.set_title(f"end, after {_counted(len(centers))}: {episode.outcome}", fontsize=10, fontweight="bold")
     for panel in axes.flat[len(chosen) + 1 :]:
         panel.set_axis_off()
+    handles = [Line2D([], [], label=label, **style) for label, style in styles.SHOWN.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(6, 2 * columns), fontsize=9, frameon=False)
     figure.suptitle(f"{name}, seed {episode.seed}", fontsize=12)
     save_figure(path, figure)
 
@@ -124,4 +127,5 @@ def _ground(panel: Axes, photograph: NDArray[np.uint8] | None) -> None:
     panel.set_aspect("equal")
     if photograph is not None:
         panel.imshow(photograph)
+        panel.set(xlim=(0, photograph.shape[1]), ylim=(photograph.shape[0], 0), autoscale_on=False)
         panel.set_axis_off()
