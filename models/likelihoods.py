@@ -70,9 +70,9 @@ class LikelihoodScales(Scales):
     """
 
     space: Space
-    center: float | Tensor = None  # type: ignore[assignment]
-    feature: float | Tensor = None  # type: ignore[assignment]
-    action: Sequence[float | Tensor] = None  # type: ignore[assignment]
+    center: float | None = None  # type: ignore[assignment]
+    feature: float | None = None  # type: ignore[assignment]
+    action: Sequence[float] | None = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         for name, value in _filled(self.space, self.center, self.feature, self.action).items():
