@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import difflib
 import functools
+import hashlib
 import itertools
 import os
 import re
@@ -222,7 +223,11 @@ def _default_output(name: str, config: dict[str, Any], hydra_config: Any) -> str
 
 
 def _file_name(overrides: Sequence[str]) -> str:
-    return ",".join(sorted(word.lstrip("+").replace("/", "-") for word in overrides))
+    """The overrides as a part of a path; of long ones the beginning and a digest, as file systems take 255 bytes."""
+    name = ",".join(sorted(word.lstrip("+").replace("/", "-") for word in overrides)).encode()
+    if len(name) > 200:
+        name = name[:190] + b"-" + hashlib.sha256(name).hexdigest()[:8].encode()
+    return name.decode(errors="ignore")
 
 
 def _explained(name: str, words: Sequence[str], raised: Exception) -> str:

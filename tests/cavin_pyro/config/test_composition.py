@@ -197,3 +197,8 @@ def test_every_group_of_presets_belongs_to_a_command() -> None:
     groups = {file.parent.relative_to(PRESETS).as_posix() for file in PRESETS.rglob("*.yaml")} - {"."}
     chosen = {group for name in COMMANDS for group in composed(name, [])[1]}
     assert groups <= chosen
+
+
+def test_the_folder_of_a_run_has_a_name_that_a_file_system_takes() -> None:
+    outputs = {compose("check", f"checkpoint=/{place}{'x' * 300}.safetensors").output for place in "ab"}
+    assert len(outputs) == 2 and all(len(one.encode()) < 255 for one in outputs)
