@@ -11,10 +11,11 @@ from torch import Generator, Tensor
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import HOOKS, Choice, ChosenEffect
 from cavin_pyro.planning.checks import check_choice, check_fraction, check_weight
+from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, Query, SegmentRollout
 from cavin_pyro.planning.returns import SubgoalDistance, TrackingCost, best_of, interpolate, select_segment
-from cavin_pyro.planning.rollout import Candidates, Focus, actions_of, predict_states, project
+from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states, project
 from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 

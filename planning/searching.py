@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import nullcontext
 from operator import itemgetter
@@ -48,7 +49,7 @@ PLANS_ON_ACCELERATOR = 131_072  # samples of all environments of a chunk
 Value = TypeVar("Value")
 
 
-class SearchingPlanner:
+class SearchingPlanner(ABC):
     """Searches N = `samples` plans of K = `horizon` / T segments for the highest cumulative reward.
 
     A planner implements `plan_scene`. The options, of which `cavin_pyro.planning.cavin.CavinPlanner` has more:
@@ -134,9 +135,9 @@ class SearchingPlanner:
                 raise NoFiniteCandidateError(start + error.environment, error.what) from error
         return plans[0] if len(plans) == 1 else records.join(plans, dimension=0)
 
+    @abstractmethod
     def plan_scene(self, scene: Query) -> Plan:
         """Plan for the environments of one chunk."""
-        raise NotImplementedError
 
     def search(
         self,

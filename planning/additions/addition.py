@@ -8,9 +8,10 @@ from typing import Any, ClassVar, NamedTuple
 from torch import Tensor
 
 from cavin_pyro.models.state import State
+from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.protocol import Plan, Query, SearchObjective
 from cavin_pyro.planning.returns import SubgoalDistance
-from cavin_pyro.planning.rollout import Candidates, Focus
+from cavin_pyro.planning.rollout import Candidates
 
 
 class ChosenEffect(NamedTuple):

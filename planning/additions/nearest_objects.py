@@ -8,8 +8,8 @@ import torch
 
 from cavin_pyro.planning.additions.addition import Addition
 from cavin_pyro.planning.checks import check_positive
+from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.protocol import Query
-from cavin_pyro.planning.rollout import Focus
 
 
 @dataclass(frozen=True)

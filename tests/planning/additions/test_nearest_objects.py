@@ -14,8 +14,8 @@ from cavin_pyro.envs.tabletop.tasks import TaskReward
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.additions import NearestObjects
+from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.protocol import Query, Reward
-from cavin_pyro.planning.rollout import Focus
 
 PLACES = [(0.0, 0.0), (0.9, 0.0), (0.1, 0.1), (0.8, 0.0), (0.2, 0.0), (0.0, 0.3)]  # metres; 0, 2, 4, 5 are nearest
 

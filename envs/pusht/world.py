@@ -15,52 +15,40 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavin_pyro.envs.pusht.policy import (
+    RADIUS,
+    REACH,
+    SIZE,
+    SKIN,
+    SPACING,
+    WALLS,
+    ObservationDict,
+    PushTPolicy,
+    in_window,
+    outline_of,
+    rotation,
+)
 from cavin_pyro.envs.randomness import named_stream
 from cavin_pyro.envs.world import Geometry, Goal, World
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
 REPEAT = 5  # steps of the simulator, 0.1 s each, in one step of the environment
-REACH = 100.0  # pixels; how far an action of 1 puts the disc's target, on each axis
-SIZE, RADIUS = 512.0, 15.0  # pixels; of the window, and of the disc
-WALLS = 8.0, 503.0  # pixels; within them nothing touches a wall
 POSE_DISTANCE, POSE_ANGLE = 20.0, math.pi / 9  # pixels of disc and block together, radians of the block
 COVERAGE = 0.95  # of the goal's area
 COVERAGE_DISTANCE, COVERAGE_ANGLE = 4.0, 0.05  # pixels, radians of the block, within which that is so
 FIXED_GOAL = 256.0, 400.0, 256.0, 256.0, math.pi / 4  # gym-pusht's block; the disc counts for the pose criterion only
 CRITERIA = ("pose", "coverage", "none")
-OUTLINE = np.array([(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)], dtype=float)
-CENTER = np.array([0.0, 45.0])  # pixels in the block's frame; its centre of mass
 _GOAL = 1  # last entry of a spawn key: the stream of random goals
-
-SPACING = 5.0  # pixels between the points of the outline that the policy knows
-ARRIVED = 6.0  # pixels from where a push begins
-APPROACHES = 6  # steps on the way to a push, at most
-ASTRAY = 0.1  # of the intents are random moves
-STRAIGHT = 0.15  # of the approaches go straight, through the block if it is in the way
-CARELESS = 0.05  # of the pushes may press the block into a wall
-CANDIDATES = 12  # pushes to choose one from
-ROUND = 110.0  # pixels from the block's centre of mass, on the way round it
-NOISE = 3.0  # pixels; standard deviation of a push's displacement, on each axis
-
 EPISODE = 60  # steps of an episode from which a start and its goal are taken
 PICTURE = 680.0  # pixels of the simulator's picture
 
-ObservationDict = dict[str, NDArray[np.float64]]
-
-
-def reached(agent: NDArray[Any], block: NDArray[Any], goal: NDArray[Any]) -> NDArray[np.bool_]:
-    """The pose criterion: disc [..., 2] and block [..., 3] near a goal [..., 5] (both positions, the block's angle).
-
-    The four coordinates' joint distance is below 20 pixels, and the angles differ by less than 20 degrees.
-    """
-    distance = np.linalg.norm(np.concatenate([agent, block[..., :2]], axis=-1) - goal[..., :4], axis=-1)
-    turn = np.abs(np.remainder(block[..., 2] - goal[..., 4] + np.pi, 2 * np.pi) - np.pi)
-    return (distance < POSE_DISTANCE) & (turn < POSE_ANGLE)
-
 
 class PoseGoal(Goal):
-    """The pose criterion, or within smaller distances; without `disc`, of the block alone."""
+    """Disc and block near a pose [5]: both positions, which count jointly, and the block's angle; or the block alone.
+
+    distance: pixels. angle: radians. disc: whether it counts.
+    """
 
     def __init__(self, space: Space, goal: NDArray[Any], *, distance: float, angle: float, disc: bool, weight: float):
         super().__init__(space, weight=weight)
@@ -102,8 +90,8 @@ class PushT(World):
     Args:
         ahead: steps of the simulator from the start to the goal in an episode of `PushTPolicy`, from which a reset
             takes both; starts at their goal are excluded, and counted in `excluded`. 0: both are random.
-        criterion: "pose" (see `reached`), "coverage" (more than 95 % of the goal's area, as `gym-pusht` ends an
-            episode; the disc may be anywhere), or "none".
+        criterion: "pose" (20 pixels and 20 degrees, see `PoseGoal`), "coverage" (more than 95 % of the goal's area, as
+            `gym-pusht` ends an episode; the disc may be anywhere), or "none".
         maximum_steps: after how many steps an episode is truncated; published, 18 for `ahead=75` and 10 for 25.
         weight: of progress in the planner's reward, in units of the criterion's two limits. margin: the part of these
             limits within which a plan has to end.
@@ -238,10 +226,7 @@ class PushT(World):
 
     def goal(self, device: str | torch.device = "cpu") -> PoseGoal:
         """See `World`. For coverage the block alone has to be near the goal's pose."""
-        limits = (POSE_DISTANCE, POSE_ANGLE) if self.criterion == "pose" else (COVERAGE_DISTANCE, COVERAGE_ANGLE)
-        distance, angle = (self._margin * limit for limit in limits)
-        disc = self.criterion == "pose"
-        return PoseGoal(self.space, self.pose, distance=distance, angle=angle, disc=disc, weight=self._weight)
+        return self._goal(self.pose, margin=self._margin, weight=self._weight)
 
     def policy(self, generator: np.random.Generator) -> PushTPolicy:
         """See `World`."""
@@ -271,8 +256,14 @@ class PushT(World):
     def _is_success(self) -> bool:
         if self.criterion == "coverage":
             return self.coverage() > COVERAGE
-        observed = self._observe()
-        return self.criterion == "pose" and bool(reached(observed["agent"], observed["block"], self.pose))
+        return self.criterion == "pose" and bool(self._goal(self.pose).success(self.state(self._observe())))
+
+    def _goal(self, pose: NDArray[np.float64], *, margin: float = 1.0, weight: float = 0.0) -> PoseGoal:
+        """To be within the criterion's limits, times `margin`, of a pose [5]."""
+        block_alone = self.criterion == "coverage"
+        distance, angle = (COVERAGE_DISTANCE, COVERAGE_ANGLE) if block_alone else (POSE_DISTANCE, POSE_ANGLE)
+        limits = {"distance": margin * distance, "angle": margin * angle}
+        return PoseGoal(self.space, pose, **limits, disc=not block_alone, weight=weight)
 
     def _goal_body(self) -> Any:
         return self._simulator.get_goal_pose_body(self.pose[2:])
@@ -311,8 +302,9 @@ class PushT(World):
                     states.append(np.concatenate([observed["agent"], observed["block"], observed["velocity"]]))
                     self.step(policy.act(observed).astype(np.float32))
                 start, goal = states[first], states[-1][:5]
-                inside = all(bool(((_outline(one) > 0) & (_outline(one) < SIZE)).all()) for one in (start, goal))
-                if inside and not reached(start[:2], start[2:5], goal):
+                inside = all(bool(((outline_of(one) > 0) & (outline_of(one) < SIZE)).all()) for one in (start, goal))
+                begun = self.state({"agent": start[:2], "block": start[2:5]})
+                if inside and not bool(self._goal(goal).success(begun)):
                     return start, goal, excluded
         finally:
             self.criterion = criterion
@@ -323,104 +315,13 @@ class PushT(World):
         while True:
             pose = np.array([*generator.uniform(*WALLS, size=2), generator.uniform(-np.pi, np.pi)])
             agent = generator.uniform(WALLS[0] + RADIUS, WALLS[1] - RADIUS, size=2)
-            outline = in_window(pose, _SKIN[0])
+            outline = in_window(pose, SKIN[0])
             # The disc's centre is outside if the nearest point of the outline shows it its outer side.
             nearest = int(np.linalg.norm(outline - agent, axis=-1).argmin())
-            height = float((agent - outline[nearest]) @ (_rotation(float(pose[2])) @ _SKIN[1][nearest]))
+            height = float((agent - outline[nearest]) @ (rotation(float(pose[2])) @ SKIN[1][nearest]))
             apart = height > 0 and float(np.linalg.norm(outline[nearest] - agent)) > RADIUS + SPACING
             if (outline > WALLS[0]).all() and (outline < WALLS[1]).all() and apart:
                 return np.concatenate([agent, pose])
-
-
-class PushTPolicy:
-    """Collects data: goes to a random point of the block's outline, pushes there in a line or a curve, and so on.
-
-    Args:
-        generator: all of the policy's randomness.
-    """
-
-    def __init__(self, generator: np.random.Generator) -> None:
-        self._generator = generator
-        self._approaches = self._pushes = self._moves = 0  # steps left of each kind
-        self._straight = False
-        self._contact, self._displacement = np.zeros((2, 2))  # in the block's frame; of the next push, in the window's
-        self._turn = 0.0  # radians from one push to the next
-
-    def act(self, observation: ObservationDict) -> NDArray[np.float64]:
-        """Choose the next action [2] from an observation."""
-        generator, agent, block = self._generator, observation["agent"], observation["block"]
-        if self._pushes + self._moves == 0:
-            self._choose(agent, block)
-        if self._moves:
-            self._moves -= 1
-            return generator.uniform(-1.0, 1.0, size=2)
-        start = in_window(block, self._contact)
-        if self._approaches and np.linalg.norm(start - agent) > ARRIVED:
-            self._approaches -= 1
-            way = (start if self._straight else _way(agent, start, block)) - agent
-            return way / max(REACH, float(np.abs(way).max()))
-        self._approaches = 0
-        self._pushes -= 1
-        action = (self._displacement + generator.normal(scale=NOISE, size=2)) / REACH
-        self._displacement = self._displacement @ _rotation(self._turn).T
-        return np.clip(action, -1.0, 1.0)
-
-    def _choose(self, agent: NDArray[np.float64], block: NDArray[np.float64]) -> None:
-        """Choose random moves, or one of some pushes: mostly one that leaves the block inside, often a near one."""
-        generator = self._generator
-        if generator.random() < ASTRAY:
-            self._moves = int(generator.integers(1, 4))
-            return
-        steps, length = int(generator.integers(1, 6)), generator.uniform(20.0, REACH)
-        points, normals = _SKIN
-        chosen = generator.integers(len(points), size=CANDIDATES)
-        gaps = RADIUS + generator.uniform(1.0, 15.0, size=(CANDIDATES, 1))
-        contacts = points[chosen] + gaps * normals[chosen]
-        starts, outline = in_window(block, contacts), in_window(block, points)
-        inward = -normals[chosen] @ _rotation(float(block[2])).T
-        angles = np.arctan2(inward[:, 1], inward[:, 0]) + generator.normal(scale=0.5, size=CANDIDATES)
-        headings = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        room = np.where(headings > 0, WALLS[1] - outline.max(axis=0), outline.min(axis=0) - WALLS[0])
-        room = (np.maximum(room, 0.0) / np.maximum(np.abs(headings), 1e-6)).min(axis=-1) + gaps[:, 0] - RADIUS
-        reachable = ((starts > WALLS[0] + RADIUS) & (starts < WALLS[1] - RADIUS)).all(axis=-1)
-        cost = np.linalg.norm(starts - agent, axis=-1) * generator.integers(2)
-        cost += generator.uniform(0.0, 100.0, CANDIDATES) + 4 * SIZE * ~reachable
-        if generator.random() > CARELESS:
-            cost += SIZE * (room < 40.0)
-            length = np.minimum(length, room / steps)
-        best = int(cost.argmin())
-        self._contact = contacts[best]
-        self._displacement = np.broadcast_to(length, CANDIDATES)[best] * headings[best]
-        self._approaches, self._pushes, self._turn = APPROACHES, steps, float(generator.normal(scale=0.25))
-        self._straight = bool(generator.random() < STRAIGHT)
-
-
-def _outline(state: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points [P, 2] of the block's outline in a state [5 or more]."""
-    return in_window(state[2:5], _SKIN[0])
-
-
-def in_window(block: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points [..., 2] of the block's frame, in the window's, for a block [3] (x, y, angle)."""
-    return points @ _rotation(float(block[2])).T + block[:2]
-
-
-def _rotation(angle: float) -> NDArray[np.float64]:
-    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-
-
-def _way(agent: NDArray[np.float64], start: NDArray[np.float64], block: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where to go next [2] from the disc to the start of a push: there, or round the block if it is in between."""
-    line = start - agent
-    outline = in_window(block, _SKIN[0])
-    along = np.clip((outline - agent) @ line / max(float(line @ line), 1e-9), 0.0, 1.0)
-    if np.linalg.norm(agent + along[:, None] * line - outline, axis=-1).min() >= RADIUS - 2.0:
-        return start
-    center = in_window(block, CENTER)
-    bearing, wanted = (math.atan2(*(point - center)[::-1]) for point in (agent, start))
-    bearing += float(np.clip(math.remainder(wanted - bearing, 2 * math.pi), -1.0, 1.0))
-    around = center + ROUND * np.array([math.cos(bearing), math.sin(bearing)])
-    return np.clip(around, WALLS[0] + RADIUS, WALLS[1] - RADIUS)
 
 
 def _numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
@@ -428,18 +329,3 @@ def _numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
     if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
         raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
     return array
-
-
-def _skin() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points [P, 2] of the block's outline in its frame, and the outward normals there."""
-    points, normals = [], []
-    for begin, end in zip(OUTLINE, np.roll(OUTLINE, -1, axis=0), strict=True):
-        edge = end - begin
-        length = float(np.linalg.norm(edge))
-        fractions = (np.arange(round(length / SPACING)) + 0.5) / round(length / SPACING)
-        points.append(begin + fractions[:, None] * edge)
-        normals.append(np.tile(np.array([edge[1], -edge[0]]) / length, (len(fractions), 1)))
-    return np.concatenate(points), np.concatenate(normals)
-
-
-_SKIN = _skin()
