@@ -26,7 +26,6 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from cavin_pyro.config.composition import compose
-from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.tabletop.tasks import TaskReward
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.models.state import State
@@ -45,15 +44,8 @@ def runner(objects: int, samples: int, *overrides: str) -> EpisodeRunner:
 
 def scenes(one: EpisodeRunner, count: int) -> State:
     """`count` scenes as the camera sees them: [count, M, ...]."""
-    assert one.geometry is not None
-    states = [observed_state(one.env.reset(seed=seed)[0], one.geometry) for seed in range(count)]
-    return State(*(torch.cat(field) for field in zip(*states, strict=True)))
-
-
-def reward_of(one: EpisodeRunner) -> Reward:
-    """Of the runner's current episode."""
-    assert one.reward is not None
-    return one.reward(one.env)
+    states = [one.env.state(one.env.reset(seed=seed)[0]) for seed in range(count)]
+    return State(*(torch.stack(field) for field in zip(*states, strict=True)))
 
 
 def generators(count: int) -> list[torch.Generator]:
@@ -115,7 +107,7 @@ def planners(
     torch.compiler.reset()  # which keeps eight versions of a function
     for way in ways:
         one = runner(objects, samples, f"planner.compile={str(way == 'compiled').lower()}", *options)
-        found[way], state, reward = one.planner, scenes(one, SCENES), reward_of(one)
+        found[way], state, reward = one.planner, scenes(one, SCENES), one.env.goal()
         one.env.close()
     if "compiled" in found:
         plain: Any = copy.copy(found["compiled"])  # with what has been compiled
@@ -154,7 +146,7 @@ def first(objects: list[int], samples: int, options: list[str]) -> None:
         state = scenes(one, 1)
         for name in ("first", "second"):
             began, spent = time.perf_counter(), time.process_time()
-            planning(one.planner, state, reward_of(one), 1)()
+            planning(one.planner, state, one.env.goal(), 1)()
             took, spent = time.perf_counter() - began, time.process_time() - spent
             print(f"{number} objects, {name} plan: {took:.2f} s, of this process's processor {spent:.2f} s", flush=True)
         one.env.close()
@@ -170,7 +162,7 @@ class FlatProblem:
     def __init__(self, one: EpisodeRunner, state: State) -> None:
         planner: MpcPlanner = one.planner  # type: ignore[assignment]
         self.model, self.backend, self.mask = planner.model, planner.backend, state.mask[0]
-        self.reward = TaskReward(one.task)
+        self.reward = TaskReward(one.env.task)  # type: ignore[attr-defined]
         self.objects = state.objects
         self.start = torch.cat((state.centers[0], state.features[0]), -1).flatten()
 
@@ -256,7 +248,7 @@ def flat(samples: list[int], repetitions: int, ways: list[str], options: list[st
         ours, theirs = {}, {}
         for way, one in runners.items():
             problem = FlatProblem(one, scenes(one, 1))
-            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1), reward_of(one), 1)
+            ours[f"ours, {way}"] = planning(one.planner, scenes(one, 1), one.env.goal(), 1)
             theirs[f"pytorch_mppi, f {way}"] = mppi_planner(problem, count)
             theirs[f"torchrl CEM, f {way}"] = cem_planner(problem, count)
         with torch.inference_mode():

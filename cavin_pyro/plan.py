@@ -34,7 +34,7 @@ def main(config: DictConfig) -> Figures:
         steps = ("push", "pushes") if isinstance(runner.env, PushingEnv) else ("step", "steps")
         pushes = counted(row["steps"], *steps)
         idle = f", {row['ineffective']} of which moved nothing" if row["ineffective"] else ""
-        print(f"{runner.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
+        print(f"{runner.env.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)
         for name in episode_files(video=config.video):

@@ -16,6 +16,7 @@ from torch import Tensor
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
+ACTION_DECIMALS = 3  # of an executed action's numbers; of a push 0.1 mm of its motion, 0.25 and 0.55 mm of its start
 GOAL_REWARD = 100.0
 STEP_REWARD = -1.0
 
@@ -43,6 +44,10 @@ class RandomBursts:
         return self._action
 
 
+class NoRoomError(ValueError):
+    """No episode can begin from a seed as the world's options ask."""
+
+
 class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     """An environment of Gymnasium that models can learn and planners can act in.
 
@@ -56,7 +61,8 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     policy      that collects; by default random actions, each for a while
     pixels      where positions lie in the picture of `render`, for drawings; None: they are drawn on axes
 
-    A caller may set `render_mode`, and `on_frame`, which a world may call during a step, to film it.
+    A caller may set `render_mode`, and `on_frame`, which a world may call during a step, to film it. A world that
+    `sees_clouds` needs a checkpoint's `geometry` for its states.
     """
 
     space: ClassVar[Space]
@@ -64,17 +70,28 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     objects: int
     maximum_steps: int
     on_frame: Callable[[], None] | None = None
+    sees_clouds = False
+    geometry: Geometry | None = None
 
     @abstractmethod
-    def state(self, observation: Any, geometry: Geometry | None = None) -> State:
-        """The state `[]` of one observation: centres `[M, P]`, features `[M, F]`, mask `[M]`, float32.
-
-        `geometry`: of the checkpoint, in worlds that see point clouds.
-        """
+    def state(self, observation: Any) -> State:
+        """The state `[]` of one observation: centres `[M, P]`, features `[M, F]`, mask `[M]`, float32."""
 
     @abstractmethod
     def goal(self, device: str | torch.device = "cpu") -> Any:
         """The reward of the current episode, for plans on a device: a `Goal`."""
+
+    @property
+    def name(self) -> str:
+        """What pictures and results call the current episode."""
+        return type(self).__name__
+
+    def check_starts(self, seed: int) -> None:
+        """Begin an episode of each kind that there is; raises ValueError where none can begin."""
+
+    def observed(self, observation: Any) -> Any:
+        """What additions to planners read besides the state: a named tuple of tensors `[1, ...]`; by default None."""
+        return None
 
     def positions(self, observation: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """The centres `[M, P]` and the mask `[M]` of an observation, without features."""
@@ -158,7 +175,7 @@ class Goal(ABC):
         return State(values[..., :size], values[..., size:], mask)
 
 
-def executed(action: NDArray[np.floating], decimals: int | None = 3) -> NDArray[np.float32]:
+def executed(action: NDArray[np.floating], decimals: int | None = ACTION_DECIMALS) -> NDArray[np.float32]:
     """The action that is made: clipped to [-1, 1], and rounded.
 
     Without rounding, an error of 1e-7 in a plan, of another processor or of compiled code, makes another episode.

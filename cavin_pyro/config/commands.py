@@ -9,9 +9,10 @@ from typing import Any
 
 from cavin_pyro.config.options import option, preset_defaults, seed_option
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
-from cavin_pyro.envs.tabletop.pushing import PLANNING_MARGIN, PushingEnv
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.tasks.generated import ANY_SHAPE, SHAPES, GeneratedLayouts
-from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, PUSH_DECIMALS, TILE_SIDE
+from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, TILE_SIDE
+from cavin_pyro.envs.world import ACTION_DECIMALS
 
 CHECKPOINTS = {  # names of shipped checkpoints, with the model and the guide of each
     **dict.fromkeys(("cavin", "kinect", "held_out", "contact"), ("cascaded", "cascaded")),
@@ -260,8 +261,8 @@ class SceneConfig(DeviceOptions):
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
     planner: Any = None
     pushes_per_plan: int | None = option(1, "executed pushes per plan; null: all T (Algorithm 1, line 11)", minimum=1)
-    push_decimals: int | None = option(PUSH_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
-    margin: float = option(PLANNING_MARGIN, MARGIN, unit="metres", minimum=0, maximum=TILE_SIDE / 2)
+    push_decimals: int | None = option(ACTION_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
+    margin: float = option(ENV["margin"], MARGIN, unit="metres", minimum=0, maximum=TILE_SIDE / 2)
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
     checkpoint: str = option("${oc.select:planner.default_checkpoint,cavin}", f"{CHECKPOINT}; by default the planner's")
     trust: list[str] = option([], TRUST)

@@ -23,9 +23,9 @@ from cavin_pyro.criticism.estimates import UNKNOWN, Interval, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
 from cavin_pyro.data.collection import clutter_area, open_scene
-from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State
@@ -155,8 +155,7 @@ def _rollout(
     context: CheckContext, scene: Scene, number: int, motion: str, objects: int, samples: int
 ) -> SubgoalRollout:
     first = sample_scene(scene, context.world.ranges, context.seed, number, objects)
-    seen = {"centers": first.centers, "clouds": first.clouds, "mask": first.mask}
-    state = observed_state(seen, context.geometry)
+    state = state_of(vars(first), context.geometry).expand_plans(1)
     plan = plan_segment(context.model, state, motion, [context.seed, number], samples)
     reports = []
     for action in plan.actions:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.device import one_thread
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.observed import observed_points, observed_state
-from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.observation import Observation, ObservedPoints
 from cavin_pyro.envs.tabletop.policy import Intent
+from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning.additions.touchdown import Touchdown
@@ -51,7 +51,7 @@ class ModelPushingPolicy:
     @torch.inference_mode()
     def _segment(self, observation: Observation) -> list[NDArray[np.float32]]:
         model, seen = self._model, vars(observation)
-        state = observed_state(seen, self._geometry)
+        state = state_of(seen, self._geometry).expand_plans(1)
         here, plans = state.expand_plans(1), state.expand_plans(self._motions)
         effect_code = sample_codes(model.effect_prior, [here], None, [self._random])
         subgoal = model.subgoal(here, effect_code)
@@ -60,7 +60,7 @@ class ModelPushingPolicy:
         pushes = project(model.actions(here, effect_code=codes, motion_code=motion_code), None)
         ends, _ = predict_states(model, here, pushes)
         scores = -squared_distance(ends, subgoal)
-        scores = Touchdown().leave_out(scores, pushes[:, :, 0], observed_points(seen))
+        scores = Touchdown().leave_out(scores, pushes[:, :, 0], ObservedPoints.of(seen))
         best = int(best_of(scores, "distances of motions to the subgoal"))
         moves = (subgoal.centers - here.centers)[0, 0, :, :2] * state.mask[0, :, None]
         target = int(moves.norm(dim=-1).argmax())

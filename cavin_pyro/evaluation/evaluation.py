@@ -66,7 +66,7 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
         results = summarize((merge if config.merge else run_missing)(config, folder))
-        scene = runner.name
+        scene = runner.env.name
         if not config.world.get("_target_"):
             scene += f", layout {config.layout}, {config.reward} reward, {config.objects} objects"
         lines = [table(results, f"{scene}, {planner_name(config)}"), plan_summary(results["per_episode"], config)]

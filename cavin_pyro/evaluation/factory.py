@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -22,9 +22,9 @@ from cavin_pyro.config.parts import check_sizes, class_of, construct
 from cavin_pyro.config.world import object_ranges, part_of, task_of, world_of
 from cavin_pyro.envs.tabletop.layouts import GENERATED
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
-from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts, Task, TaskReward
-from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, PUSH_DECIMALS, SPACE
-from cavin_pyro.envs.world import World
+from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts
+from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, SPACE
+from cavin_pyro.envs.world import ACTION_DECIMALS, World
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
@@ -32,7 +32,6 @@ from cavin_pyro.planning import Planner
 from cavin_pyro.planning.additions import ADDITIONS, Addition
 from cavin_pyro.planning.backends import GRAPHS
 from cavin_pyro.planning.optimizers import Shooting
-from cavin_pyro.planning.protocol import Reward
 from cavin_pyro.planning.searching import SearchingPlanner
 from cavin_pyro.storage.checkpoint import Checkpoint, load
 
@@ -49,27 +48,14 @@ class EpisodeRunner:
 
     env: World
     planner: Planner
-    geometry: Geometry | None
-    reward: Callable[[Any], Reward] | None
     pushes_per_plan: int | None  # as in `cavin_pyro.evaluation.rollout.rollout`
     device: torch.device = CPU
-    push_decimals: int | None = PUSH_DECIMALS  # as in `cavin_pyro.evaluation.rollout.rollout`
-
-    @property
-    def name(self) -> str:
-        """The task of the current episode, or the world."""
-        return self.task.name if isinstance(self.env, PushingEnv) else type(self.env).__name__
-
-    @property
-    def task(self) -> Task:
-        """The task of the current episode on the table."""
-        assert isinstance(self.env, PushingEnv)
-        return self.env.task
+    push_decimals: int | None = ACTION_DECIMALS  # as in `cavin_pyro.evaluation.rollout.rollout`
 
     def rollout(self, seed: int, **options: Any) -> Episode:
         """Run one episode; for the other options see `cavin_pyro.evaluation.rollout.rollout`."""
-        usual = {name: getattr(self, name) for name in ("pushes_per_plan", "push_decimals", "reward", "device")}
-        return rollout(self.env, self.planner, self.geometry, seed=seed, **(usual | options))
+        usual = {name: getattr(self, name) for name in ("pushes_per_plan", "push_decimals", "device")}
+        return rollout(self.env, self.planner, seed=seed, **(usual | options))
 
 
 def check_options(config: DictConfig, device: torch.device) -> None:
@@ -110,15 +96,18 @@ def announce_objects(config: DictConfig) -> None:
         )
 
 
-def make_env(config: DictConfig | None = None, *, render: bool = False, **options: Any) -> World:
+def make_env(
+    config: DictConfig | None = None, *, geometry: Geometry | None = None, render: bool = False, **options: Any
+) -> World:
     """Build an environment as the command `plan` does.
 
-    env = cavin_pyro.make_env(task="crossing", reward="sparse", objects=3, env={"camera": "kinect2"})
+    env = cavin_pyro.make_env(task="crossing", objects=3, env={"camera": "kinect2"}, geometry=trained.geometry)
     env = cavin_pyro.make_env(env="pusht")
 
     Args:
         config: of a command; by default that of `options`, which are the command's options of the task and the world:
             `task`, `layout`, `reward`, `objects`, `maximum_steps`, `env` and others.
+        geometry: of the checkpoint, with which a world that sees point clouds makes states for its model.
         render: whether `env.render()` makes pictures, as `rollout(..., photograph=True)` needs them.
 
     Raises:
@@ -132,7 +121,7 @@ def make_env(config: DictConfig | None = None, *, render: bool = False, **option
     task, tiles = task_of(config)
     with user_input():
         parts = {name: part_of(name, config.env[name], config.env.assets) for name in PARTS_OF_WORLD}
-        return PushingEnv(
+        env = PushingEnv(
             task=task,
             tiles=tiles,
             generated=GeneratedLayouts(**config.generated),
@@ -140,9 +129,11 @@ def make_env(config: DictConfig | None = None, *, render: bool = False, **option
             object_set=parts.pop("objects"),
             assets=config.env.assets,
             render_mode="rgb_array" if render else None,
-            **{name: config[name] for name in ("layout", "reward", "criterion", "objects", "maximum_steps")},
+            **{name: config[name] for name in ("layout", "reward", "criterion", "margin", "objects", "maximum_steps")},
             **parts,
         )
+    env.geometry = geometry
+    return env
 
 
 def make_planner(
@@ -207,30 +198,22 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     set_matmul_precision(config.matmul_precision)
     keep_freed_memory()
     env = make_env(config, render=render)
-    table, reward, trained = isinstance(env, PushingEnv), None, None
+    model_free, model = config.planner.get("model_free"), None
     try:
-        if isinstance(env, PushingEnv):
-            with user_input():
-                reward = episode_rewards(env.tasks, reward=config.reward, margin=config.margin, device=device)
-        if table or not config.planner.get("model_free"):
+        if env.sees_clouds or not model_free:
             trained = load(config.checkpoint, trust=list(config.trust))
             check_space(trained, env)
-        model = None if trained is None or config.planner.get("model_free") else trained.model
-        # On the CPU, so that states are the same for every device.
-        geometry = None if trained is None else trained.geometry if table else None
+            model = None if model_free else trained.model
+            env.geometry = trained.geometry  # on the CPU, so that states are the same for every device
         planner = planner_of(config, model, device, action_dimension=env.space.actions)
         if config.pushes_per_plan is not None:
             check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
-        if isinstance(env, PushingEnv):
-            with user_input():  # fails now, not in a later episode, if some layout has no room for the objects
-                for number in range(len(env.tasks)):
-                    env.reset(seed=config.seed, options={"layout": number})
-            if len(env.tasks) > 1:
-                env.reset(seed=config.seed)  # in the layout that the seed samples
+        with user_input():
+            env.check_starts(config.seed)  # fails now, not in a later episode
     except BaseException:
         env.close()
         raise
-    return EpisodeRunner(env, planner, geometry, reward, config.pushes_per_plan, device, config.get("push_decimals"))
+    return EpisodeRunner(env, planner, config.pushes_per_plan, device, config.get("push_decimals"))
 
 
 def check_space(trained: Checkpoint, env: World) -> None:
@@ -242,17 +225,6 @@ def check_space(trained: Checkpoint, env: World) -> None:
             f"checkpoint {trained.path} was trained in {own}, whose actions, positions or units are "
             f"not those of {type(env).__name__}: choose another checkpoint, or its env"
         )
-
-
-def episode_rewards(tasks: Sequence[Task], **options: Any) -> Callable[[PushingEnv], TaskReward]:
-    """The reward of an episode's task, by `options` of `TaskReward`: one object for each of `tasks`."""
-    known = {id(task): (task, TaskReward(task, **options)) for task in tasks}  # with its task, so that its id stays
-
-    def reward(env: PushingEnv) -> TaskReward:
-        task = env.task
-        return known[id(task)][1] if id(task) in known else TaskReward(task, **options)
-
-    return reward
 
 
 def _additions(options: dict[str, Any], *, one_push: bool) -> list[Addition]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,15 +14,10 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.observed import observed_points
 from cavin_pyro.envs.randomness import planner_seed
-from cavin_pyro.envs.tabletop.objects.sampling import NoRoomError
-from cavin_pyro.envs.tabletop.workspace import PUSH_DECIMALS
-from cavin_pyro.envs.world import World, executed
-from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World, executed
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
-from cavin_pyro.planning.protocol import Reward
 from cavin_pyro.planning.records import apply
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
@@ -34,8 +29,8 @@ class PlanRecord:
 
     Attributes:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
-        milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
-        clouds: [M, 256, 3] metres, as observed, if a photograph was asked for.
+        milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for, and the
+            observation that it shows.
     """
 
     step: int
@@ -44,7 +39,7 @@ class PlanRecord:
     plan: Plan
     milliseconds: float
     photograph: Any = None
-    clouds: NDArray[np.float32] | None = None
+    observation: Any = None
 
     @property
     def share_reaching_goal(self) -> float | None:
@@ -90,14 +85,14 @@ class Transition:
 
 @dataclass
 class Episode:
-    """One episode. outcome: one of `OUTCOMES`. photograph, clouds: as in `PlanRecord`, after the last push."""
+    """One episode. outcome: one of `OUTCOMES`. photograph, observation: as in `PlanRecord`, after the last push."""
 
     seed: int
     outcome: str = "timeout"
     plan_records: list[PlanRecord] = field(default_factory=list)
     transitions: list[Transition] = field(default_factory=list)
     photograph: Any = None
-    clouds: NDArray[np.float32] | None = None
+    observation: Any = None
 
     @property
     def total_reward(self) -> float:
@@ -143,27 +138,24 @@ class EpisodeCallback:
 def rollout(
     env: World,
     planner: Planner,
-    geometry: Geometry | None = None,
     *,
     seed: int,
-    reward: Callable[[World], Reward] | None = None,
     pushes_per_plan: int | None = 1,
-    push_decimals: int | None = PUSH_DECIMALS,
+    push_decimals: int | None = ACTION_DECIMALS,
     photograph: bool = False,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
 ) -> Episode:
     """Run one episode in a world.
 
-    trained, env = cavin_pyro.load("contact"), cavin_pyro.make_env(task="crossing")
-    episode = cavin_pyro.rollout(env, cavin_pyro.make_planner(trained.model), trained.geometry, seed=1)
+    trained = cavin_pyro.load("contact")
+    env = cavin_pyro.make_env(task="crossing", geometry=trained.geometry)
+    episode = cavin_pyro.rollout(env, cavin_pyro.make_planner(trained.model), seed=1)
     print(episode.outcome, len(episode.transitions))
 
     Args:
         env: as `make_env` makes it. planner: as `make_planner`, or with its method `plan`.
-        geometry: which makes the features of the model's states, in worlds that see point clouds.
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
-        reward: by which plans are made, of the world when its episode has begun; by default the world's goal.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
             planner with the addition `first_push` is for 1.
         push_decimals: to which planned actions are rounded (`cavin_pyro.envs.world.executed`), so that an episode does
@@ -173,7 +165,7 @@ def rollout(
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
 
     Raises:
-        UserError: the layout has no room for the objects, the planner found no plan with finite numbers, or an
+        UserError: no episode can begin from the seed, the planner found no plan with finite numbers, or an
             optimizer of the user's own breaks the interface of optimizers.
         RuntimeError: the robot stands in the camera's view.
     """
@@ -182,17 +174,17 @@ def rollout(
     env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
     with _refusals(seed):
         observation, _ = env.reset(seed=seed)
-    goal = env.goal(device) if reward is None else reward(env)
+    goal = env.goal(device)
     for callback in callbacks:
         callback.on_observation(observation)
     ended = False
     while not ended:
         began = time.perf_counter()
-        state = env.state(observation, geometry).map(lambda field: field.unsqueeze(0).to(device))
-        seen = isinstance(observation, Mapping) and "clouds" in observation
-        points = observed_points(observation, device) if seen else None
+        state = env.state(observation).map(lambda field: field.unsqueeze(0).to(device))
+        shown = env.observed(observation)
+        shown = shown and apply(shown, lambda field: field.to(device))
         with _refusals(seed):
-            plan = planner.plan(state, reward=goal, generators=[generator], observed=points)
+            plan = planner.plan(state, reward=goal, generators=[generator], observed=shown)
         plan = apply(plan, lambda field: field.cpu())
         centers, mask = env.positions(observation)
         record = PlanRecord(
@@ -202,7 +194,7 @@ def rollout(
             plan=plan,
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
-            clouds=observation["clouds"] if photograph and seen else None,
+            observation=observation if photograph else None,
         )
         episode.plan_records.append(record)
         for callback in callbacks:
@@ -236,7 +228,7 @@ def rollout(
                 episode.outcome = _end(ends) or "timeout"
                 break
     if photograph:
-        episode.photograph, episode.clouds = env.render(), observation["clouds"] if seen else None
+        episode.photograph, episode.observation = env.render(), observation
     for callback in callbacks:
         callback.on_end(episode)
     return episode

@@ -185,7 +185,7 @@ def draw_plan(path: Path, episode: Episode, task: Task, camera: Camera | None) -
     Parts that a planner lacks are omitted.
 
     Args:
-        episode: its plans hold photographs and clouds, or an empty table is drawn.
+        episode: its plans hold photographs and observations, or an empty table is drawn.
         camera: that took the photographs, in any resolution; None draws maps from above instead, with the clouds.
     """
     count = len(episode.plan_records)
@@ -230,7 +230,7 @@ def draw_plan_record(
         scale: of the candidates' returns; None omits the candidates.
         reached: [n, M, 3] metres, centres observed after each push; None before that.
     """
-    view = _draw_ground(panel, task, camera, record.photograph, record.clouds, record.mask)
+    view = _draw_ground(panel, task, camera, record.photograph, record.observation, record.mask)
     draw_overlay(panel, record, task, view, scale, reached)
     lines = [f"after {counted(record.step)}{_error(record, reached)}", record.prospect.removeprefix(", ")]
     panel.set_title("\n".join(filter(None, lines)), fontsize=10)
@@ -258,7 +258,7 @@ def _error(record: PlanRecord, reached: NDArray[np.float32] | None) -> str:
 def draw_end(panel: Axes, episode: Episode, task: Task, camera: Camera | None) -> None:
     """Draw the last observation and the objects' paths, with the outcome as the title."""
     first, last = episode.plan_records[0], episode.plan_records[-1]
-    view = _draw_ground(panel, task, camera, episode.photograph, episode.clouds, last.mask)
+    view = _draw_ground(panel, task, camera, episode.photograph, episode.observation, last.mask)
     centers = np.array([transition.centers for transition in episode.transitions], dtype=np.float32).reshape(
         -1, *first.centers.shape
     )
@@ -279,7 +279,7 @@ def _draw_ground(
     task: Task,
     camera: Camera | None,
     photograph: NDArray[np.uint8] | None,
-    clouds: NDArray[np.float32] | None,
+    observation: Mapping[str, NDArray[np.float32]] | None,
     mask: NDArray[np.bool_],
 ) -> View:
     """Draw the background, and return its projection."""
@@ -299,9 +299,9 @@ def _draw_ground(
                 panel.add_patch(Polygon(corners, facecolor=fill, edgecolor=group.color, linewidth=1.4, zorder=1))
     if camera is None:
         mark_axes(panel, view)
-        if clouds is not None:
+        if observation is not None:
             for number in np.flatnonzero(mask):
-                pixels = view.project(clouds[number])
+                pixels = view.project(observation["clouds"][number])
                 panel.scatter(pixels[:, 0], pixels[:, 1], s=1.5, color=COLORS[number], linewidths=0, zorder=1.5)
     panel.set_xlim(left - MARGIN, right + MARGIN)
     panel.set_ylim(bottom + MARGIN, top - MARGIN)  # rows count downwards

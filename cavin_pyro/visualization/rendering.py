@@ -90,11 +90,11 @@ def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: boo
     with ExitStack() as stack:
         callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
         if video:
-            callbacks.append(stack.enter_context(episode_video(folder / "episode.mp4", env, runner.task)))
+            callbacks.append(stack.enter_context(episode_video(folder / "episode.mp4", env, env.task)))
         episode = runner.rollout(seed, photograph=True, callbacks=callbacks)
     write_steps(folder / "steps.csv", episode)
-    draw_plan(folder / "plan.png", episode, runner.task, env.scene.camera)
-    draw_plan(folder / "plan-above.png", episode, runner.task, None)
+    draw_plan(folder / "plan.png", episode, env.task, env.scene.camera)
+    draw_plan(folder / "plan-above.png", episode, env.task, None)
     return episode_row(episode)
 
 

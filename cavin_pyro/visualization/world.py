@@ -66,11 +66,11 @@ def render_world(runner: EpisodeRunner, folder: Path, *, seed: int, video: bool)
             frames = {**FORMAT, "fps": FRAMES_PER_SECOND}
             callbacks.append(Film(world, stack.enter_context(imageio.get_writer(temporary, mode="I", **frames))))
         episode = runner.rollout(seed, photograph=True, callbacks=callbacks)
-    draw_world(folder / "plan.png", episode, world, runner.name)
+    draw_world(folder / "plan.png", episode, world)
     return episode_row(episode)
 
 
-def draw_world(path: Path, episode: Episode, world: World, name: str) -> None:
+def draw_world(path: Path, episode: Episode, world: World) -> None:
     """Draw at most five plans in temporal order, and the end: candidates, subgoals, predictions, what was reached."""
     count = len(episode.plan_records)
     chosen = [episode.plan_records[i] for i in np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)]
@@ -97,7 +97,7 @@ def draw_world(path: Path, episode: Episode, world: World, name: str) -> None:
         panel.set_axis_off()
     handles = [Line2D([], [], label=label, **style) for label, style in styles.SHOWN.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(6, 2 * columns), fontsize=9, frameon=False)
-    figure.suptitle(f"{name}, seed {episode.seed}", fontsize=12)
+    figure.suptitle(f"{world.name}, seed {episode.seed}", fontsize=12)
     save_figure(path, figure)
 
 

@@ -29,7 +29,7 @@ from cavin_pyro.envs.pusht.policy import (
     rotation,
 )
 from cavin_pyro.envs.randomness import named_stream
-from cavin_pyro.envs.world import Geometry, Goal, World
+from cavin_pyro.envs.world import Goal, NoRoomError, World
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
@@ -217,7 +217,7 @@ class PushT(World):
         info = {"steps": self._steps, "simulator_steps": done, "success": success}
         return self._observe(), float(success), success, not success and self._steps >= self.maximum_steps, info
 
-    def state(self, observation: ObservationDict, geometry: Geometry | None = None) -> State:
+    def state(self, observation: ObservationDict) -> State:
         """See `World`: the block, then the disc, whose angle is always 0."""
         x, y, angle = observation["block"]
         centers = torch.tensor([[x, y], observation["agent"].tolist()], dtype=torch.float32)
@@ -308,7 +308,7 @@ class PushT(World):
                     return start, goal, excluded
         finally:
             self.criterion = criterion
-        raise RuntimeError("no start apart from its goal in 100 episodes: choose a larger ahead")
+        raise NoRoomError("no start apart from its goal in 100 episodes: choose a larger ahead")
 
     def _sample(self, generator: np.random.Generator) -> NDArray[np.float64]:
         """A random state [5] in which nothing touches anything."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,8 +14,7 @@ from torch import Tensor
 from cavin_pyro.envs.tabletop.segmentation import Pixels
 from cavin_pyro.envs.tabletop.sensors import DepthImage
 from cavin_pyro.envs.tabletop.sensors.camera import sample_cloud
-from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT
-from cavin_pyro.models.state import State
+from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, POINTS_PER_OBJECT, REACH_HIGH, REACH_LOW
 
 MINIMUM_PIXELS = 8  # minimum to locate an object
 
@@ -64,22 +63,26 @@ class LatestClouds:
         return Observation(self._clouds.copy(), self._centers.copy(), self._mask.copy(), visible)
 
 
-@torch.inference_mode()
-def state_of(observation: Mapping[str, NDArray[Any]], geometry: Callable[[Tensor], Tensor]) -> State:
-    """The state `[M]` of an observation, without needless padding.
+class ObservedPoints(NamedTuple):
+    """Points of the objects that the camera sees, and the box that normalised starts of pushes span."""
 
-    Args:
-        observation: `centers`, `clouds` and `mask` of `Observation`, [M, ...]. geometry: on the CPU.
+    points: Tensor  # [B, P, 2] metres; infinite for no point
+    low: Tensor  # [B, 2] metres, the start -1
+    high: Tensor  # [B, 2] metres, the start 1
 
-    Raises:
-        ValueError: no object, or numbers of one that are not finite.
-    """
-    real = np.flatnonzero(observation["mask"])
-    for name in ("clouds", "centers"):
-        if not (observation[name][real].size and np.isfinite(observation[name][real]).all()):
-            raise ValueError(f"{name} of an observation must be finite numbers of at least one object")
-    objects = int(real.max()) + 1
-    centers = torch.from_numpy(observation["centers"][:objects])
-    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
-    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
-    return State(centers, geometry(clouds), mask)
+    @classmethod
+    def of(cls, observation: Mapping[str, NDArray[Any]]) -> ObservedPoints:
+        """Those of real objects, object after object, in a batch of one."""
+        real = observation["mask"].astype(np.bool_)
+        points = torch.from_numpy(observation["clouds"][real][..., :2].reshape(1, -1, 2))
+        return cls(points, *(torch.tensor([corner], dtype=points.dtype) for corner in (REACH_LOW, REACH_HIGH)))
+
+    def blocked(self, pushes: Tensor, distance: float) -> Tensor:
+        """`[B, N]` bool: `pushes: [B, N, 4]` that start nearer than `distance` metres to a point."""
+        low, high = self.low.unsqueeze(1), self.high.unsqueeze(1)
+        starts = low + (pushes[..., :2].clamp(-1.0, 1.0) + 1.0) / 2.0 * (high - low)
+        if self.points.shape[1] == 0:
+            return torch.zeros_like(starts[..., 0], dtype=torch.bool)
+        # Not by matrix products, in which an infinite point makes all distances NaN.
+        apart = torch.cdist(starts, self.points, compute_mode="donot_use_mm_for_euclid_dist")
+        return apart.amin(-1) < distance

@@ -16,7 +16,7 @@ from cavin_pyro.envs.randomness import GOAL, LAYOUT, named_stream
 from cavin_pyro.envs.tabletop.layouts import GENERATED, generate_task, possible_tasks
 from cavin_pyro.envs.tabletop.objects.object_sets import ObjectSet, load_object_set, plain_name
 from cavin_pyro.envs.tabletop.objects.sampling import Area, ObjectRanges
-from cavin_pyro.envs.tabletop.observation import Observation, state_of
+from cavin_pyro.envs.tabletop.observation import Observation, ObservedPoints
 from cavin_pyro.envs.tabletop.physics import Uncopied
 from cavin_pyro.envs.tabletop.robots import RobotFactory
 from cavin_pyro.envs.tabletop.scene import Scene
@@ -37,7 +37,6 @@ from cavin_pyro.envs.world import Geometry, World
 from cavin_pyro.models.state import State
 
 EPISODE_STEPS = 60
-PLANNING_MARGIN = 0.02  # metres; of the reward by which plans are made
 TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
 OBSTACLE_JITTER = TILE_SIDE / 2  # metres; obstacles start anywhere on their tiles
 VIDEO_SIZE = (512, 424)  # pixels
@@ -64,7 +63,7 @@ class PushingEnv(Uncopied, World):
             `layout="random"` is sampled at every reset. A `Task` object has its own layout.
         generated: what is wanted of `layout="generated"`, which is generated at every reset.
         reward: dense or sparse. criterion: what ends an episode as a violation, see `TaskReward`. Scenes and
-            observations do not depend on it.
+            observations do not depend on it. margin: metres, of the reward by which plans are made.
         objects: how many, 1 to 10. ranges: object parameters, or a mapping of them, which JSON can hold.
         robot: one of `cavin_pyro.envs.tabletop.robots.ROBOTS`, or a factory of robots.
         object_set: a key of `cavin_pyro.envs.tabletop.objects.object_sets.OBJECT_SETS`, or a set.
@@ -80,7 +79,8 @@ class PushingEnv(Uncopied, World):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     space = SPACE
-    features = 64  # of `geometry=`, which makes them of the clouds
+    features = 64  # of `geometry`, which makes them of the clouds
+    sees_clouds = True
 
     def __init__(
         self,
@@ -91,6 +91,7 @@ class PushingEnv(Uncopied, World):
         generated: GeneratedLayouts | None = None,
         reward: str = "sparse",
         criterion: str = "strict",
+        margin: float = 0.02,
         objects: int = 3,
         ranges: ObjectRanges | Mapping[str, Any] | None = None,
         object_set: str | ObjectSet = "builtin",
@@ -123,8 +124,10 @@ class PushingEnv(Uncopied, World):
             self.tasks = possible_tasks(task, layout, tiles)
         if type(self.tasks[0]) not in TASKS.values():
             check_functions(self.tasks[0], int(objects))
-        self._rules = reward, criterion
+        self._rules, self.margin = (reward, criterion), margin
+        self._goals: dict[tuple[int, str], TaskReward] = {}
         self._begin(self.tasks[0])
+        self.goal()
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
@@ -166,6 +169,7 @@ class PushingEnv(Uncopied, World):
             raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
         if self._generate is not None:
             self.tasks = (self._generate(named_stream(scene_generator, LAYOUT)),)
+            self._goals.clear()
         self._begin(self.tasks[number])
         target = _areas(self.task.target_start, TARGET_JITTER)
         obstacle = _areas(self.task.obstacle_start, OBSTACLE_JITTER)
@@ -212,20 +216,43 @@ class PushingEnv(Uncopied, World):
             return None
         return self.scene.photograph(self.scene.camera.resized(*VIDEO_SIZE))
 
-    def state(self, observation: Mapping[str, NDArray[Any]], geometry: Geometry | None = None) -> State:
-        """See `World` and `cavin_pyro.envs.tabletop.observation.state_of`."""
-        if geometry is None:
-            raise ValueError("the state of the table needs a geometry, which makes features of clouds")
-        return state_of(observation, geometry)
+    @property
+    def name(self) -> str:
+        """See `World`."""
+        return self.task.name
+
+    def check_starts(self, seed: int) -> None:
+        """See `World`: in every layout."""
+        for number in range(len(self.tasks)):
+            self.reset(seed=seed, options={"layout": number})
+        if len(self.tasks) > 1:
+            self.reset(seed=seed)  # in the layout that the seed samples
+
+    def state(self, observation: Mapping[str, NDArray[Any]]) -> State:
+        """See `World` and `state_of`."""
+        if self.geometry is None:
+            raise ValueError(
+                "the state of the table needs the geometry of a checkpoint, which makes features of clouds"
+            )
+        return state_of(observation, self.geometry)
+
+    def observed(self, observation: Mapping[str, NDArray[Any]]) -> ObservedPoints:
+        """See `World`."""
+        return ObservedPoints.of(observation)
 
     def positions(self, observation: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """See `World`."""
         return observation["centers"], observation["mask"].astype(np.bool_)
 
     def goal(self, device: str | torch.device = "cpu") -> TaskReward:
-        """The task's reward with the margin that commands give planners; `reward` is that of the episode."""
-        kind = "dense" if self.reward.dense else "sparse"
-        return TaskReward(self.task, reward=kind, margin=PLANNING_MARGIN, device=device)
+        """The task's reward with the margin: one object for each of `tasks`, which keeps what it has computed."""
+        key = id(self.task), str(device)
+        if key in self._goals:
+            return self._goals[key]
+        made = TaskReward(self.task, reward=self._rules[0], margin=self.margin, device=device)
+        if any(self.task is one for one in self.tasks):
+            self._goals[key] = made
+        return made
 
     @property
     def on_frame(self) -> Callable[[], None] | None:
@@ -253,6 +280,27 @@ class PushingEnv(Uncopied, World):
             self._begin(task)
         outcome = _judged(self._strict_reward, observation, observation)
         return not bool(outcome.success | outcome.failure)
+
+
+@torch.inference_mode()
+def state_of(observation: Mapping[str, NDArray[Any]], geometry: Geometry) -> State:
+    """The state `[]` of an observation, without needless padding.
+
+    Args:
+        observation: `centers`, `clouds` and `mask` of `Observation`, [M, ...]. geometry: on the CPU.
+
+    Raises:
+        ValueError: no object, or numbers of one that are not finite.
+    """
+    real = np.flatnonzero(observation["mask"])
+    for name in ("clouds", "centers"):
+        if not (observation[name][real].size and np.isfinite(observation[name][real]).all()):
+            raise ValueError(f"{name} of an observation must be finite numbers of at least one object")
+    objects = int(real.max()) + 1
+    centers = torch.from_numpy(observation["centers"][:objects])
+    clouds = torch.from_numpy(observation["clouds"][:objects]) - centers[:, None]
+    mask = torch.from_numpy(observation["mask"][:objects].astype(np.bool_))
+    return State(centers, geometry(clouds), mask)
 
 
 def _judged(reward: TaskReward, before: Observation, after: Observation, *, fallen: bool = False) -> Outcome:

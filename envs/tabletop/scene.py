@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from cavin_pyro.envs.randomness import SENSOR, named_stream
 from cavin_pyro.envs.tabletop.markings import Place, TileGroup, paint_of
 from cavin_pyro.envs.tabletop.objects.object_sets import BUILTIN, ObjectSet
-from cavin_pyro.envs.tabletop.objects.sampling import Area, NoRoomError, ObjectParameters, ObjectRanges, sample_objects
+from cavin_pyro.envs.tabletop.objects.sampling import Area, ObjectParameters, ObjectRanges, sample_objects
 from cavin_pyro.envs.tabletop.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from cavin_pyro.envs.tabletop.physics import PhysicsWorld, Poses, Uncopied
 from cavin_pyro.envs.tabletop.robots import RobotFactory, robot_factory
@@ -27,6 +27,7 @@ from cavin_pyro.envs.tabletop.segmentation import Pixels, SegmenterFactory, segm
 from cavin_pyro.envs.tabletop.sensors import DepthImage, DepthSensor, sensor_of
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, push_endpoints
+from cavin_pyro.envs.world import NoRoomError
 
 MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians

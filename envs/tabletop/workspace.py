@@ -19,7 +19,6 @@ TABLE_THICKNESS = 0.1  # metres
 REACH_LOW = (0.30, -0.55)  # metres; the planar box that the tool's tip may touch
 REACH_HIGH = (0.80, 0.55)  # metres
 MAXIMUM_MOTION = 0.1  # metres per push, on each axis
-PUSH_DECIMALS = 3  # of a planned push's numbers: 0.1 mm of its motion, 0.25 and 0.55 mm of its start
 
 TILE_SIDE = 0.15  # metres
 TILE_ORIGIN = (0.295, -0.485)  # metres; the centre of tile (0, 0)

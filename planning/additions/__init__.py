@@ -12,7 +12,7 @@ from cavin_pyro.planning.additions.first_push import FirstPush
 from cavin_pyro.planning.additions.guidance import Guidance
 from cavin_pyro.planning.additions.nearest_objects import NearestObjects
 from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts
-from cavin_pyro.planning.additions.touchdown import ObservedPoints, Touchdown
+from cavin_pyro.planning.additions.touchdown import Touchdown
 
 __all__ = [
     "ADDITIONS",
@@ -26,7 +26,6 @@ __all__ = [
     "FirstPush",
     "Guidance",
     "NearestObjects",
-    "ObservedPoints",
     "PerturbedRollouts",
     "Touchdown",
     "make_additions",

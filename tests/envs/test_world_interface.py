@@ -62,7 +62,7 @@ class Line(World):
         self.place += 0.5 * float(action[0])
         return self.place, 0.0, False, False, {"success": False}
 
-    def state(self, observation: Any, geometry: Any = None) -> State:
+    def state(self, observation: Any) -> State:
         return State(torch.tensor([[observation]]), torch.tensor([[0.6, 0.8, 7.0]]), REAL)
 
     def goal(self, device: Any = "cpu") -> Any:

@@ -15,12 +15,9 @@ from scipy.spatial.transform import Rotation
 from cavin_pyro.envs.tabletop.objects.object_sets import BUILTIN, ObjectSet, chosen
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.world import NoRoomError
 
 ATTEMPTS = 400  # arrangements sampled before an area counts as too small
-
-
-class NoRoomError(ValueError):
-    """A layout has no room for the objects of a scene, at least of this one."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class Point(World):
         self.steps += 1
         return self.place, 0.0, done, self.steps >= self.maximum_steps, {"success": done}
 
-    def state(self, observation: Any, geometry: Any = None) -> State:
+    def state(self, observation: Any) -> State:
         centers = torch.as_tensor(np.array(observation, np.float32) * self.flaw)[None]
         return State(centers, torch.ones(1, 1), torch.ones(1, dtype=torch.bool))
 

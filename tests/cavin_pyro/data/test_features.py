@@ -11,8 +11,8 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data import features
 from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_shard
 from cavin_pyro.data.features import cloud_features, geometry_fingerprint, sample_clouds, shard_features
-from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
+from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.models.networks.pointnet import PointNet
 
 
@@ -34,9 +34,9 @@ def test_clouds_without_points_or_with_numbers_that_are_not_finite_are_refused()
     broken[0, 3] = np.nan
     for clouds, some in ((broken, mask), (good[:, :0], mask), (good, ~mask & mask)):
         with pytest.raises(ValueError, match=r"^clouds of an observation must be finite numbers of at least"):
-            observed_state({"clouds": clouds, "centers": good[:, 0], "mask": some}, PointNet())
+            state_of({"clouds": clouds, "centers": good[:, 0], "mask": some}, PointNet())
     broken[[0, 1]] = broken[[1, 0]]  # in padding, anything may stand
-    assert observed_state({"clouds": broken, "centers": good[:, 0], "mask": mask}, PointNet()).features.isfinite().all()
+    assert state_of({"clouds": broken, "centers": good[:, 0], "mask": mask}, PointNet()).features.isfinite().all()
     for empty in (good[:0], good[:, :0]):
         with pytest.raises(ValueError, match=r"^clouds have the shape \[.*0.*\]: at least one with a point is needed$"):
             cloud_features(PointNet(), empty)

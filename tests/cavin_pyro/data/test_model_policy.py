@@ -14,9 +14,9 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.data.collection import check_policy, collect
 from cavin_pyro.data.dataset import read_shard, shard_path
 from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
-from cavin_pyro.data.observed import observed_points, observed_state
 from cavin_pyro.envs.tabletop.objects.sampling import WHOLE_TABLE, ObjectRanges
-from cavin_pyro.envs.tabletop.observation import Observation
+from cavin_pyro.envs.tabletop.observation import Observation, ObservedPoints
+from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
@@ -54,7 +54,7 @@ def distance_to_where_the_intent_points(
     model, geometry = pusher
     policy = ModelPushingPolicy(np.random.default_rng(seed), model, geometry, motions=motions)
     pushes = np.stack([policy.act(observation) for _ in range(3)])
-    state = observed_state(vars(observation), geometry)
+    state = state_of(vars(observation), geometry).expand_plans(1)
     random = torch.Generator().manual_seed(int(np.random.default_rng(seed).integers(2**62)))
     code = model.effect_prior(state).base_dist
     effect = code.loc + code.scale * torch.randn(1, 16, generator=random)
@@ -75,7 +75,7 @@ def test_of_more_motions_the_best_comes_nearer_to_the_subgoal(
 
 def test_no_segment_begins_on_an_object(pusher: tuple[Model, Geometry], observation: Observation) -> None:
     first = torch.from_numpy(np.stack([chosen(pusher, observation, seed, 64)[0] for seed in range(20)]))
-    assert not observed_points(vars(observation)).blocked(first[None], 0.015).any()
+    assert not ObservedPoints.of(vars(observation)).blocked(first[None], 0.015).any()
 
 
 def test_the_seed_determines_the_pushes_whatever_the_number_of_threads(

@@ -13,7 +13,6 @@ import torch
 
 import cavin_pyro
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.observed import observed_state
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.world import executed
 from cavin_pyro.evaluation.evaluation import episode_row, run_missing
@@ -29,6 +28,7 @@ rollout = partial(cavin_pyro.rollout, pushes_per_plan=None)  # executes all T pu
 @pytest.fixture
 def env() -> Any:
     env = PushingEnv(task="crossing", objects=2, maximum_steps=4)
+    env.geometry = PointNet()
     yield env
     env.close()
 
@@ -64,12 +64,11 @@ def happened(episode: Episode) -> list[tuple]:
 
 def test_one_rollout_tells_how_it_ends_by_either_criterion() -> None:
     """Random pushes leave the bridge; by published rules the same episode goes on."""
-    pointnet, ended = PointNet(), []
+    ended = []
     for criterion in ("strict", "published"):
         env = PushingEnv(task="crossing", objects=5, maximum_steps=30, criterion=criterion)
-        ended.append(
-            rollout(env, RandomPlanner(action_dimension=4), pointnet, seed=30)
-        )  # of seeds 10 to 39 the only one that leaves it
+        env.geometry = PointNet()
+        ended.append(rollout(env, RandomPlanner(action_dimension=4), seed=30))  # of seeds 10 to 39 this one leaves it
         env.close()
     strict, published = ended
     assert strict.outcome == "violation"
@@ -108,9 +107,7 @@ class Listener(EpisodeCallback):
 
 def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) -> None:
     listener = Listener()
-    episode = rollout(
-        env, RandomPlanner(action_dimension=4), PointNet(), seed=0, callbacks=[listener, EpisodeCallback()]
-    )
+    episode = rollout(env, RandomPlanner(action_dimension=4), seed=0, callbacks=[listener, EpisodeCallback()])
     called = listener.plans
     assert called == episode.plan_records
     assert listener.transitions == episode.transitions
@@ -130,11 +127,11 @@ def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) 
 def test_an_episode_does_not_depend_on_how_a_machine_rounds(env: PushingEnv) -> None:
     exact, rounded, other = (Rounding(action_dimension=4) for _ in range(3))
     rounded.error, other.error = 1e-6, 2e-3
-    one, same, different = (happened(rollout(env, planner, PointNet(), seed=3)) for planner in (exact, rounded, other))
+    one, same, different = (happened(rollout(env, planner, seed=3)) for planner in (exact, rounded, other))
     assert one == same
     assert one != different
     exact_pushes, rounded_otherwise = (
-        happened(rollout(env, planner, PointNet(), seed=3, push_decimals=None)) for planner in (exact, rounded)
+        happened(rollout(env, planner, seed=3, push_decimals=None)) for planner in (exact, rounded)
     )
     assert exact_pushes != rounded_otherwise
 
@@ -143,7 +140,7 @@ def test_an_episode_does_not_depend_on_how_a_machine_rounds(env: PushingEnv) -> 
 def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
     env: PushingEnv, pushes_per_plan: int | None, steps: list[int]
 ) -> None:
-    episode = rollout(env, Still(3, action_dimension=4), PointNet(), seed=0, pushes_per_plan=pushes_per_plan)
+    episode = rollout(env, Still(3, action_dimension=4), seed=0, pushes_per_plan=pushes_per_plan)
     assert [record.step for record in episode.plan_records] == steps
     assert len(episode.transitions) == 4
     for record, end in zip(episode.plan_records, [*steps[1:], 4], strict=True):
@@ -156,25 +153,24 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
 @pytest.mark.parametrize("pushes", [0, 4])
 def test_as_many_pushes_of_a_plan_are_made_as_there_are(env: PushingEnv, pushes: int) -> None:
     with pytest.raises(UserError, match=f"pushes_per_plan must be between 1 and 3, not {pushes}"):
-        rollout(env, Still(3, action_dimension=4), PointNet(), seed=0, pushes_per_plan=pushes)
+        rollout(env, Still(3, action_dimension=4), seed=0, pushes_per_plan=pushes)
 
 
 def test_the_planner_gets_the_observed_points_without_needless_padding(env: PushingEnv) -> None:
-    pointnet = PointNet()
     observation, _ = env.reset(seed=0)
-    state = observed_state(observation, pointnet)
-    assert state.centers.shape == (1, 2, 3)
-    assert state.mask.tolist() == [[True, True]]
-    np.testing.assert_array_equal(state.centers[0], observation["centers"][:2])
+    state = env.state(observation)
+    assert state.centers.shape == (2, 3)
+    assert state.mask.tolist() == [True, True]
+    np.testing.assert_array_equal(state.centers, observation["centers"][:2])
     with torch.no_grad():
         cloud = torch.from_numpy(observation["clouds"][1] - observation["centers"][1])
-        torch.testing.assert_close(state.features[0, 1], pointnet(cloud), rtol=0, atol=1e-6)
+        torch.testing.assert_close(state.features[1], env.geometry(cloud), rtol=0, atol=1e-6)
     # An object that was never seen leaves a hole, not a shift.
     observation["mask"] = np.array([0, 1, 0, 0, 0], np.int8)
-    assert observed_state(observation, pointnet).mask.tolist() == [[False, True]]
+    assert env.state(observation).mask.tolist() == [False, True]
     observation["mask"][:] = 0
     with pytest.raises(ValueError, match="at least one object"):
-        observed_state(observation, pointnet)
+        env.state(observation)
 
 
 def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: PushingEnv) -> None:
@@ -189,7 +185,7 @@ def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: Pushin
                 actions=torch.zeros(1, 3, 4), subgoals=there, segments=torch.ones(1, dtype=torch.int64)
             )
 
-    episode = rollout(env, Wishful(3, action_dimension=4), PointNet(), seed=0)
+    episode = rollout(env, Wishful(3, action_dimension=4), seed=0)
     distances = [transition.subgoal_distance for transition in episode.transitions]
     assert distances[2] == pytest.approx(0.3, abs=0.05)
     assert np.isnan([distances[0], distances[1]]).all()
@@ -217,14 +213,14 @@ def test_an_evaluation_runs_only_what_is_missing(configure: Any, tmp_path: Path)
 
 def parts(runner: EpisodeRunner) -> SimpleNamespace:
     runner.env.close()
-    return SimpleNamespace(**{**vars(runner), "task": runner.task, "reward": runner.reward(runner.env)})
+    return SimpleNamespace(**{**vars(runner), "reward": runner.env.goal()})
 
 
 def test_options_reach_the_parts(configure: Any) -> None:
     runner = parts(make_runner(configure(*fast("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7"))))
     assert isinstance(runner.planner, CavinPlanner)
     assert (runner.planner.samples, runner.planner.segments) == (8, 2)
-    assert runner.task.name == "insertion" and runner.reward.task == runner.env.task
+    assert runner.env.name == "insertion" and runner.reward.task == runner.env.task
     assert runner.reward.dense and runner.env.reward.dense
     assert (runner.reward.margin, runner.env.reward.margin) == (0.02, 0.0)
     assert (runner.env.maximum_steps, runner.env.objects) == (7, 2)

@@ -92,13 +92,13 @@ def test_every_planner_plans_with_every_optimizer(
     planner: str, optimizer: str, make_small_runner: Callable[..., EpisodeRunner], tmp_path: Path
 ) -> None:
     parts = make_small_runner(planner, FITTING[planner], f"planner.optimizer={optimizer}")
-    episode = rollout(parts.env, parts.planner, parts.geometry, reward=parts.reward, seed=1)
+    episode = rollout(parts.env, parts.planner, seed=1)
     assert episode.outcome in OUTCOMES
     plan = episode.plan_records[0].plan
     assert plan.actions.shape == (1, 3, 4)
     assert plan.actions.isfinite().all()
     assert plan.candidate_centers.shape[2:] == (2, 2, 3)
-    draw_plan(tmp_path / "plan.png", episode, parts.task, parts.env.scene.camera)
+    draw_plan(tmp_path / "plan.png", episode, parts.env.task, parts.env.scene.camera)
     parts.env.close()
 
 
@@ -128,9 +128,7 @@ def test_options_take_effect(planner: str, option: str) -> None:
         name, *own = planner.split()
         overrides = [f"planner={name}", *SMALL, "planner.samples=64", *own, *further, "output=unused"]
         parts = make_runner(compose("evaluate", *overrides))  # the shipped checkpoint knows something
-        plans.append(
-            rollout(parts.env, parts.planner, parts.geometry, reward=parts.reward, seed=1).plan_records[0].plan
-        )
+        plans.append(rollout(parts.env, parts.planner, seed=1).plan_records[0].plan)
         parts.env.close()
     returns, actions = ([getattr(plan, name) for plan in plans] for name in ("candidate_returns", "actions"))
     assert not (torch.equal(*returns) and torch.equal(*actions))
@@ -173,9 +171,9 @@ def test_an_episode_from_python_is_that_of_the_command(checkpoints: dict[str, Pa
     options = {"samples": 16, "horizon": 6}
     config = compose("plan", **world, checkpoint=str(checkpoints["cascaded"]), planner=options)
     runner, trained = make_runner(config), cavin_pyro.load(checkpoints["cascaded"])
-    env = cavin_pyro.make_env(**world)
+    env = cavin_pyro.make_env(**world, geometry=trained.geometry)
     planner = cavin_pyro.make_planner(trained.model, seed=4, **options)
-    one, other = runner.rollout(4), cavin_pyro.rollout(env, planner, trained.geometry, seed=4)
+    one, other = runner.rollout(4), cavin_pyro.rollout(env, planner, seed=4)
     assert [step.action.tolist() for step in one.transitions] == [step.action.tolist() for step in other.transitions]
     assert len(one.plan_records) == len(one.transitions) and one.total_reward == other.total_reward
     runner.env.close(), env.close()

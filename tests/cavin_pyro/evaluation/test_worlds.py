@@ -78,7 +78,7 @@ def test_the_cascade_plans_from_the_state_and_the_goal_of_a_world() -> None:
 def test_an_episode_is_drawn_over_the_worlds_picture_or_on_axes(tmp_path: Path, world: type[Point]) -> None:
     env = world()
     env.render_mode = "rgb_array" if world is Drawn else None
-    runner = EpisodeRunner(env, CavinPlanner(model(), samples=8, horizon=6), None, None, 3)
+    runner = EpisodeRunner(env, CavinPlanner(model(), samples=8, horizon=6), 3)
     row = render_world(runner, tmp_path, seed=1, video=True)
     assert row["outcome"] in ("success", "timeout")
     assert matplotlib.image.imread(tmp_path / "plan.png").std() > 0.01

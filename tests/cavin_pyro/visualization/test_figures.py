@@ -140,7 +140,7 @@ def test_a_map_is_true_to_scale_and_turned_as_the_cameras_image(tmp_path: Path) 
     seen = record(made_up_plan(), photograph=False)
     draw_plan(tmp_path / "plan.png", Episode(0, "fall", [seen]), load_task("crossing", 0), None)
     clouds = seen_centers()[:, None] + 0.02 * np.random.default_rng(0).standard_normal((ROOM, 256, 3))
-    seen = replace(seen, clouds=clouds.astype(np.float32))
+    seen = replace(seen, observation={"clouds": clouds.astype(np.float32)})
     draw_plan(tmp_path / "clouds.png", Episode(0, "fall", [seen]), load_task("crossing", 0), None)
     bare, full = (imageio.imread(tmp_path / name) for name in ("plan.png", "clouds.png"))
     assert pixels_like(full, colors.to_hex(COLORS[1])) > pixels_like(bare, colors.to_hex(COLORS[1])) + 20

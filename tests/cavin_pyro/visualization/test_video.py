@@ -24,9 +24,8 @@ def test_an_episode_is_filmed_from_the_first_push_to_the_last_as_browsers_play_i
     env = PushingEnv(task="insertion", objects=2, maximum_steps=3, camera=camera, render_mode="rgb_array")
     with episode_video(path, env, env.task) as video:
         assert video.camera == camera.resized(*VIDEO_SIZE)
-        episode = rollout(
-            env, RandomPlanner(action_dimension=4), PointNet(), seed=0, photograph=True, callbacks=[video]
-        )
+        env.geometry = PointNet()
+        episode = rollout(env, RandomPlanner(action_dimension=4), seed=0, photograph=True, callbacks=[video])
     env.close()
     images = read(path)
     safe = sum(not transition.unsafe for transition in episode.transitions)

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from cavin_pyro.data.observed import observed_points
+from cavin_pyro.envs.tabletop.observation import ObservedPoints
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import CavinPlanner, MpcPlanner
-from cavin_pyro.planning.additions import ObservedPoints, Touchdown
+from cavin_pyro.planning.additions import Touchdown
 
 LOW, HIGH = torch.tensor([[0.0, -1.0]]), torch.tensor([[1.0, 1.0]])  # metres
 
@@ -91,7 +91,7 @@ def test_the_camera_sees_where_pushes_are_unsafe() -> None:
     env = PushingEnv(task="crossing", objects=3)
     try:
         observation, _ = env.reset(seed=3)
-        points = observed_points(observation)
+        points = env.observed(observation)
         assert points.points.shape == (1, 3 * observation["clouds"].shape[1], 2)
         candidates = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 4)).astype(np.float32)
         candidates[:, 2:] = 0.0
