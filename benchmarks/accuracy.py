@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 from pyro import poutine
 
-from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene, pushing_policy
+from cavin_pyro.data.collection import CollectionConfig, clutter_area, heuristic_policy, open_scene
 from cavin_pyro.data.features import cloud_features
 from cavin_pyro.envs.randomness import collection_streams
 from cavin_pyro.envs.tabletop.observation import Observation
@@ -64,7 +64,7 @@ def play(
     generator, policy_generator = collection_streams(config.seed, number)
     count = int(generator.integers(config.minimum_objects, config.maximum_objects + 1))
     seen = [scene.sample([clutter_area(generator)] * count, config.ranges, generator)]
-    policy = pushing_policy(config, policy_generator)
+    policy = heuristic_policy(config, policy_generator)
     there, actions = [scene.ground_truth()], []
     for _ in range(config.steps):
         action = policy.act(seen[-1]).astype(np.float32)

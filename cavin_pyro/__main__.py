@@ -20,7 +20,6 @@ ORDER = (
     "pretrain",
     "train",
     "check",
-    "calibrate",
     "reproduce",
     "assets",
 )

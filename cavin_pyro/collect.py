@@ -11,7 +11,7 @@ from cavin_pyro.config.application import DictConfig, command
 
 @command("collect")
 def main(config: DictConfig) -> None:
-    """Collect pushes by the heuristic policy, or by a model, into a dataset folder, with their statistics.
+    """Collect pushes by the heuristic policy into a dataset folder, with their statistics.
 
     In another world than the tabletop, episodes of its own policy. Resumes an interrupted run.
     """
@@ -42,7 +42,7 @@ def _collection(config: DictConfig) -> Any:
     from cavin_pyro.config.commands import CollectionOptions
     from cavin_pyro.config.errors import UserError, user_input
     from cavin_pyro.config.world import world_of
-    from cavin_pyro.data.collection import check_policy, collecting_world
+    from cavin_pyro.data.collection import collecting_world
     from cavin_pyro.data.episodes import WorldCollection
 
     given = {one.name: config[one.name] for one in fields(CollectionOptions)}
@@ -50,9 +50,7 @@ def _collection(config: DictConfig) -> Any:
     if world is None:
         if config.minimum_objects > config.maximum_objects:
             raise UserError(f"minimum_objects must be at most maximum_objects={config.maximum_objects}")
-        collection = replace(collecting_world(config.env), **given)
-        check_policy(collection)
-        return collection
+        return replace(collecting_world(config.env), **given)
     own = {name: given.pop(name) for name in ("seed", "steps", "episodes_per_shard")}
     for name, value in given.items():
         if value != getattr(CollectionOptions, name):

@@ -192,6 +192,52 @@ def test_planning_starts_without_pyro_pybullet_and_the_other_packages() -> None:
     assert others <= {"cavin_pyro.models", "cavin_pyro.models.state"}
 
 
+def make(folder: Path, *arguments: str) -> str:
+    """What `make -n` would run with the repository's Makefile in another folder."""
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        (folder / name).write_bytes((ROOT / name).read_bytes())
+    command = ["make", "-n", *arguments]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def test_make_says_what_an_installation_takes_before_it_begins(tmp_path: Path) -> None:
+    lines = make(tmp_path, "demo").splitlines()
+    said = next(number for number, line in enumerate(lines) if re.search(r"echo .* minutes.* GB", line))
+    installs = [number for number, line in enumerate(lines) if " -m venv " in line or "pip install" in line]
+    assert said < min(installs)
+
+
+def test_make_installs_again_what_is_no_longer_editable(tmp_path: Path) -> None:
+    packages = tmp_path / ".venv" / "lib" / "python3.11" / "site-packages"
+    packages.mkdir(parents=True)
+    (packages / "__editable__.cavin_pyro-0.2.0.pth").touch()
+    make(tmp_path, "demo")
+    (tmp_path / ".venv" / "installed").touch()
+    assert "pip install" not in make(tmp_path, "demo", "-o", "pyproject.toml", "-o", "constraints.txt")
+    (packages / "cavin_pyro").mkdir()
+    assert "--editable" in make(tmp_path, "demo", "-o", "pyproject.toml", "-o", "constraints.txt")
+
+
+def test_documented_extras_keep_the_installation_editable() -> None:
+    pages = [file for file in repository_files() if file.suffix == ".md"]
+    lines = re.findall(r"pip install[^`\n]*'\.\[.*", "\n".join(page.read_text() for page in pages))
+    assert lines and all("--editable" in line or "--dry-run" in line for line in lines)
+
+
+def test_the_site_keeps_names_of_options_whole_is_searched_from_disk_and_its_tables_have_heads() -> None:
+    style = (ROOT / "docs" / "assets" / "extra.css").read_text()
+    assert re.search(r"td code[^}]*\{[^}]*word-break: normal", style, re.DOTALL)
+    configuration = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
+    assert configuration["extra_css"] == ["assets/extra.css"] and {"search", "offline"} <= {
+        plugin for plugin in configuration["plugins"] if isinstance(plugin, str)
+    }
+    assert configuration["use_directory_urls"] is False
+    headless = re.compile(r"^\|(?: *\|)+\n\| *:?---", re.MULTILINE)
+    assert not [
+        place(file) for file in repository_files() if file.suffix == ".md" and headless.search(file.read_text())
+    ]
+
+
 def test_no_file_names_a_path_of_somebodys_machine() -> None:
     found = []
     for file in repository_files():

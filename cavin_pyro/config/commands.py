@@ -97,9 +97,6 @@ class CollectionOptions:
     steps: int = option(10, "pushes per episode", minimum=1)
     intent_length: int = option(5, "pushes in a row that share a target object and a direction", minimum=1)
     perturbation_rate: float = option(0.3, "fraction of pushes with a perturbed start", minimum=0, maximum=1)
-    policy: str = option("heuristic", "what chooses pushes; model has a checkpoint", choices=("heuristic", "model"))
-    checkpoint: str | None = option(None, "checkpoint for policy=model, by name or path; by default contact")
-    motions: int = option(256, "motions sampled for each effect, for policy=model", minimum=1)
     minimum_objects: int = option(1, "objects on the table, at least", minimum=1)
     maximum_objects: int = option(OBJECT_SLOTS, "objects, at most", minimum=1, maximum=MAXIMUM_OBJECTS)
     episodes_per_shard: int = option(50, "episodes per file, the unit of resuming", minimum=1, maximum=10_000)
@@ -213,25 +210,6 @@ class CheckConfig:
 
 
 @dataclass
-class CalibrateConfig(DeviceOptions):
-    """Options of `python -m cavin_pyro.calibrate`."""
-
-    defaults: list[Any] = preset_defaults("")
-    checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
-    trust: list[str] = option([], TRUST)
-    parts: list[str] = option(["guide"], "what to calibrate", choices=("guide", "scales"))
-    data: Any = option("data/pushes", f"{DATA}; the model's training data")
-    output: str | None = option(None, "folder for the checkpoint; by default one in runs/")
-    seed: int = seed_option()
-    steps: int = option(1500, "gradient steps", minimum=1)
-    batch_size: int = option(256, "windows per step", minimum=1)
-    learning_rate: float = option(3e-3, "learning rate of Adam at the start, which falls to a hundredth", positive=True)
-    wake_weight: float = option(0.03, "weight of -ELBO on real windows beside the loss on generated ones", minimum=0)
-    windows: int = option(2000, "held-out windows for measurements", minimum=1)
-    samples: int = option(50, "samples of the guide for each window, in measurements", minimum=2)
-
-
-@dataclass
 class TilesConfig:
     """Fields of the layout to replace, for example `tiles.goal=[[1,2]]` (section `tiles`)."""
 
@@ -323,7 +301,9 @@ class ReproduceConfig(DeviceOptions):
     )
     planners: list[str] = option(["paper", "ours"], "kinds of planners", choices=f"{REPRODUCE}.cells.PLANNERS")
     tasks: list[str] = option(PAPER_TASKS, "tasks", choices=f"{REPRODUCE}.sizes.TASKS")
-    objects: list[int] = option([1, 2, 3, 4, 5], "numbers of objects with sparse rewards, at most those of the scale")
+    objects: list[int] = option(
+        [1, 2, 3, 4, 5], "numbers of objects with sparse rewards", choices=f"{REPRODUCE}.sizes.OBJECT_COUNTS"
+    )
     rewards: list[str] = option(["dense", "sparse"], "rewards of the tasks", choices=f"{REPRODUCE}.sizes.REWARDS")
     episodes: int | None = option(None, "episodes per cell of the top row; by default the scale's", minimum=1)
     bottom_episodes: int | None = option(None, "episodes per cell of the bottom row; by default the scale's", minimum=1)
@@ -340,7 +320,6 @@ COMMANDS: dict[str, type] = {
     "pretrain": PretrainConfig,
     "train": TrainConfig,
     "check": CheckConfig,
-    "calibrate": CalibrateConfig,
     "plan": PlanConfig,
     "evaluate": EvaluateConfig,
     "demo": DemoConfig,

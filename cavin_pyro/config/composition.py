@@ -202,7 +202,9 @@ def _composed(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, st
     config = hydra.compose(name, overrides=list(words), return_hydra_config=True)
     for one in map(_parsed, words):
         section = one.key_or_group.rpartition(".")[0]
-        if one.is_delete() and not section.startswith("hydra"):
+        if re.match(r"hydra\.(?!(launcher|sweeper|searchpath)\b)", one.key_or_group):
+            raise UserError(f"{one.input_line}: Hydra's folders and logs are not used here; choose output=DIR")
+        if one.is_delete():
             raise UserError(f"{one.input_line}: an option cannot be removed; give it a value, {one.key_or_group}=value")
         if one.is_add() or one.is_force_add():  # arguments of a part, which its class checks
             part: Any = OmegaConf.select(config, section) if section else None

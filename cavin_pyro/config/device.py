@@ -5,8 +5,6 @@ from __future__ import annotations
 import ctypes
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -73,14 +71,3 @@ def keep_freed_memory() -> None:
         mallopt(TRIM_THRESHOLD, KEPT)
         mallopt(TOP_PAD, KEPT // 16)
         mallopt(LARGEST_FAST, 0)  # otherwise every large allocation scans all freed small blocks
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute in one thread: which plan wins can change with the rounding of sums in several."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

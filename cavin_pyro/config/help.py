@@ -23,7 +23,6 @@ EXAMPLES = {
     "pretrain": ("data=data/pushes", "data=[data/pushes,data/random]", "held_out_objects=[mug,banana]"),
     "train": ("data=data/pushes", "model=flat guide=flat", "trainer.steps=200000 trainer.batches=bucketed"),
     "check": ("checkpoint=cavin data=data/pushes", "checkpoint=contact windows=2000", "sections=[prior,subgoals]"),
-    "calibrate": ("checkpoint=runs/train/checkpoint.safetensors data=data/pushes", "checkpoint=contact seed=1"),
     "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
     "evaluate": ("task=crossing objects=3", "planner=paper compare=runs/mine", "-m task=clearing,insertion,crossing"),
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
@@ -35,7 +34,7 @@ EPISODES = (
     "env.segmentation env.assets"
 )
 USUAL = {  # options that a user of the field changes, which --help lists; --help=all lists every one
-    "collect": "env/ranges transitions output seed steps policy checkpoint minimum_objects maximum_objects repair "
+    "collect": "env/ranges transitions output seed steps minimum_objects maximum_objects repair "
     "workers launcher env.objects env.camera env.segmentation env.assets "
     "env.ranges.names env.ranges.mass env.ranges.friction",
     "pretrain": "data output device seed clouds held_out_objects steps batch_size learning_rate autoencoder.width "
@@ -45,7 +44,6 @@ USUAL = {  # options that a user of the field changes, which --help lists; --hel
     "windows.held_out_objects objective.elbo.num_particles model.width model.effect_dimension model.motion_dimension",
     "check": "sizes checkpoint data output seed windows sections export trust env.objects env.camera "
     "env.segmentation env.assets sizes.guide.samples sizes.predictive.replicates sizes.subgoals.scenes",
-    "calibrate": "checkpoint data output device seed parts steps batch_size learning_rate windows samples",
     "plan": f"{EPISODES} task tiles.goal video save_goal",
     "evaluate": f"{EPISODES} task episodes compare shard workers",
     "demo": f"{EPISODES} tasks",

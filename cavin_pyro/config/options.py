@@ -57,7 +57,7 @@ class About:
     def names(self) -> tuple[str, ...] | None:
         """The choices, None if there is no list of them."""
         choices = get_object(self.choices) if isinstance(self.choices, str) else self.choices
-        return None if choices is None else tuple(choices)
+        return None if choices is None else tuple(map(str, choices))
 
     @property
     def range(self) -> str:
@@ -130,7 +130,7 @@ def check_value(name: str, value: Any, about: About) -> None:
         if value == []:
             raise UserError(f"{name} must name at least one: choose from {', '.join(about.names or ())}")
         for entry in value if isinstance(value, list) else [value]:
-            if entry not in (about.names or ()):
+            if str(entry) not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")
         return
     low, high = about.minimum, about.maximum

@@ -80,7 +80,7 @@ def assess_guide(
             "What 90 % regions cover, of all codes jointly and of the informed dimensions of each: good if the 95 % "
             f"interval over episodes lies within {GOOD[0]:.0%} to {GOOD[1]:.0%}, bad if it lies outside of "
             f"{BAD[0]:.0%} to {BAD[1]:.0%}.",
-            "Too narrow: run calibrate, or train longer, or with guide=joint or guide=flow.",
+            "Too narrow: train longer, or with guide=joint or guide=flow.",
             episodes,
         ),
         [

@@ -21,23 +21,15 @@ from cavin_pyro.config.world import object_ranges, part_of
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.data.episodes import WorldCollection
-from cavin_pyro.data.model_policy import ModelPushingPolicy, load_pusher
 from cavin_pyro.envs.randomness import collection_streams
 from cavin_pyro.envs.tabletop.objects.sampling import WHOLE_TABLE, Area, ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation
-from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy
+from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy, Intent
 from cavin_pyro.envs.tabletop.scene import PushReport, Scene
 from cavin_pyro.envs.tabletop.workspace import POINTS_PER_OBJECT, object_slots
 from cavin_pyro.launching.launcher import Launcher, as_launcher
-from cavin_pyro.models.model import Model
-from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.storage.checkpoint import find_checkpoint
-from cavin_pyro.storage.files import file_digest
 from cavin_pyro.storage.progress import progress_bar
 
-PUSHER = "contact"  # the checkpoint of policy=model, without another
-OPTIONS_OF_POLICIES = {"model": ("checkpoint", "motions"), "heuristic": ("intent_length", "perturbation_rate")}
-PushingPolicy = HeuristicPushingPolicy | ModelPushingPolicy
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
 
 
@@ -47,7 +39,7 @@ class CollectionConfig(CollectionOptions):
 
     Attributes:
         ranges: object parameters. object_set: as `env.objects`. assets: folder of meshes, for a set that needs one;
-            its path does not affect the data. Of a checkpoint its content does, not its path.
+            its path does not affect the data.
         camera, segmentation: as `env.camera` and `env.segmentation`, by name or with a class of the user's.
     """
 
@@ -58,11 +50,10 @@ class CollectionConfig(CollectionOptions):
     segmentation: Any = WorldConfig.segmentation
 
     def stored(self) -> dict[str, Any]:
-        """The configuration in the metadata, with the SHA-256 of a checkpoint that chooses the pushes for its name."""
+        """The configuration in the metadata."""
         made: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # with lists in place of tuples, as it is stored
         del made["assets"]
-        chooser = find_checkpoint(self.checkpoint or PUSHER) if self.policy == "model" else None
-        return made | {"checkpoint": chooser and file_digest(chooser)}
+        return made | {"policy": "heuristic"}  # older programs had another one, whose datasets do not go on with this
 
     def shard(self, number: int) -> Arrays:
         """The arrays of a shard, which its number and the configuration determine."""
@@ -143,7 +134,7 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
     count = int(scene_generator.integers(config.minimum_objects, config.maximum_objects + 1))
     with user_input():
         observation = scene.sample([clutter_area(scene_generator)] * count, config.ranges, scene_generator)
-    policy = pushing_policy(config, policy_generator)
+    policy = heuristic_policy(config, policy_generator)
     arrays = _blank(config, scene)
     arrays["mask"][:] = observation.mask
     arrays["episode"] = np.array(episode, np.int64)
@@ -152,7 +143,7 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
         action = policy.act(observation).astype(np.float32)
         report = scene.push(action)
         observation = scene.observe()
-        _record_push(arrays, step, action, report, policy)
+        _record_push(arrays, step, action, report, policy.intent)
         _record_observation(arrays, step + 1, observation)
         arrays["length"] = np.array(step + 1, np.int64)
         if report.fallen:
@@ -160,25 +151,8 @@ def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arr
     return arrays
 
 
-def check_policy(config: CollectionConfig) -> None:
-    """Check that the pushes can be chosen, before anything is written.
-
-    Raises:
-        UserError: the checkpoint cannot be used, or an option of the other policy is given.
-    """
-    for policy, names in OPTIONS_OF_POLICIES.items():
-        for name in names if policy != config.policy else ():
-            value = getattr(config, name)
-            if value != getattr(CollectionOptions, name):
-                raise UserError(f"{name}={value} is of policy={policy}: add that, or leave {name}")
-    if config.policy == "model":
-        _pusher(config.checkpoint or PUSHER)
-
-
-def pushing_policy(config: CollectionConfig, generator: np.random.Generator) -> PushingPolicy:
+def heuristic_policy(config: CollectionConfig, generator: np.random.Generator) -> HeuristicPushingPolicy:
     """What chooses the pushes of one episode; `generator`: its randomness, see `collection_streams`."""
-    if config.policy == "model":
-        return ModelPushingPolicy(generator, *_pusher(config.checkpoint or PUSHER), motions=config.motions)
     return HeuristicPushingPolicy(
         generator, intent_length=config.intent_length, perturbation_rate=config.perturbation_rate
     )
@@ -211,12 +185,12 @@ def _record_observation(arrays: Arrays, step: int, observation: Observation) -> 
     arrays["visible"][step] = observation.visible
 
 
-def _record_push(arrays: Arrays, step: int, action: np.ndarray, report: PushReport, policy: PushingPolicy) -> None:
+def _record_push(arrays: Arrays, step: int, action: np.ndarray, report: PushReport, intent: Intent) -> None:
     arrays["actions"][step] = action
     arrays["moved"][step, : len(report.moved)] = report.moved
     arrays["unsafe"][step], arrays["ineffective"][step] = report.unsafe, report.ineffective
     arrays["fallen"][step] = report.fallen
-    arrays["target"][step], arrays["angle"][step] = policy.intent.target, policy.intent.angle
+    arrays["target"][step], arrays["angle"][step] = intent.target, intent.angle
 
 
 def open_scene(config: CollectionConfig) -> Scene:
@@ -238,12 +212,6 @@ def open_scene(config: CollectionConfig) -> Scene:
 def _scene(parts: str) -> Scene:
     """One per worker process; `parts` as JSON."""
     return open_scene(CollectionConfig(**json.loads(parts)))
-
-
-@cache
-def _pusher(checkpoint: str) -> tuple[Model, Geometry]:
-    """One per worker process."""
-    return load_pusher(checkpoint)
 
 
 def _collect_shard(job: tuple[Collection, int]) -> Arrays:

@@ -18,7 +18,7 @@ an action.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,11 +90,6 @@ WORLD_ARRAYS = {
 DECLARED = ARRAYS | FEATURES
 
 
-def arrays_of(metadata: Mapping[str, Any]) -> dict[str, Declared]:
-    """The arrays of a dataset's shards: of the tabletop, or of another world."""
-    return WORLD_ARRAYS if "space" in metadata["configuration"] else ARRAYS
-
-
 def space_of(metadata: Mapping[str, Any]) -> Space | None:
     """The space of a dataset's world; None of the tabletop, whose geometry makes the features."""
     section = metadata["configuration"].get("space")
@@ -145,38 +140,33 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapp
     Raises:
         CorruptShardError: the file is missing, truncated, damaged or not a shard; it is named.
     """
-    arrays = Arrays()
-    for defect in find_damage(path, names, metadata or {}, arrays):
-        raise CorruptShardError(f"shard {path} is missing or corrupt ({defect})")
+    metadata = metadata or {}
+    configuration, arrays, where = metadata.get("configuration", {}), Arrays(), ""
+    declared = WORLD_ARRAYS if "space" in configuration else DECLARED
+    try:
+        with h5py.File(path, "r") as file:
+            check_file(file, configuration, declared)
+            for name in sorted(file) if names is None else names:
+                where = f"array {name}: "
+                arrays[name] = file[name][()]
+                check_values(name, arrays[name], declared)
+        where = ""
+        _check_agreement(arrays, metadata)
+    except UNREADABLE as error:
+        defect = f"{where}{str(error).splitlines()[0]}" if path.exists() else "it is missing"
+        raise CorruptShardError(f"shard {path} is missing or corrupt ({defect})") from error
     return arrays
 
 
-def find_damage(path: Path, names: Iterable[str] | None, metadata: Mapping[str, Any], arrays: Arrays) -> Iterator[str]:
-    """What is wrong with a file by itself, for `read_shard`; what can be read of it goes into `arrays`."""
-    try:
-        with h5py.File(path, "r") as file:
-            configuration = metadata.get("configuration", {})
-            declared = WORLD_ARRAYS if "space" in configuration else DECLARED
-            check_file(file, configuration, declared)
-            for name in sorted(file) if names is None else names:
-                try:
-                    array = file[name][()]
-                    check_values(name, array, declared)
-                    arrays[name] = array
-                except UNREADABLE as error:
-                    yield f"array {name}: {str(error).splitlines()[0]}"
-    except UNREADABLE as error:
-        yield str(error).splitlines()[0] if path.exists() else "it is missing"
-    else:
-        yield from _contradictions(arrays, metadata)
-
-
-def _contradictions(arrays: Arrays, metadata: Mapping[str, Any]) -> Iterator[str]:
-    """Contradictions between readable arrays of a shard and the metadata."""
-    if {"length", "actions"} <= set(arrays) and (arrays["length"] > arrays["actions"].shape[1]).any():
-        yield f"array length: {arrays['length'].max()} pushes in an episode of {arrays['actions'].shape[1]}"
-    if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= len(metadata["shape_names"]):
-        yield f"array shape: object {arrays['shape'].max()} of {len(metadata['shape_names'])} in metadata.json"
+def _check_agreement(arrays: Arrays, metadata: Mapping[str, Any]) -> None:
+    """Raise a ValueError for numbers of a shard that contradict its other arrays or the metadata."""
+    if {"length", "actions"} <= set(arrays) and arrays["length"].max() > (pushes := arrays["actions"].shape[1]):
+        raise ValueError(f"array length: {arrays['length'].max()} pushes in an episode of {pushes}")
+    if {"target", "mask"} <= set(arrays) and arrays["target"].max() >= (slots := arrays["mask"].shape[1]):
+        raise ValueError(f"array target: object {arrays['target'].max()} of {slots}")
+    known = len(metadata.get("shape_names", ()))
+    if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= known:
+        raise ValueError(f"array shape: object {arrays['shape'].max()} of {known} in metadata.json")
 
 
 def check_file(file: h5py.File, configuration: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
@@ -245,7 +235,7 @@ def padded(arrays: Mapping[str, NDArray[Any]], objects: int) -> Arrays:
         sizes = zip(DECLARED[name].dimensions, array.shape, strict=True)
         ends = [(0, objects - size if dimension == "M" else 0) for dimension, size in sizes]
         if np.min(ends) < 0:
-            raise UserError(f"{name} has room for more than {objects} objects, of which the metadata tell: verify it")
+            raise UserError(f"{name} has room for more than the {objects} objects of the metadata: collect it again")
         wider[name] = np.pad(array, ends, constant_values=DECLARED[name].padding) if np.any(ends) else array
     return wider
 
@@ -377,15 +367,6 @@ def check_distinct(folders: Sequence[Path]) -> None:
         known[content] = folder
 
 
-def repeated_episode(known: set[int], episodes: NDArray[np.int64]) -> str | None:
-    """What a shard repeats of the `known` numbers, such as "repeats episode 3"; its own are added."""
-    for number in episodes.tolist():
-        if number in known:
-            return f"repeats episode {number}"
-        known.add(number)
-    return None
-
-
 def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
     """Yield (number, arrays) of a dataset's shards in order.
 
@@ -405,8 +386,11 @@ def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = F
                 raise
             print(f"left out: {error.args[0]}", flush=True)
             continue
-        if repetition := repeated_episode(known, arrays["episode"]):
-            raise UserError(f"shard {path} {repetition}: delete it and collect again with repair=true to rebuild it")
+        if repeated := known.intersection(arrays["episode"].tolist()):
+            raise UserError(
+                f"shard {path} repeats episode {min(repeated)}: delete it and collect again with repair=true"
+            )
+        known.update(arrays["episode"].tolist())
         whole += 1
         yield number, arrays
     if whole == 0:

@@ -384,7 +384,7 @@ class _Finder:
         """Append arrays [E, S+1, ...]."""
         filled = self._filled + arrays["mask"].shape[0] * arrays["mask"].shape[1]
         if filled > self._states:
-            raise UserError(f"dataset {self._where} has more episodes than its metadata tell: verify it")
+            raise UserError(f"dataset {self._where} has more episodes than its metadata tell: collect it again")
         for name, array in arrays.items():
             rows = array.reshape(-1, *array.shape[2:])
             if name not in self._stored:

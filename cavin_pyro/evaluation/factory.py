@@ -174,7 +174,7 @@ def planner_of(
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
     if options.pop("model_free", False):
         with user_input("planner"):
-            return construct(options, action_dimension=action_dimension)
+            return _with_pushes(config, construct(options, action_dimension=action_dimension))
     if model is None:
         raise UserError(f"{planner_name(config)} needs a model: give one, or choose planner=random")
     pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
@@ -187,7 +187,14 @@ def planner_of(
     optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
     given = {"model": model, "additions": additions, "decimals": config.get("push_decimals"), **optimizers}
     with user_input("planner"):
-        return construct(options, **given)
+        return _with_pushes(config, construct(options, **given))
+
+
+def _with_pushes(config: DictConfig, planner: Planner) -> Planner:
+    """The planner, whose plans have as many pushes as are to be executed, or a `UserError`."""
+    if config.pushes_per_plan is not None:
+        check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
+    return planner
 
 
 @user_input("planner", "checkpoint", "task", "tiles", "env", "layout", "generated", "pushes_per_plan")
@@ -206,8 +213,6 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
             model = None if model_free else trained.model
             env.geometry = trained.geometry  # on the CPU, so that states are the same for every device
         planner = planner_of(config, model, device, action_dimension=env.space.actions)
-        if config.pushes_per_plan is not None:
-            check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
         with user_input():
             env.check_starts(config.seed)  # fails now, not in a later episode
     except BaseException:

@@ -169,6 +169,8 @@ def rollout(
             optimizer of the user's own breaks the interface of optimizers.
         RuntimeError: the robot stands in the camera's view.
     """
+    if push_decimals is not None and not 1 <= push_decimals <= 6:
+        raise UserError(f"push_decimals must be None or between 1 and 6, not {push_decimals}")
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None

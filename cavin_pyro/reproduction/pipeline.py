@@ -21,7 +21,7 @@ from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_j
 from cavin_pyro.launching.launcher import Launcher, of_shard
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Cell, cells
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.sizes import OBJECT_COUNTS, SIZES, Size
+from cavin_pyro.reproduction.sizes import SIZES, Size
 from cavin_pyro.reproduction.table import TABLE, as_table, episode_row, write_table
 from cavin_pyro.storage.files import clear_abandoned
 from cavin_pyro.storage.progress import progress_bar
@@ -66,7 +66,7 @@ def chosen_size(config: DictConfig) -> Size:
     """The size that `scale` names, with the given episodes, scenes, tasks, rewards and numbers of objects.
 
     Raises:
-        UserError: more episodes than there are scenes, or objects that the figure lacks.
+        UserError: more episodes than there are scenes.
     """
     size = SIZES[config.scale]
     given = {name: config[name] for name in ("episodes", "bottom_episodes", "first_scene") if config[name] is not None}
@@ -74,8 +74,6 @@ def chosen_size(config: DictConfig) -> Size:
     for name in ("episodes", "bottom_episodes"):
         if given.get(name, 0) > most:
             raise UserError(f"{name} must be at most {most} with scale={config.scale}, not {given[name]}")
-    if odd := set(config.objects) - set(OBJECT_COUNTS):
-        raise UserError(f"objects has {min(odd)}: choose from {', '.join(map(str, OBJECT_COUNTS))}")
     tasks = tuple(one for one in size.tasks if one in config.tasks)
     counts = tuple(one for one in size.object_counts if one in config.objects)
     return replace(size, **given, tasks=tasks, object_counts=counts, rewards=tuple(config.rewards))

@@ -159,12 +159,15 @@ def save(
         provenance: where the weights come from; by default this process.
 
     Raises:
-        UserError: a part is no `cavin_pyro.models.part.Part`, or was built with something that no file can describe.
+        UserError: nothing to save, or a guide without its model; a part is no `cavin_pyro.models.part.Part`, or was
+            built with something that no file can describe.
     """
+    parts = {"model": model, "guide": guide, "geometry": geometry, **others}
+    if all(part is None for part in parts.values()) or (guide is not None and model is None):
+        raise UserError(f"save needs {'a part' if guide is None else 'the model of this guide'}: give model=")
     stored = dict(config or {})
     if model is not None and "model" not in stored:
         stored |= describe(model=model, guide=guide, geometry=geometry)
-    parts = {"model": model, "guide": guide, "geometry": geometry, **others}
     tensors = {
         f"{_stored_name(part, module)}.{name}": value.detach().cpu().clone(memory_format=contiguous_format)
         for part, module in parts.items()

@@ -224,8 +224,7 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
     """Copy the weights of the checkpoint `config.initial` into model and guide; other parts are a `UserError`.
 
     Returns:
-        Its digest and provenance, for that of the new one. What a calibration has found stays true where f alone is
-        trained: neither the codes' priors nor what a guide reads depends on f.
+        Its digest and provenance, for that of the new one.
     """
     checkpoint = load(config.initial)
     checkpoint.load_into("model", model)
@@ -235,9 +234,7 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
         raise UserError(
             f"checkpoint {checkpoint.path} was trained with other geometric features: give its geometry= or pointnet="
         )
-    about = checkpoint.provenance
-    kept = {name: about[name] for name in ("calibrated",) if name in about and list(config.trained) == ["dynamics"]}
-    return {**kept, "initial": {"sha256": file_digest(checkpoint.path), "provenance": about}}
+    return {"initial": {"sha256": file_digest(checkpoint.path), "provenance": checkpoint.provenance}}
 
 
 def train_only(names: Sequence[str], model: Model, guide: Guide) -> None:

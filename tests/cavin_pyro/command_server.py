@@ -37,7 +37,6 @@ IMPORTED = (  # what the commands import when they are run; not the commands the
     "cavin_pyro.config.help",
     "cavin_pyro.criticism.export",
     "cavin_pyro.criticism.loading",
-    "cavin_pyro.criticism.recalibration",
     "cavin_pyro.criticism.report",
     "cavin_pyro.criticism.sections",
     "cavin_pyro.data.collection",

@@ -27,7 +27,6 @@ SMALL = {  # options that make each command a matter of a second
     "windows.minimum_move=0.001 windows.validation_fraction=0.4",
     "plan": f"{EPISODES} video=false",
     "evaluate": f"{EPISODES} episodes=2 workers=1",
-    "calibrate": "steps=2 batch_size=4 windows=4 samples=3",
     "check": "windows=2 sections=[elbo]",
     "reproduce": "",
 }

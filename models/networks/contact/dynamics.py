@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
@@ -140,11 +138,6 @@ class ContactDynamics(Outcome):
         mean, rows, scales = self._predict(state, action)
         still = _scales(self.still_scale.unsqueeze(1)).T.expand(state.objects, -1)
         return mean, rows.write(still, _scales(scales))
-
-    @torch.no_grad()
-    def widen(self, factor: float) -> None:
-        """Multiply the scales of centres by `factor`, those of objects out of reach excepted, within their range."""
-        self.head.bias[3] += math.log(factor)
 
     def _predict(self, state: State, action: Tensor) -> tuple[State, Rows, Tensor]:
         """The mean `[...]`, what was computed, and logarithms of its scales `[2, R]`."""

@@ -50,7 +50,6 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),
     ("pretrain", "data=@old_data", "has format version 0, this program reads 1: collect it again"),
     ("collect", "output=@pushes seed=4", "holds a dataset with"),
-    ("collect", "motions=3", "motions=3 is of policy=model: add that, or leave motions"),
     *((command, "output=@checkpoint/below", "cannot be written (Not a directory)") for command in GOOD),
 ]
 

@@ -100,6 +100,8 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("+unknown=1", "unknown option 'unknown': valid are "),
     ("++env.ranges.clearnace=1", "unknown option 'env.ranges.clearnace': did you mean clearance? "),
     ("~task", "~task: an option cannot be removed"),
+    ("hydra.run.dir=here", "hydra.run.dir=here: Hydra's folders and logs are not used here; choose output=DIR"),
+    ("reproduce objects=[]", "objects must name at least one: choose from 1, 2, 3, 4, 5"),
     ("seed", "seed: Error parsing override"),
     ("seed=[1,", "seed=[1,: "),
     ("seed=1,2", "seed=1,2: Ambiguous value for argument 'seed=1,2'; several values need -m: "),

@@ -50,8 +50,7 @@ def test_collecting_without_options_is_that_of_the_command() -> None:
     config = compose("collect")
     usual = CollectionConfig()
     assert collecting_world(config.env) == usual
-    shared = ("seed", "steps", "policy", "checkpoint", "motions", "intent_length", "perturbation_rate")
-    for name in (*shared, "maximum_objects", "episodes_per_shard"):
+    for name in ("seed", "steps", "intent_length", "perturbation_rate", "maximum_objects", "episodes_per_shard"):
         assert config[name] == getattr(usual, name)
 
 

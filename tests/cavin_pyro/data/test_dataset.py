@@ -91,6 +91,7 @@ SPOILT: dict[str, tuple[Callable[[Path, Arrays], Any], str]] = {
     "another type": (changed("actions", lambda one: one.astype(float)), "actions has type float64, not float32"),
     "not finite": (changed("actions", lambda one: one * np.nan), "actions has values outside of -1 to 1: nan to nan"),
     "longer": (changed("length", lambda one: one + 7), "array length: 13 pushes in an episode of 6"),
+    "an object too many": (changed("target", lambda one: one + 5), r"array target: object \d of 5"),
     "elsewhere": (linked, "actions is no array in this file"),
     "unpacks to 660 gigabytes": (bomb, r"centers has shape \[1000000000, 11, 5, 3\]"),
 }
@@ -103,11 +104,12 @@ def test_a_shard_that_does_not_fit_is_named_and_can_be_skipped(
     change, said = SPOILT[kind]
     path = shard_path(own_pushes, 1)
     change(path, read_shard(path))
+    names = ("actions", "length", "mask", "target")
     with pytest.raises(UserError, match=rf"^shard .*episodes-00001\.h5 is missing or corrupt \(.*({said})") as refused:
-        list(iterate_shards(own_pushes, ("actions", "length", "mask")))
+        list(iterate_shards(own_pushes, names))
     assert "\n" not in str(refused.value) and "repair=true" in str(refused.value)
     assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)  # from another process
-    kept = [number for number, _ in iterate_shards(own_pushes, ("actions", "length", "mask"), skip_corrupt=True)]
+    kept = [number for number, _ in iterate_shards(own_pushes, names, skip_corrupt=True)]
     assert kept == [0, 2]
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(f"left out: shard {path}") and "repair" not in line
@@ -134,7 +136,7 @@ def test_padding_adds_slots_without_objects(pushes: Path) -> None:
     assert (wider["shape"][:, 5:] == -1).all() and not wider["mask"][:, 5:].any()
     for name, array in arrays.items():
         np.testing.assert_array_equal(wider[name][tuple(map(slice, array.shape))], array, err_msg=name)
-    with pytest.raises(UserError, match="room for more than 4 objects"):
+    with pytest.raises(UserError, match="room for more than the 4 objects"):
         padded(arrays, 4)
     assert slots_of(read_metadata(pushes)) == 5
 

@@ -150,10 +150,19 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
         np.testing.assert_array_equal(episode.reached(record), [transition.centers for transition in made])
 
 
-@pytest.mark.parametrize("pushes", [0, 4])
-def test_as_many_pushes_of_a_plan_are_made_as_there_are(env: PushingEnv, pushes: int) -> None:
-    with pytest.raises(UserError, match=f"pushes_per_plan must be between 1 and 3, not {pushes}"):
-        rollout(env, Still(3, action_dimension=4), seed=0, pushes_per_plan=pushes)
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ({"pushes_per_plan": 0}, "pushes_per_plan must be between 1 and 3, not 0"),
+        ({"pushes_per_plan": 4}, "pushes_per_plan must be between 1 and 3, not 4"),
+        ({"push_decimals": -3}, "push_decimals must be None or between 1 and 6, not -3"),
+    ],
+)
+def test_as_many_pushes_and_decimals_of_a_plan_are_executed_as_there_are(
+    env: PushingEnv, option: dict[str, int], said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        rollout(env, Still(3, action_dimension=4), seed=0, **option)
 
 
 def test_the_planner_gets_the_observed_points_without_needless_padding(env: PushingEnv) -> None:

@@ -107,7 +107,7 @@ def test_shards_share_the_trainings_without_overlap() -> None:
     [
         ("shard=6/6", "no cell of scale=smoke has these methods, planners, tasks, objects and rewards"),
         ("episodes=1001", "episodes must be at most 1000 with scale=smoke, not 1001"),
-        ("objects=[6]", "objects has 6: choose from 1, 2, 3, 4, 5"),
+        ("objects=[6]", "unknown objects 6: choose from 1, 2, 3, 4, 5"),
         ("models=nowhere", "models=nowhere holds no cavin-0.safetensors"),
     ],
 )

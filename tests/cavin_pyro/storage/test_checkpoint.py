@@ -78,12 +78,14 @@ def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: P
     ):
         with pytest.raises(UserError, match=said):
             save(tmp_path / "a.safetensors", model=model)
-    with pytest.raises(UserError, match="^the guide was built for another model"):
-        save(
-            tmp_path / "a.safetensors",
-            model=CascadedModel(space=SPACE),
-            guide=CascadedGuide(CascadedModel(space=SPACE)),
-        )
+    model, guide = CascadedModel(space=SPACE), CascadedGuide(CascadedModel(space=SPACE))
+    for parts, said in (
+        ({"model": model, "guide": guide}, "^the guide was built for another model"),
+        ({"guide": guide}, "^save needs the model of this guide: give model="),
+        ({"config": {"model": {}}}, "^save needs a part: give model="),
+    ):
+        with pytest.raises(UserError, match=said):
+            save(tmp_path / "a.safetensors", **parts)
     assert not list(tmp_path.iterdir())
 
 
