@@ -17,18 +17,15 @@ def main(config: DictConfig) -> Figures:
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
     from cavin_pyro.storage.run_directory import check_same_run, write_config
-    from cavin_pyro.visualization.rendering import check_goal, episode_files, render_episode, write_goal
+    from cavin_pyro.visualization.rendering import episode_files, render_episode
 
     config.device = choose_device(config.device).type
-    check_goal(config.save_goal)
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "video", "save_goal", "planner.compile"))
+        check_same_run(folder, config, ignore=("output", "video", "planner.compile"))
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
         announce_objects(config)
         row = render_episode(runner, folder, seed=config.seed, video=config.video)
-        if config.save_goal is not None and isinstance(runner.env, PushingEnv):
-            write_goal(config.save_goal, runner.env.scene)
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
         steps = ("push", "pushes") if isinstance(runner.env, PushingEnv) else ("step", "steps")

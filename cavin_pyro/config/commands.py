@@ -265,7 +265,6 @@ class PlanConfig(EpisodeConfig):
 
     output: str | None = option(None, "folder for the results; by default one in runs/")
     video: bool = option(True, "write a video of the episode")
-    save_goal: str | None = option(None, "file.png for the last scene, a goal for task=rearrange")
 
 
 @dataclass
@@ -276,7 +275,6 @@ class EvaluateConfig(LaunchOptions, EpisodeConfig):
     episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1)
     compare: str | None = option(None, "folder of another evaluation of the same scenes, to compare episode by episode")
     shard: str = option("1/1", "i/n: the i-th of every n episodes, so that n machines share the work")
-    merge: list[str] = option([], "folders of finished shards, [a,b], whose episodes are joined")
 
 
 @dataclass

@@ -28,27 +28,18 @@ EXAMPLES = {
     "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
     "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }
-EPISODES = (
-    "planner planner/optimizer layout reward objects maximum_steps seed checkpoint device output pushes_per_plan "
-    "margin planner.samples planner.horizon planner.add planner.compile env.objects env.camera "
-    "env.segmentation env.assets"
-)
-USUAL = {  # options that a user of the field changes, which --help lists; --help=all lists every one
-    "collect": "env/ranges transitions output seed steps minimum_objects maximum_objects repair "
-    "workers launcher env.objects env.camera env.segmentation env.assets "
-    "env.ranges.names env.ranges.mass env.ranges.friction",
-    "pretrain": "data output device seed clouds held_out_objects steps batch_size learning_rate autoencoder.width "
-    "autoencoder.feature_dimension",
-    "train": "model guide prior geometry dynamics scales objective data output device seed pointnet initial trained "
-    "trainer.steps trainer.batch_size trainer.learning_rate trainer.schedule trainer.validate_every trainer.patience "
-    "windows.held_out_objects objective.elbo.num_particles model.width model.effect_dimension model.motion_dimension",
-    "check": "sizes checkpoint data output seed windows sections export trust env.objects env.camera "
-    "env.segmentation env.assets sizes.guide.samples sizes.predictive.replicates sizes.subgoals.scenes",
-    "plan": f"{EPISODES} task tiles.goal video save_goal",
-    "evaluate": f"{EPISODES} task episodes compare shard workers",
-    "demo": f"{EPISODES} tasks",
-    "reproduce": "scale methods planners tasks objects rewards episodes bottom_episodes models output device workers "
-    "shard table",
+# --help lists the options that a user of the field changes, --help=all every one: those without a section, but
+RARE = {
+    *("world", "env/ranges", "criterion", "push_decimals", "matmul_precision", "trust", "launcher", "address"),
+    *("intent_length", "perturbation_rate", "episodes_per_shard", "autoencoder", "skip_corrupt", "first_scene"),
+}
+USUAL = {  # and of sections
+    *("planner.samples", "planner.horizon", "planner.add", "planner.compile"),
+    *("env.objects", "env.camera", "env.segmentation", "env.assets"),
+    *("model.width", "model.effect_dimension", "model.motion_dimension", "objective.elbo.num_particles"),
+    *("trainer.steps", "trainer.batch_size", "trainer.learning_rate", "trainer.schedule", "trainer.validate_every"),
+    *("trainer.patience", "windows.held_out_objects", "autoencoder.width", "autoencoder.feature_dimension"),
+    *("sizes.guide.samples", "sizes.predictive.replicates", "sizes.subgoals.scenes"),
 }
 FACTS_OF_PRESETS = ("model_free", "default_checkpoint")  # which a preset tells the program, and users need not set
 FLAGS = {
@@ -65,7 +56,7 @@ def help_page(
 ) -> str:
     """The page of a command: its docstring, and its options as composed, with those of the preset of each group.
 
-    `everything`: all options, by the part that reads them, instead of the `USUAL` ones.
+    `everything`: all options, by the part that reads them, instead of the usual ones.
     """
     lines = [f"python -m cavin_pyro.{name} [option=value ...]     (cavin_pyro {__version__})", ""]
     lines += textwrap.wrap(" ".join(inspect.cleandoc(purpose).split()), WIDTH)
@@ -73,12 +64,17 @@ def help_page(
     lines += [f"  python -m cavin_pyro.{name} {overrides}".rstrip() for overrides in EXAMPLES[name]]
     hidden = 0
     for section, entries in option_entries(name, config, choices).items():
-        listed = [one for one in entries if everything or one[0].partition("=")[0] in USUAL[name].split()]
+        listed = [one for one in entries if everything or is_usual(one[0].partition("=")[0])]
         lines += ["", section] * bool(listed) + [line for one in listed for line in _entry(*one)]
         hidden += len(entries) - len(listed)
     lines += ["", "Flags"]
     flags = {f"--help{'=all' if hidden else ''}": f"list {hidden or 'all'} {'more ' * bool(hidden)}options"} | FLAGS
     return "\n".join([*lines, *(line for one in flags.items() for line in _entry(*one))])
+
+
+def is_usual(option: str) -> bool:
+    """Whether --help lists an option."""
+    return option in USUAL or ("." not in option and option not in RARE)
 
 
 def option_entries(name: str, config: DictConfig, choices: Mapping[str, str]) -> dict[str, list[tuple[str, str]]]:

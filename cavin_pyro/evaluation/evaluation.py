@@ -32,7 +32,7 @@ from cavin_pyro.storage.run_directory import check_same_run, write_config
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
 NOT_COMPARED = (  # options that may differ between runs of one evaluation
-    *("output", "episodes", "compare", "shard", "merge"),
+    *("output", "episodes", "compare", "shard"),
     *("workers", "launcher", "address"),
 )
 
@@ -65,7 +65,7 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
         others = earlier_rows(Path(config.compare), config) if config.compare else []
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
-        results = summarize((merge if config.merge else run_missing)(config, folder))
+        results = summarize(run_missing(config, folder))
         scene = runner.env.name
         if not config.world.get("_target_"):
             scene += f", layout {config.layout}, {config.reward} reward, {config.objects} objects"
@@ -113,38 +113,12 @@ def seeds_of(config: DictConfig) -> Sequence[int]:
     return seeds
 
 
-def merge(config: DictConfig, folder: Path) -> list[Row]:
-    """Join the episodes of finished shards (`merge=[a,b]`), write them in the order of their seeds and return them.
-
-    A folder without an evaluation of the same options, or a missing episode, is a `UserError`.
-    """
-    rows: dict[int, Row] = {}
-    for shard in map(Path, config.merge):
-        if not (shard / EPISODES_FILE).is_file():
-            raise UserError(f"merge={shard} holds no {EPISODES_FILE}: give the folder of a shard")
-        check_same_run(shard, config, ignore=NOT_COMPARED)
-        rows |= finished_episodes(shard / EPISODES_FILE)
-    seeds = range(config.seed, config.seed + config.episodes)
-    if missing := missing_seeds(seeds, rows):
-        raise UserError(
-            f"the folders of merge lack {len(missing)} of {len(seeds)} episodes, the first with seed {missing[0]}: "
-            "give the folder of every shard, each finished"
-        )
-    whole = [rows[seed] for seed in seeds]
-    _write(folder / EPISODES_FILE, whole)
-    return whole
-
-
 def begin(folder: Path) -> dict[int, Row]:
     """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file."""
     rows = finished_episodes(folder / EPISODES_FILE)
-    _write(folder / EPISODES_FILE, rows.values())
+    with atomic_write(folder / EPISODES_FILE) as temporary:
+        temporary.write_text("".join(f"{json.dumps(row)}\n" for row in rows.values()), encoding="utf-8")
     return rows
-
-
-def _write(path: Path, rows: Iterable[Row]) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
 
 
 def append(folder: Path, row: Row) -> None:

@@ -10,10 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.tabletop.goals import SUFFIX, save_goal
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
-from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition
@@ -62,24 +59,6 @@ class EpisodeProgress(EpisodeCallback):
         line = f"push {transition.step:>2}: {what:<16} reward {transition.reward:6.2f}   {planned}   {rest}"
         print(line, flush=True)
         self._planned = None
-
-
-def check_goal(path: str | None) -> None:
-    """Check the option `save_goal`, before anything is written.
-
-    Raises:
-        UserError: a suffix that no goal has, or no folder to write into.
-    """
-    if path is not None and Path(path).suffix.lower() != SUFFIX:
-        raise UserError(f"save_goal={path} must end in {SUFFIX}")
-    if path is not None and not Path(path).parent.is_dir():
-        raise UserError(f"save_goal={path}: there is no folder {Path(path).parent}")
-
-
-def write_goal(path: str, scene: Scene) -> None:
-    """Write a scene as it is now to a file for `task.goal`, atomically."""
-    with atomic_write(Path(path)) as temporary:
-        save_goal(temporary, scene)
 
 
 def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: bool) -> dict[str, Any]:

@@ -1,9 +1,8 @@
-"""Rearranging: each object has to reach a place of its own, from a file or at random. Not in the paper."""
+"""Rearranging: each object has to reach a place of its own, given or at random. Not in the paper."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cavin_pyro.envs.tabletop.goals import Goal, assign, read_goal, sample_places
-from cavin_pyro.envs.tabletop.markings import Place, TileGroup
+from cavin_pyro.envs.tabletop.markings import Place
+from cavin_pyro.envs.tabletop.objects.sampling import arrange
 from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.tasks.task import Marking, Step, Task
 from cavin_pyro.envs.tabletop.tasks.tiles import TileSet
-from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW
+from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, tile_center
 
 TOLERANCE = 0.03  # metres between an object's centre and its place, on the table, at most
 LEAST_TOLERANCE = 0.01  # metres; a planner's margin leaves at least this
@@ -27,16 +26,14 @@ LEAST_TOLERANCE = 0.01  # metres; a planner's margin leaves at least this
 class Rearrange(Task):
     """Push every object to its place, in any order. Only falls off the table are forbidden.
 
-    Places are for centres as observed: the mean of an object's visible points. Orientations do not count. Places in a
-    file are assigned once, when the episode starts (`assign`); a random goal samples a place for each object.
+    Places are for centres as observed: the mean of an object's visible points. Orientations do not count.
 
     A margin makes the tolerance smaller for planners, and keeps objects within reach until they have arrived.
 
     Attributes:
         region: the tiles on which random places lie.
-        goal: a file, see `read_goal`; None samples places in every episode, with the start's clearance.
         clearance: metres between random places, at least.
-        places: (x, y) metres of each object, in order, instead of `goal`. Episodes have it.
+        places: (x, y) metres of each object, in order; by default every episode samples its own.
     """
 
     markings = (Marking("region", "region of places", "#F2C200", 0.12),)
@@ -45,25 +42,14 @@ class Rearrange(Task):
     goal_is_shared = False
 
     region: TileSet
-    goal: str | None = None
     clearance: float = 0.15
     places: Sequence[Place] = ()
 
     def check(self) -> None:
-        """The places are on the table, or the file shows some."""
-        places = _places(self.places)
-        object.__setattr__(self, "places", places)
-        if places and self.goal is not None:
-            raise ValueError(f"goal {self.goal} and places both say where the objects go: give one of them")
+        """The places are on the table."""
+        object.__setattr__(self, "places", _places(self.places))
         if not (isinstance(self.clearance, int | float) and self.clearance >= 0.0):
             raise ValueError(f"clearance must be at least 0 metres, not {self.clearance!r}")
-        if not places:
-            _ = self._shown  # a bad file fails now
-
-    @cached_property
-    def _shown(self) -> Goal | None:
-        """What the file shows, None without a file."""
-        return None if self.goal is None else read_goal(self.goal)
 
     @cached_property
     def _padded(self) -> Tensor:
@@ -79,26 +65,17 @@ class Rearrange(Task):
             ValueError: there are more or fewer places than objects, or no room for random ones.
         """
         objects = int(observation.mask.sum())
-        if self.places:
-            _check_count("task.places", len(self.places), objects)
-            return self
-        if self._shown is not None:
-            _check_count(f"goal {self.goal}", len(self._shown.centers), objects)
-            # Not by `replace`: nobody else may give places beside a file.
-            episode = copy.copy(self)
-            object.__setattr__(episode, "places", _places(assign(observation, self._shown)))
-            vars(episode).pop("_padded", None)  # those of no places
-            return episode
-        return replace(self, places=sample_places(self.region, objects, self.clearance, generator))
+        if not self.places:
+            return replace(self, places=sample_places(self.region, objects, self.clearance, generator))
+        if len(self.places) != objects:
+            count = len(self.places)
+            raise ValueError(f"task.places: number of places is {count}, of objects {objects}: use objects={count}")
+        return self
 
     def to(self, device: torch.device) -> Rearrange:
         """As of `Task`, the places included."""
         _ = self._padded
         return super().to(device)
-
-    def tile_groups(self) -> list[TileGroup]:
-        """The region of random places; a file's places may lie anywhere."""
-        return [] if self.goal else super().tile_groups()
 
     def object_places(self) -> tuple[Place, ...]:
         """The places, in the order of objects."""
@@ -122,6 +99,27 @@ class Rearrange(Task):
         return -torch.where(mask, self.distances(positions), 0.0).sum(dim=-1)
 
 
+def sample_places(
+    region: Iterable[Tile], count: int, clearance: float, generator: np.random.Generator
+) -> tuple[Place, ...]:
+    """Places (x, y) in metres, uniform on some tiles, no two closer than `clearance` metres.
+
+    Raises:
+        ValueError: the region is too small for so many.
+    """
+    half = TILE_SIDE / 2
+    centers = [tile_center(tile) for tile in region]
+    area = [((x - half, y - half), (x + half, y + half)) for x, y in centers]
+    try:
+        places = arrange([area] * count, clearance, generator)
+    except ValueError as error:
+        raise ValueError(
+            f"no room for {count} places at least {clearance:g} m apart in the region: add tiles to it, or lower "
+            "task.clearance"
+        ) from error
+    return tuple((float(x), float(y)) for x, y in places)
+
+
 def _places(given: Any) -> tuple[Place, ...]:
     """Check places from Python or YAML.
 
@@ -138,8 +136,3 @@ def _places(given: Any) -> tuple[Place, ...]:
         if not all(low < value < high for low, value, high in zip(TABLE_LOW, point, TABLE_HIGH, strict=True)):
             raise ValueError(f"places: {point} is off the table, from {list(TABLE_LOW)} to {list(TABLE_HIGH)}")
     return tuple((x, y) for x, y in points.tolist())
-
-
-def _check_count(what: str, places: int, objects: int) -> None:
-    if places != objects:
-        raise ValueError(f"{what}: number of places is {places}, of objects {objects}: use objects={places}")
