@@ -29,7 +29,7 @@ checks := lint format types imports docs
 .PHONY: demo test soak versions clean again $(checks)
 
 demo: $(installed)
-	$(bin)/python -m cavin_pyro.demo
+	$(bin)/python -m cavin_pyro.plan -m task=clearing,insertion,crossing seed=1 output=runs/demo
 
 test: $(installed_for_tests)
 	$(MAKE) --no-print-directory --jobs 2 --output-sync $(checks)

@@ -12,7 +12,6 @@ from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
 ORDER = (
-    "demo",
     "plan",
     "evaluate",
     "collect",

@@ -146,8 +146,7 @@ def test_every_command_is_a_console_script_and_every_console_script_has_its_main
     assert scripts
     assert set(scripts.values()) == {"main"}
     assert set(scripts) <= mains
-    # `make demo` is the demo's name, and `python -m cavin_pyro` the list of commands.
-    assert mains - set(scripts) == {"cavin_pyro.demo", "cavin_pyro.__main__"}
+    assert mains - set(scripts) == {"cavin_pyro.__main__"}  # the list of commands
 
 
 def test_a_wheel_carries_every_file_that_the_packages_read() -> None:

@@ -224,13 +224,7 @@ def _sweep(name: str, body: Body, line: argparse.Namespace) -> None:
     presets = [] if line.config_dir is None else ["--config-dir", str(Path(line.config_dir).resolve())]
     sys.argv[1:] = ["--multirun", *presets, *words, *folder]
     hydra.main(version_base="1.3", config_path=None, config_name=name)(job)()
-    print(sweep_table(found), end="")
+    if any(found.values()):  # none where other processes ran them
+        from pandas import DataFrame
 
-
-def sweep_table(found: Mapping[str, Figures]) -> str:
-    """A line for each run of a sweep, with its figures; empty where other processes ran them."""
-    columns = list(dict.fromkeys(column for figures in found.values() for column in figures))
-    rows = [["", *columns], *([run, *(str(of.get(one, "")) for one in columns)] for run, of in found.items())]
-    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(["", *lines, ""]) if columns else ""
+        print(f"\n{DataFrame.from_dict(found, orient='index').fillna('').to_string()}")

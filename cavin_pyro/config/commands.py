@@ -228,15 +228,17 @@ class GeneratedConfig:
 
 
 @dataclass
-class SceneConfig(DeviceOptions):
-    """Options of commands that run episodes of one task or of several."""
+class EpisodeConfig(DeviceOptions):
+    """Options of commands that run episodes of one task."""
 
-    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop")
+    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop task=" + ENV["task"])
     layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
     reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
     criterion: str = option(ENV["criterion"], CRITERION, choices=f"{ENVS}.tasks.reward.CRITERIA")
     objects: int = option(ENV["objects"], "objects on the table", minimum=1, maximum=MAXIMUM_OBJECTS)
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
+    task: Any = None
+    tiles: TilesConfig = field(default_factory=TilesConfig)
     planner: Any = None
     pushes_per_plan: int | None = option(1, "executed pushes per plan; null: all T (Algorithm 1, line 11)", minimum=1)
     push_decimals: int | None = option(ACTION_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
@@ -248,15 +250,6 @@ class SceneConfig(DeviceOptions):
     world: Any = None
     env: WorldConfig = field(default_factory=WorldConfig)
     seed: int = seed_option("seed of the scene and of the planner")
-
-
-@dataclass
-class EpisodeConfig(SceneConfig):
-    """Options of commands that run episodes of one task."""
-
-    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop task=" + ENV["task"])
-    task: Any = None
-    tiles: TilesConfig = field(default_factory=TilesConfig)
 
 
 @dataclass
@@ -275,15 +268,6 @@ class EvaluateConfig(LaunchOptions, EpisodeConfig):
     episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1)
     compare: str | None = option(None, "folder of another evaluation of the same scenes, to compare episode by episode")
     shard: str = option("1/1", "i/n: the i-th of every n episodes, so that n machines share the work")
-
-
-@dataclass
-class DemoConfig(SceneConfig):
-    """Options of `python -m cavin_pyro.demo`."""
-
-    output: str | None = option(None, "folder for the results, with a subfolder per task; by default runs/demo")
-    tasks: list[str] = option(PAPER_TASKS, "tasks to run", choices=f"{ENVS}.tasks.TASKS")
-    seed: int = seed_option("seed of the scenes and of the planner", default=1)
 
 
 @dataclass
@@ -320,6 +304,5 @@ COMMANDS: dict[str, type] = {
     "check": CheckConfig,
     "plan": PlanConfig,
     "evaluate": EvaluateConfig,
-    "demo": DemoConfig,
     "reproduce": ReproduceConfig,
 }

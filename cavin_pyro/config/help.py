@@ -23,9 +23,12 @@ EXAMPLES = {
     "pretrain": ("data=data/pushes", "data=[data/pushes,data/random]", "held_out_objects=[mug,banana]"),
     "train": ("data=data/pushes", "model=flat guide=flat", "trainer.steps=200000 trainer.batches=bucketed"),
     "check": ("checkpoint=cavin data=data/pushes", "checkpoint=contact windows=2000", "sections=[prior,subgoals]"),
-    "plan": ("task=insertion objects=5 seed=3", "planner=paper", "planner.optimizer=cem env.segmentation=clusters"),
+    "plan": (
+        "task=insertion objects=5 seed=3",
+        "-m planner=cavin,paper",
+        "planner.optimizer=cem env.segmentation=clusters",
+    ),
     "evaluate": ("task=crossing objects=3", "planner=paper compare=runs/mine", "-m task=clearing,insertion,crossing"),
-    "demo": ("", "tasks=[gathering] objects=5", "env.segmentation=clusters"),
     "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }
 # --help lists the options that a user of the field changes, --help=all every one: those without a section, but

@@ -96,7 +96,6 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("planner=random planner.samples=3", "unknown option 'planner.samples': valid under planner are "),
     ("sum.what.else=3", "unknown option 'sum.what.else': valid are "),
     ("check device=cuda", "unknown option 'device': it is an option of pretrain, "),
-    ("demo task=clearing", "unknown option 'task': did you mean tasks? "),
     ("+unknown=1", "unknown option 'unknown': valid are "),
     ("++env.ranges.clearnace=1", "unknown option 'env.ranges.clearnace': did you mean clearance? "),
     ("~task", "~task: an option cannot be removed"),

@@ -1,9 +1,7 @@
-"""Matrix precision and the allocator change speed and rounding only."""
+"""Matrix precision and threads change speed and rounding only."""
 
 from __future__ import annotations
 
-import ctypes
-import json
 import os
 import subprocess
 import sys
@@ -13,26 +11,6 @@ import pytest
 import torch
 
 from cavin_pyro.config.device import MATMUL_PRECISIONS, set_matmul_precision
-
-# Page faults of tensors that are made and dropped: before the call, after it, and after a second one.
-COUNT_PAGE_FAULTS = """
-import json, resource, torch
-from cavin_pyro.config.device import keep_freed_memory
-
-def page_faults():
-    first = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(10):
-        tensors = [torch.ones(6 * 2**20) for _ in range(3)]  # 24 MB each
-        del tensors
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - first
-
-counts = [page_faults()]
-for _ in range(2):
-    keep_freed_memory()
-    page_faults()
-    counts.append(page_faults())
-print(json.dumps(counts))
-"""
 
 
 @pytest.mark.parametrize("name", MATMUL_PRECISIONS)
@@ -47,18 +25,6 @@ def test_matrix_products_round_their_factors_to_the_named_precision(name: str) -
     product = (left @ right).double()
     # Sums are kept in float32 in any case, so the product is within 1e-3 of one of these and far from all others.
     assert min(float((product - expected).abs().max()) for expected in allowed[name]) < 1e-3
-
-
-@pytest.mark.soak
-@pytest.mark.skipif(
-    sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "mallopt"), reason="the C library has no such option"
-)
-def test_freed_memory_is_kept_however_often_that_is_asked_for() -> None:
-    line = [sys.executable, "-c", COUNT_PAGE_FAULTS]
-    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
-    before, once, twice = json.loads(done.stdout)
-    assert before > 10_000
-    assert once < before / 100 and twice < before / 100
 
 
 def test_a_command_computes_in_one_thread(tmp_path: Path) -> None:

@@ -89,14 +89,6 @@ def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("length", [0, 7, 5000, -1])
-def test_a_checkpoint_cut_short_is_refused(length: int, checkpoint_file: Path, tmp_path: Path) -> None:
-    path = tmp_path / "cut.safetensors"
-    path.write_bytes(checkpoint_file.read_bytes()[:length])
-    with pytest.raises(UserError, match=r"cut\.safetensors is truncated or no safetensors file"):
-        load(path)
-
-
 def test_weights_of_another_architecture_are_named(small: SimpleNamespace, checkpoint_file: Path) -> None:
     checkpoint, config = load(checkpoint_file), small.config()
     config["model"]["width"] = 16

@@ -170,14 +170,6 @@ def test_automatic_guides_are_built_by_option(name: str, family: str) -> None:
             building.build_guide({"guide": {"_target_": target}}, building.build_model(config))
 
 
-def test_the_balance_of_states_and_actions_is_a_positive_number() -> None:
-    config = composed("single_latent", "single_latent")
-    for weight in (0.0, -1.0):
-        config.model.action_weight = weight
-        with pytest.raises(UserError, match="^action_weight must be a positive number"):
-            building.build_model(config)
-
-
 class WithMore(CascadedGuide):
     """Samples something that the model does not know."""
 

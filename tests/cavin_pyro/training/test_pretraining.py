@@ -16,7 +16,7 @@ from torch import Tensor
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.models.networks.pointnet import PointNet, PointNetAutoencoder
 from cavin_pyro.training import pretraining
-from cavin_pyro.training.pretraining import _augment, _rate_after, pretrain
+from cavin_pyro.training.pretraining import _augment, pretrain
 from cavin_pyro.training.resume import write_resume
 
 
@@ -61,19 +61,6 @@ def test_equal_seeds_pretrain_equal_features(tmp_path: Path) -> None:
         weights(pretrained(tmp_path / name, seed=seed, steps=5)[0]) for name, seed in zip("abc", (0, 0, 1), strict=True)
     ]
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
-
-
-@pytest.mark.parametrize("steps", [1, 2, 7, 60])
-def test_the_learning_rate_is_that_of_torchs_cosine_to_the_last_bit(steps: int) -> None:
-    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=3e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    rate = 3e-3
-    for step in range(1, steps + 1):
-        assert rate == optimizer.param_groups[0]["lr"]
-        optimizer.step()
-        schedule.step()
-        rate = _rate_after(step, rate, steps)
-    assert rate == schedule.get_last_lr()[0] == pytest.approx(0.0, abs=1e-18)
 
 
 def test_training_clouds_are_turned_about_the_vertical_and_scaled_a_little() -> None:

@@ -6,10 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -172,10 +170,3 @@ def test_missing_files_are_named_in_one_line(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message) as caught:
             Scene(robot="sawyer", assets=tmp_path)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_gymnasium_finds_nothing_wrong_with_an_arm(name: str) -> None:
-    env = gymnasium.make("cavin/Crossing-v0", robot=name, assets=str(REAL_ASSETS), objects=2, render_mode="rgb_array")
-    check_env(env.unwrapped)
-    env.close()

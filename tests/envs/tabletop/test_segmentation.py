@@ -7,12 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectParameters
-from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.envs.tabletop.segmentation import ClusterSegmenter, MaskSegmenter
 from cavin_pyro.envs.tabletop.segmentation.height_map import fit_table, split_at_necks
@@ -176,9 +174,3 @@ def test_clusters_agree_with_the_mask_on_what_the_kinect_sees(put: Callable) -> 
     assert [one.name for one in seen_by_kinect.objects] == [one.name for one in by_mask.objects]
     for one in (by_mask, seen_by_kinect):
         one.close()
-
-
-def test_gymnasium_finds_nothing_wrong_with_a_kinect_and_clusters() -> None:
-    env = PushingEnv(objects=2, camera="kinect2", segmentation="clusters")
-    check_env(env, skip_render_check=True)
-    env.close()

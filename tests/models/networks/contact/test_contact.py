@@ -165,26 +165,6 @@ def test_predictions_do_not_depend_on_whether_shapes_are_fixed(batch: tuple[int,
     assert 0.1 < moved.double().mean() < 0.9  # some are within reach, and some are not
 
 
-@pytest.mark.parametrize("near", [None, torch.rand(4, 4, 30) < 0.6])
-@pytest.mark.parametrize("every", [True, False])
-def test_pairs_are_those_of_objects_that_count(every: bool, near: Tensor | None) -> None:
-    torch.manual_seed(1)
-    counting, values = torch.rand(4, 30) < 0.5, torch.rand(2, 4, 30)
-    rows = Rows(counting, every=every)
-    pairs = rows.pairs(near)
-    assert pairs is not None
-    first, second = rows.to_pairs(rows.of_objects(values), pairs)
-    assert torch.equal(first.index_select(1, pairs.exchanged), second)
-    real = pairs.real & counting.flatten()[pairs.first] if every else pairs.real
-    assert {tuple(row) for row in torch.cat((first[:, real], second[:, real])).T.tolist()} == {
-        (*values[:, i, push].tolist(), *values[:, j, push].tolist())
-        for push in range(30)
-        for i in range(4)
-        for j in range(4)
-        if i != j and counting[i, push] and counting[j, push] and (near is None or near[i, j, push])
-    }
-
-
 @settings(max_examples=10, deadline=None)
 @given(batch=st.lists(st.integers(1, 3), min_size=1, max_size=3), margin=st.sampled_from([None, MARGIN]))
 def test_order_padding_and_leading_dimensions(batch: list[int], margin: float | None) -> None:
