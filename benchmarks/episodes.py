@@ -51,12 +51,21 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table: a task with its number of objects and further options of `evaluate`."""
+    """A line of a table: a task with its number of objects and further options of `evaluate`.
+
+    In other worlds than the tabletop objects are None, and `{}` in the options is the training, `seed % TRAININGS`.
+    """
 
     name: str
     task: str
-    objects: int = 3
+    objects: int | None = 3
     options: tuple[str, ...] = ()
+
+    def overrides(self, seed: int) -> list[str]:
+        """The options of `evaluate` for the scene of that seed."""
+        if self.objects is None:
+            return [option.format(seed % TRAININGS) for option in self.options]
+        return [f"task={self.task}", f"objects={self.objects}", "reward=sparse", *self.options]
 
 
 PAPER = ("planner=paper", "planner.motion_horizon=full_horizon", "checkpoint=cavin")
@@ -110,28 +119,49 @@ ADDITIONS = [
     for name, options in LEFT_OUT.items()
     for task, objects in (("clearing", 5), ("insertion", 3), ("crossing", 5))
 ]
-TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS}
-_runner: tuple[Row, EpisodeRunner] | None = None  # one per process
+TRAININGS = 3  # of each row of Push-T: runs/pusht-0 and so on, by the commands of docs/how-to/push-t.md
+PUSHT_TASKS = {
+    "75 ahead": ("planner.horizon=15",),
+    "25 ahead": ("planner.horizon=6", "env.ahead=25", "env.maximum_steps=10"),
+}
+
+
+def pusht(name: str, *options: str, tasks: Sequence[str] = tuple(PUSHT_TASKS)) -> list[Row]:
+    return [Row(name, task, None, ("env=pusht", *PUSHT_TASKS[task], *options)) for task in tasks]
+
+
+PUSHT = [
+    *pusht("cascade", "checkpoint=runs/pusht-{}/checkpoint.safetensors"),
+    *pusht("cascade, N(0, I)", "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
+    *pusht("flat: actions", "checkpoint=runs/pusht-{}/checkpoint.safetensors", "planner=mpc", "planner.additions=[]"),
+    *pusht("random", "planner=random"),
+]
+TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "pusht": PUSHT}
+_runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 
 def play(row: Row, seed: int) -> list[Record]:
     """One episode of a row: a record, or with the published rules two."""
     global _runner
     torch.set_num_threads(1)
-    config = compose("evaluate", f"task={row.task}", f"objects={row.objects}", "reward=sparse", *row.options)
-    if _runner is None or _runner[0] != row:
+    overrides = row.overrides(seed)
+    config = compose("evaluate", *overrides)
+    if _runner is None or _runner[0] != overrides:
         if _runner is not None:
             _runner[1].env.close()
-        _runner = row, make_runner(config)
+        _runner = overrides, make_runner(config)
     found = episode_row(_runner[1].rollout(seed))
-    generated_layout = config.layout == "generated"
     shared = {
         **{"row": row.name, "task": row.task, "objects": row.objects, "seed": seed},
-        **{"layout": str(config.layout), "tiles": config.generated.tiles if generated_layout else None},
-        "planner": _option(row, "planner", "cavin"),
+        "planner": _option(row, "planner", "cavin" if row.objects else "search"),
         "checkpoint": config.checkpoint or config.planner.default_checkpoint,
-        "segmentation": _option(row, "env.segmentation", "mask"),
         **{name: found[name] for name in ("unsafe", "ineffective", "planning_ms")},
+    }
+    if row.objects is None:
+        return [{**shared, **{name: found[name] for name in ("outcome", "steps")}}]
+    shared |= {
+        **{"layout": str(config.layout), "tiles": config.generated.tiles if config.layout == "generated" else None},
+        "segmentation": _option(row, "env.segmentation", "mask"),
     }
     records = [{**shared, "rules": config.criterion, "outcome": found["outcome"], "steps": found["steps"]}]
     if config.criterion != "strict":
@@ -146,7 +176,8 @@ def _option(row: Row, name: str, default: str) -> str:
 def missing(rows: Sequence[Row], seeds: Sequence[int], known: Sequence[Record]) -> list[tuple[Row, int]]:
     """Episodes of these rows and seeds that no record has."""
     done = {(record["row"], record["task"], record["seed"]) for record in known}
-    return [(row, seed) for row in rows for seed in seeds if (row.name, row.task, seed) not in done]
+    by_training = sorted(seeds, key=lambda seed: seed % TRAININGS)  # so that few models are loaded
+    return [(row, seed) for row in rows for seed in by_training if (row.name, row.task, seed) not in done]
 
 
 def played(jobs: Sequence[tuple[Row, int]], workers: int) -> Generator[list[Record], None, None]:

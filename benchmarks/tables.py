@@ -250,6 +250,25 @@ def _errors(values: Sequence[float]) -> str:
     return f"{statistics.mean(values):.2f} / {statistics.median(values):.2f}" if values else ""
 
 
+def pusht() -> str:
+    """Success in Push-T, that of each training, and against the first row in the same pairs of start and goal."""
+    rows = read("pusht")
+    tasks, lines = list(groups(rows, "task")), []
+    for (name,), found in groups(rows, "row").items():
+        line: list[object] = [name, f"{statistics.median(ms for row in found for ms in row['planning_ms']):.0f}"]
+        for task in tasks:
+            cell = groups(found, "task").get(task, [])
+            by_training = sorted(groups(cell, "checkpoint").items())
+            shares = [
+                f"{100 * statistics.mean(row['outcome'] == 'success' for row in some):.0f}" for _, some in by_training
+            ]
+            alone, first, p = paired(cell, groups(rows, "row", "task")[rows[0]["row"], *task])
+            test = "" if name == rows[0]["row"] or not cell else f"; {alone}, {first} (p = {p:.2g})"
+            line += [len(cell) or "", f"{rate(cell)}; {', '.join(shares)}{test}" if cell else ""]
+        lines.append(line)
+    return markdown(["", "ms per plan", *(text for (task,) in tasks for text in ("pairs", task))], lines)
+
+
 def as_stored(name: str) -> str:
     """A file of measured times or verdicts as it is, a line per row."""
     rows = read(name)
@@ -267,6 +286,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "factors": factors,
     "simulator": simulator,
     "accuracy": accuracy,
+    "pusht": pusht,
     "speed": lambda: as_stored("speed"),
     "criticism": lambda: as_stored("criticism"),
 }

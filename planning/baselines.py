@@ -249,6 +249,7 @@ class RandomPlanner:
         generators: Sequence[torch.Generator],
         reward: RewardFunction | None = None,
         observed: Any = None,
+        steps_left: int | None = None,
     ) -> Plan:
         """Sample `[B, T, A]` actions for the scenes `state: [B]`; without prediction or choice.
 

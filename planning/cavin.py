@@ -57,7 +57,7 @@ class CavinPlanner(SearchingPlanner):
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
         )
-        self.motion_segments = self.segments if motion_horizon == "full_horizon" else 1
+        self.motion_horizon = motion_horizon
 
     def plan_scene(self, scene: Query) -> Plan:
         """Algorithm 1 for observed scenes `scene.state: [B]`."""
@@ -79,16 +79,15 @@ class CavinPlanner(SearchingPlanner):
     def plan_motions(self, scene: Query, focus: Focus, effects: Candidates, i: Tensor) -> Plan:
         """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
         chosen, T, N = effects.take(i.unsqueeze(-1)), self.segment_length, self.motion_samples
+        K = scene.segments if self.motion_horizon == "full_horizon" else 1
         c_star, subgoals = chosen.codes[:, 0], focus.among(scene.state, chosen.states.map(lambda field: field[:, 0]))
         effect = ChosenEffect(subgoals, chosen.progress.segments[:, 0], chosen.progress.succeeded[:, 0])
 
         # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
-        distance = self.added("subgoal_distance", SubgoalDistance(self.feature_weight), scene, self.motion_segments)
+        distance = self.added("subgoal_distance", SubgoalDistance(self.feature_weight), scene, K)
         tracking_cost = self.added("wrap_objective", TrackingCost(subgoals, effect.segments, distance), scene, effect)
         space = MotionSpace(self.model, c_star, focus, self.decimals, scene.reward.reads_features)
-        motions = self.search(
-            space, tracking_cost, scene, optimizer=self.motion_optimizer, segments=self.motion_segments, samples=N
-        )
+        motions = self.search(space, tracking_cost, scene, optimizer=self.motion_optimizer, segments=K, samples=N)
 
         # Line 10: choose z* and its actions a*, which lead to the states closest to the subgoals.
         choice = Choice(scene, self.model, motions, lambda: motions.at(0, actions_of), effect, distance)

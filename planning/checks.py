@@ -50,10 +50,10 @@ def check_weight(name: str, value: float) -> None:
         raise ValueError(f"{name} must be zero or a positive number, not {value}")
 
 
-def check_temperature(value: float | None) -> None:
-    """Raise ValueError unless a temperature is None or a positive number."""
+def check_optional(name: str, value: float | None) -> None:
+    """Raise ValueError unless it is None or a positive number."""
     if value is not None and not 0 < value < math.inf:
-        raise ValueError(f"temperature must be a positive number or null, not {value}")
+        raise ValueError(f"{name} must be a positive number or null, not {value}")
 
 
 def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:

@@ -227,6 +227,7 @@ class Query(NamedTuple):
     reward: Reward
     generators: Sequence[torch.Generator]  # one per environment
     observed: Any = None  # what else the world shows, for additions: a named tuple of tensors [B, ...]
+    segments: int = 1  # K
 
 
 class SegmentRollout(NamedTuple):
@@ -345,6 +346,15 @@ class Planner(Protocol):
         """T, the number of actions in a plan's `actions`."""
 
     def plan(
-        self, state: State, *, reward: RewardFunction, generators: Sequence[torch.Generator], observed: Any = None
+        self,
+        state: State,
+        *,
+        reward: RewardFunction,
+        generators: Sequence[torch.Generator],
+        observed: Any = None,
+        steps_left: int | None = None,
     ) -> Plan:
-        """Plan for the scenes `state: [B]`, each with its own generator; `observed` as in `Query`."""
+        """Plan for the scenes `state: [B]`, each with its own generator; `observed` as in `Query`.
+
+        `steps_left`: in the episodes; None: unknown.
+        """

@@ -56,6 +56,7 @@ class SearchingPlanner(ABC):
 
     samples: N, plans to compare.
     horizon: H steps, a multiple of the model's T.
+    shrinking_horizon: plan no farther than to the end of the episode, H at most the steps that are left.
     optimizer: searches the plans: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
         `cavin_pyro.planning.optimizers.Optimizer`.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment (published
@@ -81,6 +82,7 @@ class SearchingPlanner(ABC):
         samples: int = 1024,
         horizon: int = 30,
         *,
+        shrinking_horizon: bool = False,
         optimizer: str | Optimizer = "shooting",
         reward_at: str = "path",
         stride_limits: Sequence[float] | None = None,
@@ -100,6 +102,7 @@ class SearchingPlanner(ABC):
         self.reparameterized = self.early_stopping or bool(compile)
         self.model, self.reward_at, self.samples, self.decimals = model, reward_at, samples, decimals
         self.segments = horizon // model.segment_length  # line 1 of Algorithm 1: K = H / T
+        self.shrinking_horizon = shrinking_horizon
 
     @property
     def segment_length(self) -> int:
@@ -108,7 +111,13 @@ class SearchingPlanner(ABC):
 
     @torch.inference_mode()
     def plan(
-        self, state: State, *, reward: RewardFunction, generators: Sequence[torch.Generator], observed: Any = None
+        self,
+        state: State,
+        *,
+        reward: RewardFunction,
+        generators: Sequence[torch.Generator],
+        observed: Any = None,
+        steps_left: int | None = None,
     ) -> Plan:
         """Plan for the observed scenes `state: [B]`, in chunks of whole environments.
 
@@ -117,6 +126,7 @@ class SearchingPlanner(ABC):
         Args:
             reward: the task's. generators: one per environment, which the call advances.
             observed: what else the world shows, for additions: a named tuple of tensors `[B, ...]`.
+            steps_left: in the episodes, for `shrinking_horizon`.
 
         Raises:
             ValueError: a state that is not a batch of at least one scene, another number of generators than B, or an
@@ -126,11 +136,14 @@ class SearchingPlanner(ABC):
         size, plans, reward = ENVIRONMENTS_ON_PROCESSOR, [], as_reward(reward)
         if state.centers.device.type != "cpu":
             size = max(1, PLANS_ON_ACCELERATOR // self.samples)
+        segments = self.segments
+        if self.shrinking_horizon and steps_left is not None:
+            segments = max(1, min(segments, steps_left // self.segment_length))
         for start in range(0, len(generators), size):
             chunk = slice(start, start + size)
             seen = observed and records.apply(observed, itemgetter(chunk))
             try:
-                plans.append(self.plan_scene(Query(state.scene(chunk), reward, generators[chunk], seen)))
+                plans.append(self.plan_scene(Query(state.scene(chunk), reward, generators[chunk], seen, segments)))
             except NoFiniteCandidateError as error:
                 raise NoFiniteCandidateError(start + error.environment, error.what) from error
         return plans[0] if len(plans) == 1 else records.join(plans, dimension=0)
@@ -166,7 +179,7 @@ class SearchingPlanner(ABC):
             objective,
             scene.state,
             scene.generators,
-            self.segments if segments is None else segments,
+            scene.segments if segments is None else segments,
             self.reparameterized,
             early_stopping,
             self.backend,

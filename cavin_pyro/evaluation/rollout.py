@@ -186,7 +186,8 @@ def rollout(
         shown = env.observed(observation)
         shown = shown and apply(shown, lambda field: field.to(device))
         with _refusals(seed):
-            plan = planner.plan(state, reward=goal, generators=[generator], observed=shown)
+            left = env.maximum_steps - len(episode.transitions)
+            plan = planner.plan(state, reward=goal, generators=[generator], observed=shown, steps_left=left)
         plan = apply(plan, lambda field: field.cpu())
         centers, mask = env.positions(observation)
         record = PlanRecord(

@@ -156,8 +156,9 @@ def _rollout_costs(
 ) -> tuple[Tensor, Tensor]:
     """Rollouts of `pushes: [B, n, T, 4]` by f: square metres to the `goal` and whether they fail, `[B, n]` each."""
     plans = state.expand_plans(pushes.shape[1])
-    end, path = predict_states(model, state.expand_plans(1), pushes)
-    progress = returns.advance(returns.start(plans.centers), reward, plans.centers, path, plans.mask)
+    end, path = predict_states(model, state.expand_plans(1), pushes, reward.reads_features)
+    start = plans.values(reward.reads_features)
+    progress = returns.advance(returns.start(plans.centers), reward, start, path, plans.mask)
     if goal is None:
         return torch.zeros_like(progress.returns), progress.failed
     return distance(end, path, goal), progress.failed

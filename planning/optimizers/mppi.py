@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from cavin_pyro.planning.checks import check_fraction, check_positive, check_temperature
+from cavin_pyro.planning.checks import check_fraction, check_optional, check_positive
 from cavin_pyro.planning.optimizers.base import samples_of_iteration
 from cavin_pyro.planning.optimizers.weights import adapt_temperature
 from cavin_pyro.planning.rollout import SearchProblem
@@ -33,7 +33,7 @@ class MPPI:
         check_positive("iterations", self.iterations)
         check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
         check_fraction("shrink", self.shrink, positive=True)
-        check_temperature(self.temperature)
+        check_optional("temperature", self.temperature)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cavin_pyro.planning.checks import check_fraction, check_positive, check_temperature
+from cavin_pyro.planning.checks import check_fraction, check_optional, check_positive
 from cavin_pyro.planning.optimizers.weights import adapt_temperature, effective_sample_size, log_mean
 from cavin_pyro.planning.protocol import Evidence
 from cavin_pyro.planning.rollout import Candidates, SearchProblem, join
@@ -52,7 +52,7 @@ class SMC:
             raise ValueError(f"moves must be at least 0, not {self.moves}")
         check_positive("block", self.block)
         check_fraction("step", self.step, positive=True)
-        check_temperature(self.temperature)
+        check_optional("temperature", self.temperature)
 
     def particles(self, samples: int, segments: int) -> int:
         """n, for which extending and moving costs at most N = `samples` whole plans; at least 1."""

@@ -38,6 +38,16 @@ def test_dense_reward_leads_to_the_known_optimum(toy: SimpleNamespace) -> None:
     assert (plan.expected_return == plan.candidate_returns.max(-1).values).all()
 
 
+@pytest.mark.parametrize(("shrinks", "left", "segments"), [(True, 7, 2), (True, 2, 1), (True, None, 4), (False, 7, 4)])
+def test_a_shrinking_horizon_ends_with_the_episode(
+    toy: SimpleNamespace, shrinks: bool, left: int | None, segments: int
+) -> None:
+    planner = CavinPlanner(toy.PointMass(), samples=16, horizon=12, shrinking_horizon=shrinks)
+    given = {"reward": toy.GoalDisc((10.0, 0.0), dense=True), "generators": toy.generators(0), "steps_left": left}
+    plan = planner.plan(toy.scenes([[(0.0, 0.0)]]), **given)
+    assert plan.effect_codes.shape[1] == plan.motion_codes.shape[1] == segments
+
+
 @pytest.mark.parametrize("motion_horizon", ["full_horizon", "first_segment"])
 def test_replanning_in_closed_loop_reaches_the_goal_and_never_the_forbidden_part(
     toy: SimpleNamespace, motion_horizon: str
