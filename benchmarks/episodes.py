@@ -119,24 +119,30 @@ ADDITIONS = [
     for name, options in LEFT_OUT.items()
     for task, objects in (("clearing", 5), ("insertion", 3), ("crossing", 5))
 ]
-TRAININGS = 3  # of each row of Push-T: runs/pusht-0 and so on, by the commands of docs/how-to/push-t.md
-PUSHT_TASKS = {
-    "75 ahead": ("planner.horizon=15",),
-    "25 ahead": ("planner.horizon=6", "env.ahead=25", "env.maximum_steps=10"),
-}
+TRAININGS = 3  # runs/pusht-0 and so on, by the commands of docs/how-to/push-t.md
+PUSHT = {"75 ahead": ("planner.horizon=15",), "25 ahead": ("planner.horizon=6", "env.ahead=25", "env.maximum_steps=10")}
+SEARCH = ("planner.samples=4096", "planner.reward_at=subgoals", "planner.shrinking_horizon=true")
+ICEM = ("planner.optimizer=icem", "planner.optimizer.iterations=10", "planner.optimizer.elite_fraction=0.03")
+CASCADE = (*SEARCH, *ICEM, "planner.optimizer.radius=1", "checkpoint=runs/pusht-{}/checkpoint.safetensors")
+FLAT = ("planner=mpc", "planner.additions=[]", "pushes_per_plan=null", *CASCADE)
 
 
-def pusht(name: str, *options: str, tasks: Sequence[str] = tuple(PUSHT_TASKS)) -> list[Row]:
-    return [Row(name, task, None, ("env=pusht", *PUSHT_TASKS[task], *options)) for task in tasks]
+def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> list[Row]:
+    return [Row(name, task, None, ("env=pusht", *PUSHT[task], *options)) for task in tasks]
 
 
-PUSHT = [
-    *pusht("cascade", "checkpoint=runs/pusht-{}/checkpoint.safetensors"),
-    *pusht("cascade, N(0, I)", "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
-    *pusht("flat: actions", "checkpoint=runs/pusht-{}/checkpoint.safetensors", "planner=mpc", "planner.additions=[]"),
-    *pusht("random", "planner=random"),
+PUSHT_ROWS = [
+    *pusht("cascade", *CASCADE, tasks=list(PUSHT)),
+    *pusht("flat: actions", *FLAT, tasks=list(PUSHT)),
+    *pusht("random actions", "planner=random", tasks=list(PUSHT)),
+    *pusht("cascade, 2,048 samples", *CASCADE, "planner.samples=2048"),
+    *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
+    *pusht("flat: actions, 16,384 samples", *FLAT, "planner.samples=16384"),
+    *pusht("cascade, codes anywhere", *CASCADE, "planner.optimizer.radius=null"),
+    *pusht("cascade, whole horizon", *CASCADE, "planner.shrinking_horizon=false"),
+    *pusht("cascade, shooting", *SEARCH, "planner.optimizer=shooting", CASCADE[-1]),
 ]
-TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "pusht": PUSHT}
+TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "pusht": PUSHT_ROWS}
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 
