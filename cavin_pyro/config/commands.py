@@ -196,7 +196,7 @@ class PretrainConfig(DeviceOptions):
 class CheckConfig:
     """Options of `python -m cavin_pyro.check`."""
 
-    defaults: list[Any] = preset_defaults("sizes=default env/ranges=paper")
+    defaults: list[Any] = preset_defaults("sizes=default env/ranges=paper world=tabletop")
     checkpoint: str = option(DEFAULT_CHECKPOINT, CHECKPOINT)
     trust: list[str] = option([], TRUST)
     data: Any = option("data/pushes", f"{DATA}; preferably the model's training data")
@@ -207,6 +207,7 @@ class CheckConfig:
     export: str | None = option(None, "file.nc for samples of prior, guide and predictions, which ArviZ reads")
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
+    world: Any = None
 
 
 @dataclass

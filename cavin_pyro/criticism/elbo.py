@@ -32,7 +32,7 @@ SAMPLES_FOR_MEANS = 64  # of each window's codes, to find the active dimensions
 
 EXPLANATION = (
     "Nats per window of {training} training and {validation} held-out windows; every term is minus a log density (or "
-    "a KL), so smaller is better. Densities are of metres and unit vectors, so likelihood terms may be negative. The "
+    "a KL), so smaller is better. Densities are of lengths and features, so likelihood terms may be negative. The "
     "last state of a window is scored twice, by h as the subgoal and by f as the last transition, so the sum is no "
     "log density of a window. Differences are taken at equal numbers of objects, by linear regression. A dimension "
     "of a code is active where its posterior mean varies by more than {active} over windows."

@@ -19,6 +19,7 @@ from cavin_pyro.criticism.codes import log_weights
 from cavin_pyro.criticism.estimates import arviz
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.windows import all_pushes, seeded
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.storage.files import atomic_write
 
 DIMENSIONS = {  # of each variable, after chain and draw
@@ -31,6 +32,7 @@ DIMENSIONS = {  # of each variable, after chain and draw
     "mask": ["window", "object"],
     "log_weight": ["window"],
 }
+AXES = {"axis": ["x", "y", "z"], "parameter": ["x", "y", "dx", "dy"]}  # of the table
 PREDICTED = ("subgoal_centers", "actions", "next_centers")
 UNITS = dict.fromkeys(("subgoal_centers", "next_centers", "first_centers"), "metres") | {
     "actions": "normalised",
@@ -72,12 +74,12 @@ def write_samples(
     data = arviz().from_dict(
         **{group: {name: value.numpy() for name, value in values.items()} for group, values in groups.items()},
         dims=DIMENSIONS,
-        coords={"axis": ["x", "y", "z"], "parameter": ["x", "y", "dx", "dy"], "push": list(range(1, pushes + 1))},
+        coords={**AXES, "push": list(range(1, pushes + 1))} if context.space == SPACE else {},
         attrs={**told, "seed": context.seed, "inference_library": "pyro", "creation_library": "cavin_pyro"},
     )
     for group in data.groups():
         for name, unit in UNITS.items():
-            if name in data[group]:
+            if name in data[group] and (unit != "metres" or context.space == SPACE):
                 data[group][name].attrs["units"] = unit
     with atomic_write(path) as temporary:
         data.to_netcdf(str(temporary))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cavin_pyro.criticism.estimates import covered, draw_ranks, rank, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.pushing import MOVED
+from cavin_pyro.criticism.pushing import length_text
 from cavin_pyro.criticism.section import Section, conclude, within, worst
 from cavin_pyro.criticism.windows import repeated, sampled_values, seeded
 from cavin_pyro.guides.guide import Guide
@@ -32,23 +32,22 @@ LABELS = {
     "centres": "x and y of all objects",
     "moved": "x and y of objects that moved",
     "features": "features",
-    "pushes": "pushes",
+    "pushes": "actions",
 }
 PREDICTORS = {
-    "f": "f, given the state and the push",
+    "f": "f, given the state and the action",
     "h_prior": "h, codes from the prior",
     "h_guide": "h, codes from the guide",
     "g_guide": "g, codes from the guide",
 }
 
 EXPLANATION = (
-    "{samples} samples of each prediction of {windows} held-out windows, in which some object moved more than "
-    "{minimum:g} m and none more than {maximum:g} m, as in training. f predicts the state after each push; h the "
-    "state after the segment, with codes from the prior (what can be known before acting) or from the guide, which "
-    "knows the result; g the pushes. No verdict rests on the objects that moved more than 1 cm: that group is chosen "
-    "by the truth, so that a right model need not cover 90 % of it. The stated scale is the spread of the samples, "
-    "the RMS error of their mean what is right. Scales are the weights of the loss: one four times too wide weighs "
-    "its term sixteen times too little."
+    "{samples} samples of each prediction of {windows} held-out windows, in which {moved}. f predicts the state after "
+    "each action; h the state after the segment, with codes from the prior (what can be known before acting) or from "
+    "the guide, which knows the result; g the actions. No verdict rests on the objects that moved more than {scale}: "
+    "that group is chosen by the truth, so that a right model need not cover 90 % of it. The stated scale is the "
+    "spread of the samples, the RMS error of their mean what is right. Scales are the weights of the loss: one four "
+    "times too wide weighs its term sixteen times too little."
 )
 
 
@@ -76,8 +75,8 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
         EXPLANATION.format(
             samples=samples,
             windows=len(episodes),
-            minimum=context.selection.minimum_move,
-            maximum=context.selection.maximum_move,
+            moved=context.moved,
+            scale=length_text(context.space.center_scale, context.space),
         ),
         conclude(
             level,
@@ -112,19 +111,19 @@ class Prediction(NamedTuple):
 
 def predict(context: CheckContext, window: Window, samples: int) -> dict[str, Prediction]:
     """Predictions of windows `[B]` by f, h and g, as far as the model has them, by predictor and quantity."""
-    model = context.model
+    model, scale = context.model, context.space.center_scale
     nodes: Any = poutine.trace(model).get_trace(window).nodes
     before, after = window.states.step(slice(0, -1)), window.states.step(slice(1, None))
     chosen = torch.randperm(after.features.shape[-1])[:FEATURES]
     sampled = nodes["next_centers"]["fn"].sample((samples,))
     # One sample at a time: all of them with all components would be large.
     features = torch.stack([nodes["next_features"]["fn"].sample()[..., chosen] for _ in range(samples)])
-    predictions = _states("f", sampled, features, before, after, chosen, window.transition_mask.unsqueeze(-1))
+    predictions = _states("f", sampled, features, before, after, chosen, scale, window.transition_mask.unsqueeze(-1))
     if "subgoal_centers" in nodes:
         for name, guide in (("h_prior", None), ("h_guide", context.guide)):
             sites = sample_sites(model, window, samples, ("subgoal_centers", "subgoal_features"), guide)
             centers, features = sites["subgoal_centers"], sites["subgoal_features"][..., chosen]
-            predictions |= _states(name, centers, features, window.first, window.last, chosen)
+            predictions |= _states(name, centers, features, window.first, window.last, chosen, scale)
     if "actions" in nodes and context.codes:
         pushes = sample_sites(model, window, samples, ("actions",), context.guide)["actions"]
         predictions["g_guide pushes"] = Prediction(
@@ -140,11 +139,15 @@ def _states(
     before: State,
     after: State,
     chosen: Tensor,
+    scale: float,
     known: Tensor | bool = True,
 ) -> dict[str, Prediction]:
-    """Predictions of centres `[S, B, ..., M, 3]` and of the `chosen` features after states; `known`: which count."""
+    """Predictions of centres `[S, B, ..., M, 3]` and of the `chosen` features after states; `known`: which count.
+
+    An object that moved by more than `scale` has moved.
+    """
     counted = (before.mask & after.mask & known).unsqueeze(-1)
-    moved = counted & ((after.centers - before.centers).norm(dim=-1, keepdim=True) > MOVED)
+    moved = counted & ((after.centers - before.centers).norm(dim=-1, keepdim=True) > scale)
     plane, real = centers[..., :2], after.centers[..., :2]
     return {
         f"{name} centres": Prediction(plane, real, counted.expand_as(real)),

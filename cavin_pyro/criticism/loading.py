@@ -16,12 +16,17 @@ from torch import Tensor
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import configured
+from cavin_pyro.config.world import world_of
 from cavin_pyro.data.collection import CollectionConfig, collecting_world
 from cavin_pyro.data.dataset import content_record, read_metadata
-from cavin_pyro.data.windows import WindowTable, load_windows
+from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
+from cavin_pyro.envs.tabletop.workspace import SPACE
+from cavin_pyro.envs.world import World
+from cavin_pyro.evaluation.factory import check_space
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import Window
 from cavin_pyro.storage.checkpoint import Checkpoint, load
 from cavin_pyro.storage.digests import tensors_digest
@@ -42,10 +47,11 @@ class CheckContext:
     """The input of a check.
 
     Attributes:
-        model, guide: trained, in evaluation mode, without gradients. geometry: makes the features of new clouds.
+        model, guide: trained, in evaluation mode, without gradients. geometry: makes the features of new clouds, where
+            the world has these.
         training: windows `[B]` that the model was trained on. validation: windows `[B]` of held-out episodes. In
             both every window counts for all terms (`sequence_mask` is set everywhere).
-        seed: of everything random. world: in which new episodes are made.
+        seed: of everything random. world: in which new episodes are made; None if it is not known. space: its.
         training_episodes, validation_episodes: number of each window's episode `[B]`, by which intervals are clustered;
             without it every window stands for an episode of its own.
         selection: the options by which training selected windows, such as how far an object had to move.
@@ -53,11 +59,12 @@ class CheckContext:
 
     model: Model
     guide: Guide
-    geometry: Geometry
+    geometry: Geometry | None
     training: Window
     validation: Window
     seed: int = 0
-    world: CollectionConfig = field(default_factory=CollectionConfig)
+    world: CollectionConfig | World | None = field(default_factory=CollectionConfig)
+    space: Space = SPACE
     training_episodes: Tensor | None = None
     validation_episodes: Tensor | None = None
     selection: WindowConfig = field(default_factory=WindowConfig)
@@ -66,6 +73,14 @@ class CheckContext:
     def codes(self) -> tuple[str, ...]:
         """Names of the model's latent sites: effect_code, motion_code, one of them, or none."""
         return self.model.codes
+
+    @property
+    def moved(self) -> str:
+        """Which windows these are, to end a sentence with."""
+        if self.space != SPACE:
+            return "something moved by more than its scale, as in training"
+        least, most = self.selection.minimum_move, self.selection.maximum_move
+        return f"some object moved more than {least:g} m and none more than {most:g} m, as in training"
 
     def held_out(self, number: int) -> tuple[Window, Tensor]:
         """At most `number` of the held-out windows, the same ones each time, and the episode of each `[B]`."""
@@ -106,8 +121,12 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
     Raises:
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
-    world = collecting_world(config.env)
-    return context_of(config, load_trained(config, accept), world)
+    world, loaded = world_of(config), load_trained(config, accept)
+    if world is not None:
+        check_space(loaded.checkpoint, world)
+    elif loaded.checkpoint.model.space == SPACE:
+        return context_of(config, loaded, collecting_world(config.env))
+    return context_of(config, loaded, world)
 
 
 @user_input("checkpoint", "data")
@@ -117,8 +136,6 @@ def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
     `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
     """
     checkpoint = load(config.checkpoint, trust=list(config.trust))
-    if (checkpoint.config.get("geometry") or {}).get("_target_", "") is None:
-        raise UserError(f"checkpoint {checkpoint.path} is of another world: choose one of the tabletop")
     if accept is not None:
         accept(checkpoint.model)
     check_fit(checkpoint.model, checkpoint.geometry)
@@ -126,6 +143,8 @@ def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
     folders = data_folders(config.data)
     for folder in folders:
         compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
+    if checkpoint.model.space != (shared_space(folders) or SPACE):
+        raise UserError(f"{folders[0]} is of another world than checkpoint {checkpoint.path}: choose another dataset")
     storage = Path(config.output) if Path(config.output).is_dir() else None
     table = load_windows(
         folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
@@ -136,11 +155,12 @@ def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
     return Loaded(checkpoint, selection, table, folders)
 
 
-def context_of(config: DictConfig, loaded: Loaded, world: CollectionConfig) -> tuple[CheckContext, dict[str, Any]]:
+def context_of(
+    config: DictConfig, loaded: Loaded, world: CollectionConfig | World | None
+) -> tuple[CheckContext, dict[str, Any]]:
     """The context of a checkpoint and its data, and `about`."""
     checkpoint, selection, table, folders = loaded
-    path, model, guide, geometry = checkpoint.path, checkpoint.model, checkpoint.guide, checkpoint.geometry
-    assert geometry is not None  # as `load_trained` has checked
+    path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
     chosen = {
         "training": sample_windows(table, table.training, config.windows, seed=[config.seed, 0]),
         "validation": sample_windows(table, table.validation, config.windows, seed=[config.seed, 1]),
@@ -149,11 +169,12 @@ def context_of(config: DictConfig, loaded: Loaded, world: CollectionConfig) -> t
     context = CheckContext(
         model,
         guide,
-        geometry,
+        checkpoint.geometry,
         table.batch(chosen["training"]),
         table.batch(chosen["validation"]),
         seed=config.seed,
         world=world,
+        space=model.space,
         training_episodes=episodes["training"],
         validation_episodes=episodes["validation"],
         selection=selection,

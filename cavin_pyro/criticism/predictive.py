@@ -1,4 +1,4 @@
-"""Does the predictive distribution look like the data? Statistics of generated windows that matter for pushing.
+"""Does the predictive distribution look like the data? Statistics of generated windows.
 
 After Gelman, Meng and Stern, "Posterior predictive assessment of model fitness via realized discrepancies", 1996.
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cavin_pyro.criticism.estimates import Interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.pushing import Nearness, Statistic, statistics_of
+from cavin_pyro.criticism.pushing import Nearness, Statistic, length_text, statistics_of
 from cavin_pyro.criticism.section import Section, conclude, within, worst
 from cavin_pyro.criticism.windows import generated, observed, repeated, seeded
 from cavin_pyro.guides.guide import Guide
@@ -35,13 +35,15 @@ COLUMNS = 4
 
 EXPLANATION = (
     "{replicates} datasets were generated from the first states of {windows} held-out windows. These are a "
-    "selection, as in training: some object moved more than {minimum:g} m, none more than {maximum:g} m. Codes come "
-    "from the prior (prior predictive) or from the guide, which infers from the whole window (posterior predictive). "
-    '"As sampled" has the noise of the likelihoods; "means" and "as planned" have all but the codes at their means, '
-    "as a planner has it. The tail probability is the share of datasets whose mean is at least the observed one: "
-    "near 0 the model makes too little of it, near 1 too much. Two objects are inside each other where their centres "
-    "are nearer than {pair:.1f} cm, nearer than in all but 1 % of the training windows; a push touches where its "
-    "path comes within {tool:.1f} cm of a centre, as often in training windows as pushes move an object by 1 cm."
+    "selection: {moved}. Codes come from the prior (prior predictive) or from the guide, which infers from the whole "
+    'window (posterior predictive). "As sampled" has the noise of the likelihoods; "means" and "as planned" have all '
+    "but the codes at their means, as a planner has it. The tail probability is the share of datasets whose mean is "
+    "at least the observed one: near 0 the model makes too little of it, near 1 too much. Two objects are inside each "
+    "other where their centres are nearer than {pair}, nearer than in all but 1 % of the training windows."
+)
+TOUCH = (
+    " A push touches where its path comes within {tool} of a centre, as often in training windows as pushes move an "
+    "object by 1 cm."
 )
 
 
@@ -54,13 +56,15 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         replicates: datasets generated per source.
     """
     window, episodes = context.held_out(windows)
-    nearness = Nearness.of(observed(context.training))
+    nearness = Nearness.of(observed(context.training), context.space)
     sources = [name for name in SOURCES if context.codes or name.startswith("prior")]
     replicated: dict[str, dict[str, Tensor]] = {}
     with seeded(context.seed):
         outcome = generated(context.model, window)
         missing = {"h": outcome.subgoal is None, "g": not outcome.chosen}
-        statistics = [statistic for statistic in statistics_of(nearness) if not missing.get(statistic.part)]
+        statistics = [
+            statistic for statistic in statistics_of(nearness, context.space) if not missing.get(statistic.part)
+        ]
         for source in sources:
             guide = context.guide if source.startswith("guide") else None
             means = context.codes if source.endswith("means") else None
@@ -88,11 +92,10 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         EXPLANATION.format(
             replicates=replicates,
             windows=len(episodes),
-            minimum=context.selection.minimum_move,
-            maximum=context.selection.maximum_move,
-            pair=100 * nearness.pair,
-            tool=100 * nearness.tool,
-        ),
+            moved=context.moved,
+            pair=length_text(nearness.pair, context.space),
+        )
+        + (TOUCH.format(tool=length_text(nearness.tool, context.space)) if nearness.tool else ""),
         conclude(
             level,
             "The difference of each statistic, as planned, from the observed one, in standard deviations of single "

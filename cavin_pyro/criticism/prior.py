@@ -19,7 +19,9 @@ from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
 from cavin_pyro.criticism.section import INSPECT, Section, conclude, grade, not_applicable
 from cavin_pyro.criticism.windows import GeneratedWindow, generated, seeded
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.model import Model
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program, substitute
 
@@ -27,7 +29,7 @@ NAME, TITLE = "prior", "Is the prior the aggregate posterior, given the state?"
 GOOD, BAD = 0.6, 0.7  # AUC
 SOURCES = {"prior": "the prior", "control": "the prior of another scene"}
 COLORS = {"guide": "#D55E00", "prior": "#0072B2", "control": "#9A9A9A"}
-FAR = 0.3  # metres; distances that are larger (or infinite) count as this
+FAR = 2.0  # ranges of a step; distances that are larger (or infinite) count as this
 OBJECT_FEATURES = 8  # numbers of the mean geometric feature that are kept
 FOLDS = 5
 WIDTH = 64
@@ -116,7 +118,7 @@ def describe(model: Program, window: Window, codes: Codes) -> Tensor:
     """
     columns = [state_summary(window.first), *codes.values(), prior_residuals(model, window, codes)]
     if isinstance(model, Model):
-        columns.append(decoded_summary(generated(model, window, codes=codes, means=tuple(codes))))
+        columns.append(decoded_summary(generated(model, window, codes=codes, means=tuple(codes)), model.space))
     return torch.cat([column.float() for column in columns], -1)
 
 
@@ -144,25 +146,27 @@ def prior_residuals(model: Program, window: Window, codes: Codes) -> Tensor:
     return torch.cat(columns, -1)
 
 
-def decoded_summary(outcome: GeneratedWindow) -> Tensor:
-    """Pushes, how near they come to objects, and how the subgoal moves what: `[B, R]`."""
+def decoded_summary(outcome: GeneratedWindow, space: Space) -> Tensor:
+    """Actions, how the subgoal moves what, and on the table how near pushes come to objects: `[B, R]`."""
+    pushes = outcome.chosen and space == SPACE
     centers, mask = outcome.first.centers, outcome.first.mask
     columns = []
     if outcome.chosen:
-        nearest = path_distances(outcome).amin(-1)
-        columns += [outcome.actions.flatten(-2), nearest, start_distances(outcome).amin(-1)]
+        columns.append(outcome.actions.flatten(-2))
+    if pushes:
+        columns += [path_distances(outcome).amin(-1), start_distances(outcome).amin(-1)]
     if outcome.subgoal is not None:
         change = (outcome.subgoal - centers) * mask.unsqueeze(-1)
         moves = change.norm(dim=-1)
         columns += [change.sum(-2), moves.amax(-1, True), moves.sum(-1, True)]
         columns.append(pair_distances(outcome.subgoal, mask).amin((-2, -1)).unsqueeze(-1))
-        if outcome.chosen:  # whether the first push goes for what the subgoal moves
+        if pushes:  # whether the first push goes for what the subgoal moves
             target = moves.argmax(-1, keepdim=True)
             columns.append(path_distances(outcome)[:, 0].gather(-1, target))
             columns.append(start_distances(outcome)[:, 0].gather(-1, target))
     ends = outcome.steps[:, -1] - centers
     columns.append((ends * mask.unsqueeze(-1)).norm(dim=-1).amax(-1, True))
-    return torch.cat([column.clamp(max=FAR) for column in columns], -1)
+    return torch.cat([column.clamp(max=FAR * space.step_range) for column in columns], -1)
 
 
 def held_out_logits(first: Tensor, second: Tensor, episodes: Tensor, seed: int) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Statistics of windows that matter for pushing: moves, objects inside each other, and where pushes start."""
+"""Statistics of windows: moves, objects inside each other, and on the table where pushes start."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.criticism.windows import GeneratedWindow
-from cavin_pyro.envs.tabletop.workspace import push_endpoints
+from cavin_pyro.envs.tabletop.workspace import SPACE, push_endpoints
+from cavin_pyro.models.space import Space
 
-MOVED = 0.01  # metres; an object that moves farther counts as moved
 CLOSE_PAIR_SHARE = 0.01  # of the real windows with two objects or more
 
 
 @dataclass(frozen=True)
 class Nearness:
-    """Distances that stand for the objects' extent, which centres lack. Metres, in the plane of the table.
+    """Distances that stand for the objects' extent, which centres lack, in the first two numbers of positions.
 
     pair: two centres nearer than this hardly occur. tool: a push whose path comes nearer to a centre touches it.
     """
@@ -26,16 +26,18 @@ class Nearness:
     tool: float
 
     @classmethod
-    def of(cls, real: GeneratedWindow) -> Nearness:
+    def of(cls, real: GeneratedWindow, space: Space = SPACE) -> Nearness:
         """From real windows `[B]`.
 
         `pair`: so that 1 % of the last states have a nearer pair; 0 without two objects anywhere. `tool`: so that
-        as many pushes come nearer to a centre as moved an object by more than 1 cm.
+        as many pushes come nearer to a centre as moved an object by more than 1 cm; 0 in other worlds.
         """
         closest = pair_distances(real.steps[:, -1], real.first.mask).amin((-1, -2))
         several = closest[closest.isfinite()]
         pair = torch.quantile(several, CLOSE_PAIR_SHARE).item() if len(several) else 0.0
-        moved = (_moves_of_pushes(real) > MOVED).any(-1).to(real.steps.dtype).mean()
+        if space != SPACE:
+            return cls(pair, 0.0)
+        moved = (_moves_of_pushes(real) > space.center_scale).any(-1).to(real.steps.dtype).mean()
         return cls(pair, torch.quantile(path_distances(real).amin(-1), moved).item())
 
 
@@ -54,8 +56,16 @@ class Statistic:
     unit: str = ""
 
 
-def statistics_of(nearness: Nearness) -> list[Statistic]:
+def length_text(length: float, space: Space) -> str:
+    """A length in centimetres on the table, elsewhere in the world's own unit."""
+    return f"{100 * length:.3g} cm" if space == SPACE else f"{length:.3g}"
+
+
+def statistics_of(nearness: Nearness, space: Space = SPACE) -> list[Statistic]:
     """All statistics. Those of h look at its subgoal, those of f at the states after each push."""
+    ends = [*_statistics_of_ends("h", nearness.pair, space), *_statistics_of_ends("f", nearness.pair, space)]
+    if space != SPACE:
+        return [*ends, Statistic("action", "length of an action", lambda outcome: outcome.actions.norm(dim=-1), "g")]
     start, touching = (
         "from a push's start to the nearest centre",
         f"share of pushes that pass within {100 * nearness.tool:.1f} cm of a centre",
@@ -65,32 +75,37 @@ def statistics_of(nearness: Nearness) -> list[Statistic]:
         return (path_distances(outcome).amin(-1) < nearness.tool).float().mean(-1)
 
     return [
-        *_statistics_of_ends("h", nearness.pair),
-        *_statistics_of_ends("f", nearness.pair),
+        *ends,
         Statistic("start_to_nearest", start, lambda outcome: start_distances(outcome).amin(-1), "g", "m"),
         Statistic("touching", touching, touched, "g"),
     ]
 
 
-def _statistics_of_ends(part: str, near: float) -> list[Statistic]:
-    """Those of the states after the segment as h or f has them; `near` in metres."""
+def _statistics_of_ends(part: str, near: float, space: Space) -> list[Statistic]:
+    """Those of the states after the segment as h or f has them. An object has moved by more than its scale."""
+    unit = "m" if space == SPACE else ""
 
     def end(outcome: GeneratedWindow) -> Tensor:
         end = outcome.steps[:, -1] if part == "f" else outcome.subgoal
         assert end is not None
         return end
 
-    def moves(outcome: GeneratedWindow) -> Tensor:  # [B, M] metres, 0 for padding
+    def moves(outcome: GeneratedWindow) -> Tensor:  # [B, M], 0 for padding
         return (end(outcome) - outcome.first.centers).norm(dim=-1) * outcome.first.mask
 
     def close_pairs(outcome: GeneratedWindow) -> Tensor:  # every pair stands in the matrix twice
         return (pair_distances(end(outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
 
-    move, moved = f"farthest move over the segment, {part}", f"objects that move more than 1 cm, {part}"
-    close = f"pairs of centres nearer than {100 * near:.1f} cm, {part}"
+    move, moved = (
+        f"farthest move over the segment, {part}",
+        f"objects that move more than {length_text(space.center_scale, space)}, {part}",
+    )
+    close = f"pairs of centres nearer than {length_text(near, space)}, {part}"
     return [
-        Statistic(f"farthest_move_{part}", move, lambda outcome: moves(outcome).amax(-1), part, "m"),
-        Statistic(f"moved_objects_{part}", moved, lambda outcome: (moves(outcome) > MOVED).sum(-1).float(), part),
+        Statistic(f"farthest_move_{part}", move, lambda outcome: moves(outcome).amax(-1), part, unit),
+        Statistic(
+            f"moved_objects_{part}", moved, lambda outcome: (moves(outcome) > space.center_scale).sum(-1).float(), part
+        ),
         Statistic(f"close_pairs_{part}", close, close_pairs, part),
     ]
 

@@ -1,7 +1,7 @@
-"""Does a push reach its subgoal in physics? Pushes generated for (s, c) against the subgoal h(s, c).
+"""Do motions reach their subgoals in the simulator? Actions generated for (s, c) against the subgoal h(s, c).
 
-The paper asserts it (sections 3.1 and 3.2: h and g share the effect code); here the pushes are carried out.
-Letters: N candidates, T pushes, M objects.
+The paper asserts it (sections 3.1 and 3.2: h and g share the effect code); here the actions are carried out.
+Letters: N candidates, T actions, M objects.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,13 +22,17 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS
 from cavin_pyro.criticism.estimates import UNKNOWN, Interval, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
+from cavin_pyro.criticism.pushing import length_text
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
 from cavin_pyro.data.collection import clutter_area, open_scene
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.envs.tabletop.scene import Scene
+from cavin_pyro.envs.tabletop.workspace import SPACE
+from cavin_pyro.envs.world import World, executed
 from cavin_pyro.models.model import Model
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.returns import best_of, squared_distance
 from cavin_pyro.planning.rollout import predict_states
@@ -37,27 +42,29 @@ from cavin_pyro.storage.progress import progress_bar
 SAMPLED, CLOSEST, GIVEN = "sampled", "closest", "given by the effect"  # how a motion is obtained
 
 Floats = NDArray[np.floating]
-NAME, TITLE = "subgoals", "Do pushes reach their subgoals in physics?"
-MOVING = 0.02  # metres; objects that a subgoal moves less are not counted among those that it wants moved
+NAME, TITLE = "subgoals", "Do motions reach their subgoals in the simulator?"
+MOVING = 2.0  # scales of centres; objects that a subgoal moves less are not among those that it wants moved
 NEAR, FAR = 0.35, 0.65  # of the way to the subgoal that is left
 FEWEST = 50  # scenes
 COLORS = ("#D55E00", "#0072B2")
 
 EXPLANATION = (
-    "The paper asserts that the pushes generated for a state s and an effect code c lead to the subgoal h(s, c). This "
-    "check executes them in PyBullet, in {scenes} scenes of {objects} objects, and compares the state observed "
-    "afterwards with the subgoal and with f's prediction. Effect codes are sampled from the prior. A motion code is "
-    "sampled from the prior, or it is the closest of {samples}: the one that leads f closest to the subgoal, which is "
-    "what the planner executes. Models of one code have no motion to choose; models without h are compared with f's "
-    f"prediction only. Distances are means over the objects that the subgoal moves by more than {100 * MOVING:g} cm, "
-    "between centres. An unsafe push would bring the tool down on an object and is not executed; an ineffective one "
-    "moves nothing."
+    "The paper asserts that the actions generated for a state s and an effect code c lead to the subgoal h(s, c). This "
+    "check executes them in the simulator, in {scenes} scenes, and compares the state observed afterwards with the "
+    "subgoal and with f's prediction. Effect codes are sampled from the prior. A motion code is sampled from the "
+    "prior, or it is the closest of {samples}: the one that leads f closest to the subgoal, which is what the planner "
+    "executes. Models of one code have no motion to choose; models without h are compared with f's prediction only. "
+    "Distances are means over the objects that the subgoal moves by more than {moving}, between centres."
+)
+PUSHES = (
+    " There are {objects} objects. An unsafe push would bring the tool down on an object and is not executed; an "
+    "ineffective one moves nothing."
 )
 
 
 def check_objects(model: Model, objects: int) -> None:
-    """Refuse, by a UserError, more objects than a model knows."""
-    if objects > model.maximum_objects:
+    """Refuse, by a UserError, more objects on the table than a model knows."""
+    if model.space == SPACE and objects > model.maximum_objects:
         raise UserError(f"sizes.subgoals.objects={objects}, but the model knows at most {model.maximum_objects}")
 
 
@@ -66,12 +73,16 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
 
     Args:
         scenes: number of scenes to sample.
-        objects: number of objects in a scene, at most as many as the model knows.
+        objects: number of objects in a scene on the table, at most as many as the model knows.
         samples: N, candidates for the closest motion.
     """
-    check_objects(context.model, objects)
+    if context.world is None:
+        return not_applicable(NAME, TITLE, "The simulator is not known: give the world of the data (env=).")
+    space, table = context.space, not isinstance(context.world, World)
+    if table:
+        check_objects(context.model, objects)
     if not context.codes:
-        return not_applicable(NAME, TITLE, f"{NO_CODES} It generates no pushes.")
+        return not_applicable(NAME, TITLE, f"{NO_CODES} It generates no actions.")
     if others := [name for name in context.codes if name not in SYMBOLS]:
         return not_applicable(NAME, TITLE, f"{', '.join(others)}: planning samples effect_code and motion_code alone.")
     groups: dict[str, list[SubgoalRollout]] = {}
@@ -80,31 +91,34 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
             for rollout in rollouts:
                 groups.setdefault(f"motion {rollout.motion}", []).append(rollout)
             bar.update()
-    measured = {name: measure(rollouts, seed=context.seed) for name, rollouts in groups.items()}
+    measured = {
+        name: measure(rollouts, MOVING * space.center_scale, seed=context.seed) for name, rollouts in groups.items()
+    }
     best = f"motion {motions(context.codes)[-1]}"
     left = measured[best].get("left")
     return Section(
         NAME,
         TITLE,
-        EXPLANATION.format(scenes=scenes, objects=objects, samples=samples),
+        EXPLANATION.format(scenes=scenes, samples=samples, moving=length_text(MOVING * space.center_scale, space))
+        + (PUSHES.format(objects=objects) if table else ""),
         _verdict(left, best, scenes),
-        [_finding(name, numbers) for name, numbers in measured.items()],
-        {"scenes": scenes, "objects": objects, "samples": samples, "motions": measured},
+        [_finding(name, numbers, space) for name, numbers in measured.items()],
+        {"scenes": scenes, **({"objects": objects} if table else {}), "samples": samples, "motions": measured},
         f"part of the way to the subgoal that is left ({best})" if left else "",
         left,
-        figure=draw_distances(groups),
+        figure=draw_distances(groups, space),
         caption="Left: share of the objects that are to move within a distance of their subgoal (of f's prediction "
-        "without h), after the pushes, and before (dashed). Right: how far objects move in physics and by f; "
-        "at the bottom a push missed what f expects it to move.",
+        "without h), after the actions, and before (dashed). Right: how far objects move in the simulator and by f; "
+        "at the bottom a motion missed what f expects it to move.",
     )
 
 
 class SegmentPlan(NamedTuple):
-    """The pushes of one segment, with the states that the model predicts after them."""
+    """The actions of one segment, with the states that the model predicts after them."""
 
-    actions: Floats  # [T, 4] normalised
-    subgoal: Floats | None  # [M, 3] metres, by h
-    predicted: Floats  # [M, 3] metres, by f along the actions
+    actions: Floats  # [T, A] normalised
+    subgoal: Floats | None  # [M, P], by h
+    predicted: Floats  # [M, P], by f along the actions
 
 
 @dataclass(frozen=True)
@@ -113,9 +127,10 @@ class SubgoalRollout:
 
     Attributes:
         motion: how its code was obtained.
-        before, reached: [M, 3] metres, as observed before the first push and after the last.
+        before, reached: [M, P], as observed before the first action and after the last.
         unsafe, ineffective: numbers of pushes that were not executed, and that were executed and moved nothing.
-        lost: an object left the table, which ended the rollout, or is not visible at the end.
+        lost: an object left the table, or the world ended the episode, which ended the rollout, or an object is not
+            visible at the end.
     """
 
     motion: str
@@ -140,9 +155,16 @@ def subgoal_rollouts(
     Args:
         samples: N, the number of candidates for the closest motion.
     """
-    with closing(open_scene(context.world)) as scene:
-        for number in range(scenes):
-            yield [_rollout(context, scene, number, way, objects, samples) for way in motions(context.codes)]
+    ways = motions(context.codes)
+    if isinstance(context.world, World):
+        with closing(context.world) as world:
+            for number in range(scenes):
+                yield [_rollout_in_world(context, world, number, way, samples) for way in ways]
+    elif context.world is not None:
+        with closing(open_scene(context.world)) as scene:
+            for number in range(scenes):
+                first = partial(sample_scene, scene, context.world.ranges, context.seed, number, objects)
+                yield [_rollout(context, scene, first(), number, way, objects, samples) for way in ways]
 
 
 def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, objects: int) -> Observation:
@@ -151,10 +173,34 @@ def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, obj
     return scene.sample([clutter_area(generator)] * objects, ranges, generator)
 
 
+def _rollout_in_world(context: CheckContext, world: World, number: int, motion: str, samples: int) -> SubgoalRollout:
+    """In an episode of another world than the tabletop; places of padding are zeros."""
+    seed = [context.seed, number]
+    observation, _ = world.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    before, mask = world.positions(observation)
+    plan = plan_segment(context.model, world.state(observation).expand_plans(1), motion, seed, samples)
+    ended = False
+    for action in plan.actions:
+        observation, _, ended, *_ = world.step(executed(action, None))
+        if ended:
+            break
+    reached, real = world.positions(observation)[0], mask[:, None]
+    subgoal = None if plan.subgoal is None else plan.subgoal * real
+    return SubgoalRollout(
+        motion,
+        plan=SegmentPlan(plan.actions, subgoal, plan.predicted * real),
+        before=before * real,
+        reached=reached * real,
+        unsafe=0,
+        ineffective=0,
+        lost=ended,
+    )
+
+
 def _rollout(
-    context: CheckContext, scene: Scene, number: int, motion: str, objects: int, samples: int
+    context: CheckContext, scene: Scene, first: Observation, number: int, motion: str, objects: int, samples: int
 ) -> SubgoalRollout:
-    first = sample_scene(scene, context.world.ranges, context.seed, number, objects)
+    assert context.geometry is not None
     state = state_of(vars(first), context.geometry).expand_plans(1)
     plan = plan_segment(context.model, state, motion, [context.seed, number], samples)
     reports = []
@@ -176,7 +222,7 @@ def _rollout(
 
 @torch.inference_mode()
 def plan_segment(model: Model, state: State, motion: str, seed: list[int], samples: int) -> SegmentPlan:
-    """Sample an effect for one scene `state: [1]`, obtain a motion in one of the ways, and generate the pushes.
+    """Sample an effect for one scene `state: [1]`, obtain a motion in one of the ways, and generate the actions.
 
     A motion code is sampled from the prior, or it is the closest of N: the one that leads f closest to the subgoal, as
     in planning (paper, Algorithm 1, line 10). A model with one code has its motion given by the effect.
@@ -205,15 +251,17 @@ def _generator(seed: list[int]) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
 
-def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> dict[str, Any]:
-    """Numbers of rollouts whose codes were obtained in one way; metres, shares as fractions, NaN where nothing counts.
+def measure(
+    rollouts: Sequence[SubgoalRollout], moving: float = MOVING * SPACE.center_scale, *, seed: int
+) -> dict[str, Any]:
+    """Numbers of rollouts whose codes were obtained in one way; lengths, shares as fractions, NaN where nothing counts.
 
     Counted in distances are rollouts in which no object was lost. An object is *wanted* where the subgoal lies
-    more than `MOVING` from it.
+    more than `moving` from it.
 
     Returns:
         Shares `unsafe` and `ineffective` of the pushes, `lost` of the rollouts; of objects that moved
-        more than `MOVING` or were predicted to: `moved` and f's `error`. With subgoals, of the wanted objects:
+        more than `moving` or were predicted to: `moved` and f's `error`. With subgoals, of the wanted objects:
         `wanted` (their mean distance to the subgoal at first), `from_subgoal` (at the end), `predicted_from_subgoal`
         (f's end state), `from_prediction` (at the end; f against physics), and `left`: `from_subgoal` over `wanted`, an
         interval over scenes.
@@ -230,20 +278,20 @@ def measure(rollouts: Sequence[SubgoalRollout], *, seed: int) -> dict[str, Any]:
         )
     )
     moved, error = _lengths(reached - before), _lengths(reached - predicted)
-    moving = np.maximum(moved, _lengths(predicted - before)) > MOVING
+    counted = np.maximum(moved, _lengths(predicted - before)) > moving
     numbers: dict[str, Any] = {
         "counted": len(finished),
         "unsafe": sum(rollout.unsafe for rollout in rollouts) / pushes,
         "ineffective": sum(rollout.ineffective for rollout in rollouts) / pushes,
         "lost": float(np.mean([rollout.lost for rollout in rollouts])),
-        "moved": _mean(moved[moving]),
-        "error": _mean(error[moving]),
+        "moved": _mean(moved[counted]),
+        "error": _mean(error[counted]),
     }
     if rollouts[0].plan.subgoal is None:
         return numbers
     subgoal = np.reshape([rollout.plan.subgoal for rollout in finished], shape)
     way, end = _lengths(subgoal - before), _lengths(reached - subgoal)
-    wanted = way > MOVING
+    wanted = way > moving
     left = UNKNOWN
     if wanted.any():
         remaining, whole = (torch.from_numpy((lengths * wanted).sum(-1)) for lengths in (end, way))
@@ -279,46 +327,47 @@ def _verdict(left: Interval | None, name: str, scenes: int) -> Verdict:
     return Verdict(level, rule, advice if level != GOOD else "")
 
 
-def _finding(name: str, numbers: Mapping[str, Any]) -> str:
+def _finding(name: str, numbers: Mapping[str, Any], space: Space) -> str:
     pushes = f"{numbers['unsafe']:.0%} of the pushes are unsafe and {numbers['ineffective']:.0%} ineffective"
+    end = f"; {pushes}." if space == SPACE else "."
     name = name[0].upper() + name[1:]
+    length = {key: length_text(value, space) for key, value in numbers.items() if isinstance(value, float)}
     if "left" not in numbers:
-        return (
-            f"{name}: f errs by {100 * numbers['error']:.1f} cm on objects that move {100 * numbers['moved']:.1f} cm; "
-            f"{pushes}."
-        )
+        return f"{name}: f errs by {length['error']} on objects that move {length['moved']}{end}"
     if math.isnan(numbers["left"].mean):
-        return f"{name}: no subgoal moves an object by more than {100 * MOVING:g} cm; {pushes}."
+        return f"{name}: no subgoal moves an object by more than {length_text(MOVING * space.center_scale, space)}{end}"
     return (
-        f"{name}: objects that are to move {100 * numbers['wanted']:.1f} cm end {100 * numbers['from_subgoal']:.1f} cm "
-        f"from the subgoal, so that {numbers['left'].percent()} of the way is left; f predicted "
-        f"{100 * numbers['predicted_from_subgoal']:.1f} cm; {pushes}."
+        f"{name}: objects that are to move {length['wanted']} end {length['from_subgoal']} from the subgoal, so that "
+        f"{numbers['left'].percent()} of the way is left; f predicted {length['predicted_from_subgoal']}{end}"
     )
 
 
-def draw_distances(groups: Mapping[str, Sequence[SubgoalRollout]]) -> Figure:
-    """Distances of the objects that are to move, and f's moves against those in physics."""
+def draw_distances(groups: Mapping[str, Sequence[SubgoalRollout]], space: Space = SPACE) -> Figure:
+    """Distances of the objects that are to move, and f's moves against those in the simulator."""
+    factor, unit = (100, " (cm)") if space == SPACE else (1, "")
+    moving, far = MOVING * space.center_scale, 2 * factor * space.step_range
     figure = Figure(figsize=(8.5, 3.6), layout="constrained")
     shares, moves = figure.subplots(1, 2)
     for color, (name, rollouts) in zip(COLORS, groups.items(), strict=False):
         finished = [rollout for rollout in rollouts if not rollout.lost]
         for rollout in finished:
             states = (rollout.plan.predicted, rollout.reached)
-            moves.plot(*(100 * _lengths(state - rollout.before) for state in states), ".", color=color, alpha=0.5)
-        distances = [wanted_distances(rollout) for rollout in finished]
+            moves.plot(*(factor * _lengths(state - rollout.before) for state in states), ".", color=color, alpha=0.5)
+        distances = [wanted_distances(rollout, moving) for rollout in finished]
         if sum(one.size for one in distances):
-            before, after = 100 * np.concatenate(distances, 1)
+            before, after = factor * np.concatenate(distances, 1)
             shares.ecdf(after, color=color, label=name)
             shares.ecdf(before, color=color, linestyle="--", linewidth=0.8)
-    moves.plot([0, 30], [0, 30], color="#999999", linewidth=1, linestyle="--")
-    moves.set(xlabel="by f (cm)", ylabel="moved in physics (cm)", xlim=(-0.5, 30), ylim=(-0.5, 30))
-    shares.set(xlabel="distance to the subgoal (cm)", ylabel="share of objects", xlim=(0, 30), ylim=(0, 1))
+    moves.plot([0, far], [0, far], color="#999999", linewidth=1, linestyle="--")
+    labels = {"xlabel": f"by f{unit}", "ylabel": f"moved in the simulator{unit}"}
+    moves.set(**labels, xlim=(-far / 60, far), ylim=(-far / 60, far))
+    shares.set(xlabel=f"distance to the subgoal{unit}", ylabel="share of objects", xlim=(0, far), ylim=(0, 1))
     shares.legend(fontsize=8, frameon=False, loc="lower right")
     return figure
 
 
-def wanted_distances(rollout: SubgoalRollout) -> Floats:
-    """[2, n] metres, of the objects that are to move: to where they should be, before and after the pushes."""
+def wanted_distances(rollout: SubgoalRollout, moving: float = MOVING * SPACE.center_scale) -> Floats:
+    """[2, n], of the objects that are to move: to where they should be, before and after the actions."""
     aim = rollout.plan.predicted if rollout.plan.subgoal is None else rollout.plan.subgoal
     distances = np.stack([_lengths(aim - state) for state in (rollout.before, rollout.reached)])
-    return distances[:, distances[0] > MOVING]
+    return distances[:, distances[0] > moving]

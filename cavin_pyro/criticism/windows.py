@@ -22,12 +22,12 @@ WINDOWS_AT_ONCE = 4096  # a few megabytes per layer, so that a pass stays in the
 
 
 class GeneratedWindow(NamedTuple):
-    """Actions and states of windows `[B]`, observed or generated. Lengths are metres."""
+    """Actions and states of windows `[B]`, observed or generated."""
 
     first: State  # [B], the state s
-    actions: Tensor  # [B, T, 4] normalised
-    steps: Tensor  # [B, T, M, 3] centres after each push, from f
-    subgoal: Tensor | None  # [B, M, 3] centres after the segment, from h; None for a model without h
+    actions: Tensor  # [B, T, A] normalised
+    steps: Tensor  # [B, T, M, P] centres after each action, from f
+    subgoal: Tensor | None  # [B, M, P] centres after the segment, from h; None for a model without h
     chosen: bool = True  # whether the actions are the model's own
 
 

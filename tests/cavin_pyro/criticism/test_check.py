@@ -21,13 +21,17 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism import sections
 from cavin_pyro.criticism.loading import CheckContext, compare_data, load_context, trained_windows
 from cavin_pyro.criticism.section import Section, Verdict
+from cavin_pyro.data.collection import collect
 from cavin_pyro.data.dataset import content_record
+from cavin_pyro.data.episodes import WorldCollection
 from cavin_pyro.data.windows import load_windows
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.storage.checkpoint import load, save
+from cavin_pyro.training.run import train
 from tests.cavin_pyro.conftest import SMALL_CHECK, WINDOWS
 from tests.guides.user_programs import InferredKindsGuide, KindsGuide, KindsModel
 
+POINT = {"_target_": "tests.cavin_pyro.data.point.Point"}
 SMALL = [*SMALL_CHECK, "sizes.subgoals.scenes=2"]
 
 
@@ -81,6 +85,23 @@ def test_other_models_are_checked_for_what_they_have(
     parts = sections.run_sections(list(sections.SECTIONS), context, config.sizes, tmp_path, "")
     nothing = {part["name"] for part in parts if "The model has no codes" in " ".join(part["findings"])}
     assert nothing == ({"guide", "prior", "subgoals"} if name == "dynamics" else set())
+
+
+def test_in_another_world_motions_are_executed_if_it_is_given(pushes: Path, tmp_path: Path) -> None:
+    (tmp_path / "walks").mkdir()
+    walks = WorldCollection(POINT, seed=3, steps=12, episodes_per_shard=10)
+    collect(walks, tmp_path / "walks", transitions=250, workers=1)
+    steps = ("trainer.steps=3", "trainer.validate_every=3", "trainer.batch_size=8", "model.width=8")
+    train(compose("train", f"data={tmp_path / 'walks'}", f"output={tmp_path / 'run'}", *steps))
+    words = [f"checkpoint={tmp_path / 'run' / 'checkpoint.safetensors'}", *SMALL_CHECK]
+    for env in ([], [f"env._target_={POINT['_target_']}"]):
+        config = compose("check", f"data={tmp_path / 'walks'}", *words, *env)
+        context, _ = load_context(config)
+        *others, last = sections.run_sections(list(sections.SECTIONS), context, config.sizes, tmp_path, str(env))
+        assert all(part["values"]["windows"] for part in others)
+        assert last["values"].get("scenes") == (1 if env else None)
+    with pytest.raises(UserError, match=r"is of another world than checkpoint .*: choose another dataset"):
+        load_context(compose("check", f"data={pushes}", *words))
 
 
 @pytest.mark.parametrize("kind", [KindsGuide, InferredKindsGuide])
