@@ -18,7 +18,7 @@ def unit(values: Tensor) -> Tensor:
     return functional.normalize(values, dim=-1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Space:
     """The numbers of a world. Lengths are in its own unit; lists may stand for tuples.
 
@@ -27,10 +27,12 @@ class Space:
     Attributes:
         origin: [P], the position that networks see as 0; P is the dimension of positions. length: a typical distance,
             which they see as 1.
-        step_range, subgoal_range: the most that f in a step, and h in a segment, moves a position along an axis.
+        step_range, subgoal_range: the most that f in a step, and h in a segment, moves a position along an axis;
+            by default three steps.
         action_sizes: how many numbers each part of an action has; A is their sum. action_names: of the parts.
         action_limits: of g's means, approached softly: 1 is the border of the action box.
-        center_scale, feature_scale, action_scales: standard deviations of the likelihoods, one for each part.
+        center_scale, feature_scale, action_scales: standard deviations of the likelihoods, one for each part; that of
+            positions is by default a fiftieth of the length.
         unit_features: how many numbers of a feature, from the first, are a vector of unit length; the others are free.
             None: all.
         turning: networks see positions from object 0, and all vectors in its axes: its feature begins with the cosine
@@ -44,11 +46,11 @@ class Space:
     origin: Sequence[float]
     length: float
     step_range: float
-    subgoal_range: float
+    subgoal_range: float = 0.0
     action_sizes: Sequence[int]
     action_names: Sequence[str] = ("action",)
     action_limits: Sequence[float] = (1.0,)
-    center_scale: float = 0.01
+    center_scale: float = 0.0
     feature_scale: float = 0.1
     action_scales: Sequence[float] = (0.1,)
     unit_features: int | None = None
@@ -58,6 +60,8 @@ class Space:
     def __post_init__(self) -> None:
         for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name, usual in (("subgoal_range", 3.0 * self.step_range), ("center_scale", self.length / 50)):
+            object.__setattr__(self, name, getattr(self, name) or usual)
         parts = (self.action_names, self.action_limits, self.action_scales)
         if not self.action_sizes or any(len(one) != len(self.action_sizes) for one in (*parts, {*self.action_names})):
             raise ValueError(

@@ -218,7 +218,10 @@ def _composed(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, st
 def _default_output(name: str, config: dict[str, Any], hydra_config: Any) -> str:
     """A folder that says how a run differs from the usual one: "runs/train-model=flat,guide=flat"."""
     pattern = OUTPUT.get(name, f"runs/{name}")
-    told = {*SAME_RUN, *re.findall(r"{(\w+)}", pattern)}
+    world = str((config.get("world") or {}).get("_target_") or "").rpartition(".")[2].lower()
+    if world:
+        pattern = re.sub(r"pushes|{task}-{reward}-{objects}", world, pattern)
+    told = {*SAME_RUN, "world", "world._target_", *re.findall(r"{(\w+)}", pattern)}
     overrides = [word.lstrip("+") for word in hydra_config.overrides.task if not word.endswith("={}")]
     others = _file_name([word for word in overrides if word.partition("=")[0] not in told])
     return pattern.format(**{**config, **hydra_config.runtime.choices}) + ("-" if others else "") + others

@@ -19,8 +19,6 @@ from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
 
 CODES = ("effect_code", "motion_code")
 COMPILED = (infer.JitTrace_ELBO, infer.JitTraceEnum_ELBO, infer.JitTraceGraph_ELBO, infer.JitTraceMeanField_ELBO)
-CENTER_UNIT = 0.005  # in the world's unit, a typical error of f after one action; on the tabletop 5 mm
-FEATURE_UNIT = 0.1  # of a vector of unit length
 SMOOTHING = 1e-6  # of squared distances between centres, and between features; the distance has no gradient at 0
 
 
@@ -202,21 +200,21 @@ def rollout_loss(model: Model, window: Window) -> Tensor:
     """Distances between f's own rollout and what was observed, summed over the windows `[B]`, a scalar.
 
     s^_0 = s_0, s^_t+1 = mean of f(. | s^_t, a_t) for t = 0, ..., T - 1, and the term is the sum over t and objects of
-    |center^ - center| / 0.005 + |feature^ - feature| / 0.1. Distances, not squares, because a few actions end far from
-    what is likely. Objects count that are real before and after action t, in windows whose actions up to t all
-    count (`transition_mask`).
+    |center^ - center| / (center_scale / 2) + |feature^ - feature| / feature_scale, scales of the world's space.
+    Distances, not squares, because a few actions end far from what is likely. Objects count that are real before and
+    after action t, in windows whose actions up to t all count (`transition_mask`).
 
     The bound scores each step from the state that was observed before it. A plan's later steps start from predictions,
     whose errors grow, and the bound does not penalise these.
     """
     state, counts = window.first, torch.ones_like(window.sequence_mask)
-    loss = window.actions.new_zeros(())
+    loss, space = window.actions.new_zeros(()), model.space
     for step in range(window.segment_length):
         state = model.next_state(state, window.actions[..., step, :])
         before, after = window.states.step(step), window.states.step(step + 1)
         counts = counts & window.transition_mask[..., step]
-        far = _distance(state.centers, after.centers) / CENTER_UNIT
-        far = far + _distance(state.features, after.features) / FEATURE_UNIT
+        far = _distance(state.centers, after.centers) / (space.center_scale / 2)
+        far = far + _distance(state.features, after.features) / space.feature_scale
         loss = loss + far.where(before.mask & after.mask & counts.unsqueeze(-1), 0.0).sum()
     return loss
 

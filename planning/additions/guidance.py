@@ -31,7 +31,6 @@ from cavin_pyro.planning.protocol import (
 from cavin_pyro.planning.returns import Progress, TrackingState, select_segment
 
 CONTINUES = 0.9  # after each segment; 1 values the last state alone
-ACTIONS_PER_LENGTH = 20.0  # turns distances into returns, whose unit is an action: one moves an object by about 0.05
 
 
 @dataclass(frozen=True)
@@ -39,14 +38,18 @@ class Guidance(Addition):
     """Prefers, among plans that miss the goal, those that leave the shortest way to it along allowed places.
 
     Plans raise ValueError for a reward that does not know the remaining distance to the goal.
+
+    actions_per_length: turns distances into returns, whose unit is an action; a push moves an object by about 0.05.
     """
+
+    actions_per_length: float = 20.0
 
     def wrap_objective(self, objective: SearchObjective, scene: Query, effect: ChosenEffect | None) -> SearchObjective:
         distance = scene.reward.distance_to_goal()
         if distance is None:
             raise ValueError("the addition guidance needs a reward with a `distance_to_goal`: leave it out")
         if effect is None:
-            return GuidedReturn(objective, distance)
+            return GuidedReturn(objective, distance, self.actions_per_length)
         return GuidedTracking(objective, distance, effect.subgoals, effect.segments, ~effect.succeeded)
 
 
@@ -77,6 +80,7 @@ class GuidedReturn:
 
     objective: SearchObjective
     distance_to_goal: RemainingDistance
+    actions_per_length: float = 20.0
 
     def start(self, plans: State) -> GuidedProgress:
         potential = self.potential(plans.centers, plans.mask)
@@ -91,12 +95,12 @@ class GuidedReturn:
 
     def potential(self, centers: Tensor, mask: Tensor) -> Tensor:
         """Minus the distance to the goal, in actions: `[B, n]`."""
-        return -ACTIONS_PER_LENGTH * self.distance_to_goal(centers, mask)
+        return -self.actions_per_length * self.distance_to_goal(centers, mask)
 
     def valued(self, inner: Any, value: Tensor, passed: Tensor, mask: Tensor) -> GuidedProgress:
         """The state of plans with that value, if they have not ended."""
         progress = unwrap(inner, Progress)
-        lowest = -ACTIONS_PER_LENGTH * self.distance_to_goal.longest(mask)
+        lowest = -self.actions_per_length * self.distance_to_goal.longest(mask)
         value = torch.where(progress.failed, lowest, torch.where(progress.succeeded, 0.0, value))
         return GuidedProgress(inner, value, passed)
 

@@ -29,6 +29,7 @@ from cavin_pyro.data.collection import CollectionConfig
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy
 from cavin_pyro.envs.tabletop.scene import Scene
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.models.state import State
 
@@ -51,7 +52,7 @@ class Oracle:
     `wish` makes the subgoal [M, 3] out of the centers before and after.
     """
 
-    name, maximum_objects, codes = "oracle", 5, ("effect_code", "motion_code")
+    name, maximum_objects, codes, space = "oracle", 5, ("effect_code", "motion_code"), SPACE
 
     def __init__(self, wish: Any = lambda before, after: after) -> None:
         self.wish, self.pushes, self.paths = wish, [], []
@@ -122,7 +123,7 @@ def test_a_model_whose_subgoals_oppose_its_pushes_is_found(oracle: Oracle) -> No
 
 
 def test_models_of_one_code_have_no_motion_to_choose(oracle: Oracle) -> None:
-    parts = {name: getattr(oracle, name) for name in ("actions", "next_state", "maximum_objects")}
+    parts = {name: getattr(oracle, name) for name in ("actions", "next_state", "maximum_objects", "space")}
     effects = SimpleNamespace(**parts, subgoal=oracle.subgoal, codes=("effect_code",), effect_prior=standard)
     found = assess(effects).values["motions"]
     assert list(found) == ["motion given by the effect"]
@@ -135,10 +136,10 @@ def test_models_of_one_code_have_no_motion_to_choose(oracle: Oracle) -> None:
 
 
 def test_models_without_pushes_or_for_fewer_objects_are_not_executed() -> None:
-    section = assess_subgoals(context_of(SimpleNamespace(maximum_objects=5, codes=())), scenes=1)
+    section = assess_subgoals(context_of(SimpleNamespace(maximum_objects=5, codes=(), space=SPACE)), scenes=1)
     assert section.verdict.level == "none"
     with pytest.raises(UserError, match=r"sizes\.subgoals\.objects=3, but the model knows at most 2"):
-        assess_subgoals(context_of(SimpleNamespace(maximum_objects=2)), scenes=1, objects=3)
+        assess_subgoals(context_of(SimpleNamespace(maximum_objects=2, space=SPACE)), scenes=1, objects=3)
 
 
 def test_the_closest_motion_is_the_one_that_f_leads_to_the_same_subgoal(small: SimpleNamespace) -> None:
