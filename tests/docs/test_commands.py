@@ -30,7 +30,7 @@ SMALL = {  # options that make each command a matter of a second
     "check": "windows=2 sections=[elbo]",
     "reproduce": "",
 }
-OTHER_WORLD = r"env\._target_=|data/pendulum|pusht"  # which refuses options of the tabletop
+OTHER_WORLD = r"env\._target_=|data/pendulum|pusht|maze"  # which refuses options of the tabletop
 NOT_RUN = {  # a part of a command, and why it does not run here
     "make ": "installs and tests everything",
     "source ": "of the shell",

@@ -1,0 +1,172 @@
+"""The large maze of PointMaze: a force moves a ball to a place (`gymnasium-robotics`; D4RL, Fu et al. 2020).
+
+Lengths are metres; a cell of the maze is 1 by 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cavin_pyro.envs.world import Goal, World
+from cavin_pyro.models.space import Space
+from cavin_pyro.models.state import State
+
+REPEAT = 10  # steps of the simulator, 0.01 s each, in one step of the environment
+REACHED = 0.45  # metres from the goal, as published
+
+Cell = tuple[int, int]
+Ways = dict[tuple[Cell, Cell], list[Cell]]
+
+
+class Place(Goal):
+    """The ball within `radius` of a place [2]; what is left is the straight distance, whatever the walls."""
+
+    def __init__(self, space: Space, place: Any, *, radius: float, weight: float) -> None:
+        super().__init__(space, weight=weight)
+        self._place, self._radius = [float(number) for number in place], radius
+
+    def success(self, state: State) -> Tensor:
+        return self.distance(state) < self._radius
+
+    def distance(self, state: State) -> Tensor:
+        return (state.centers[..., 0, :] - state.centers.new_tensor(self._place)).norm(dim=-1)
+
+
+class Maze(World):
+    """Reach a place in the maze. One step here is ten of the simulator's, with the same force.
+
+    Observation: place [2] and velocity [2]. Action: the force [2] in [-1, 1]. Walls are not observed: models learn
+    them. Its state has one object, the ball, whose feature is the velocity. `info` of a reset: `goal` [2].
+
+    Args:
+        cells: of the shortest way from the start to the goal, at least. stops: whether the goal ends an episode.
+        maximum_steps: after how many steps an episode is truncated; published, 80.
+        weight: of progress in the planner's reward. margin: the part of 0.45 m within which a plan has to end.
+
+    Raises:
+        ImportError: gymnasium-robotics is not installed. ValueError: an argument is not one of those above.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    space = Space(
+        origin=(0.0, 0.0),
+        length=4.0,
+        step_range=0.6,
+        action_sizes=(2,),
+        center_scale=0.02,
+        action_scales=(0.2,),
+        unit_features=0,
+        frequencies=5,
+    )
+    features, objects = 2, 1
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    observation_space = gymnasium.spaces.Box(-20.0, 20.0, (4,), np.float64)
+
+    def __init__(
+        self,
+        *,
+        cells: int = 10,
+        stops: bool = True,
+        maximum_steps: int = 80,
+        weight: float = 0.0,
+        margin: float = 0.8,
+        render_mode: str | None = None,
+    ) -> None:
+        if maximum_steps < 1 or not 2 <= cells <= 20 or render_mode not in (None, "rgb_array"):
+            given = f"maximum_steps={maximum_steps}, cells={cells}, render_mode={render_mode!r}"
+            raise ValueError(f"give maximum_steps of 1 or more, cells from 2 to 20, render_mode rgb_array, not {given}")
+        try:
+            from gymnasium_robotics.envs.maze import maps, point_maze
+        except ImportError as error:
+            line = f"the maze needs gymnasium-robotics ({error}): pip install -c constraints.txt -e '.[maze]'"
+            raise ImportError(line) from error
+        maze = maps.LARGE_MAZE
+        self._simulator = point_maze.PointMazeEnv(maze_map=maze, continuing_task=False, render_mode="rgb_array")
+        self.ways = shortest_ways(np.array(maze) == 0)
+        self._pairs = [pair for pair, way in self.ways.items() if len(way) >= cells]
+        self._stops, self._reward = stops, {"radius": margin * REACHED, "weight": weight}
+        self.maximum_steps, self.render_mode = maximum_steps, render_mode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Begin near the middle of a random cell, with a goal near that of another."""
+        super().reset(seed=seed)
+        cells = map(np.array, self._pairs[int(self.np_random.integers(len(self._pairs)))])
+        chosen = dict(zip(("reset_cell", "goal_cell"), cells, strict=True))
+        seen, _ = self._simulator.reset(seed=int(self.np_random.integers(2**31)), options=chosen)
+        self._steps, self.place = 0, self._simulator.goal.copy()
+        return seen["observation"], {"goal": self.place.copy()}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Push ten times, or until the goal is reached; an action that is not two finite numbers is a ValueError."""
+        force = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+        if force.shape != (2,) or not np.isfinite(force).all():
+            raise ValueError(f"action must be 2 finite numbers, not {action}")
+        for _ in range(REPEAT):
+            seen = self._simulator.step(force)[0]["observation"]
+            success = self._stops and bool(np.linalg.norm(seen[:2] - self.place) < REACHED)
+            if success:
+                break
+        self._steps += 1
+        return seen, float(success), success, not success and self._steps >= self.maximum_steps, {"success": success}
+
+    def state(self, observation: NDArray[np.float64]) -> State:
+        """See `World`."""
+        place, velocity = torch.tensor(observation, dtype=torch.float32).split(2)
+        return State(place[None], velocity[None], torch.ones(1, dtype=torch.bool))
+
+    def goal(self, device: str | torch.device = "cpu") -> Place:
+        """See `World`."""
+        return Place(self.space, self.place, **self._reward)
+
+    def policy(self, generator: np.random.Generator) -> Wanderer:
+        """See `World`."""
+        return Wanderer(generator, self.ways, self._simulator.maze)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a colour image in mode rgb_array."""
+        return None if self.render_mode is None else np.array(self._simulator.render())
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._simulator.close()
+
+
+class Wanderer:
+    """Goes the shortest way to one random cell after another, and strays from it."""
+
+    def __init__(self, generator: np.random.Generator, ways: Ways, maze: Any) -> None:
+        self._generator, self._ways, self._maze = generator, ways, maze
+        self._target, self._strays = (0, 0), generator.normal(size=2)
+
+    def act(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `cavin_pyro.envs.world.Policy`."""
+        row, column = self._maze.cell_xy_to_rowcol(observation[:2])
+        here = int(row), int(column)
+        if (here, self._target) not in self._ways or self._generator.random() < 0.02:
+            every = [goal for start, goal in self._ways if start == here]
+            self._target = every[int(self._generator.integers(len(every)))]
+        way = self._maze.cell_rowcol_to_xy(np.array(self._ways[here, self._target][1])) - observation[:2]
+        self._strays = 0.8 * self._strays + 0.6 * self._generator.normal(size=2)
+        return np.clip(4.0 * way - observation[2:] + 0.5 * self._strays, -1.0, 1.0)
+
+
+def shortest_ways(free: NDArray[np.bool_]) -> Ways:
+    """The cells from each free cell to each other, both ends included."""
+    ways: Ways = {}
+    for start in [(int(row), int(column)) for row, column in np.argwhere(free)]:
+        known: dict[Cell, list[Cell]] = {start: [start]}
+        for row, column in (queue := [start]):
+            for after in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+                if free[after] and after not in known:
+                    known[after] = [*known[row, column], after]
+                    queue.append(after)
+        ways |= {(start, goal): way for goal, way in known.items() if goal != start}
+    return ways
