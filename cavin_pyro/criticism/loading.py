@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,19 +96,6 @@ class CheckContext:
         return windows.map(lambda field: field[order]), (torch.arange(count) if episodes is None else episodes)[order]
 
 
-class Loaded(NamedTuple):
-    """A checkpoint with its data.
-
-    selection: the options by which its training selected windows. table: all windows of `folders`, as its own training
-    selected and split them.
-    """
-
-    checkpoint: Checkpoint
-    selection: WindowConfig
-    table: WindowTable
-    folders: list[Path]
-
-
 def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
@@ -121,45 +108,10 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
     Raises:
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
-    world, loaded = world_of(config), load_trained(config, accept)
+    world, on_table = world_of(config), collecting_world(config.env)
+    checkpoint, selection, table, folders = load_trained(config, accept)
     if world is not None:
-        check_space(loaded.checkpoint, world)
-    elif loaded.checkpoint.model.space == SPACE:
-        return context_of(config, loaded, collecting_world(config.env))
-    return context_of(config, loaded, world)
-
-
-@user_input("checkpoint", "data")
-def load_trained(config: DictConfig, accept: Accept | None = None) -> Loaded:
-    """The checkpoint that the options name, with its programs, and the windows of `data` as its training split them.
-
-    `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
-    """
-    checkpoint = load(config.checkpoint, trust=list(config.trust))
-    if accept is not None:
-        accept(checkpoint.model)
-    check_fit(checkpoint.model, checkpoint.geometry)
-    selection, segment_length, split = trained_windows(checkpoint)
-    folders = data_folders(config.data)
-    for folder in folders:
-        compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
-    if checkpoint.model.space != (shared_space(folders) or SPACE):
-        raise UserError(f"{folders[0]} is of another world than checkpoint {checkpoint.path}: choose another dataset")
-    storage = Path(config.output) if Path(config.output).is_dir() else None
-    table = load_windows(
-        folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
-    )
-    # What the file says of its parts may be such that they can be built and not run.
-    with checkpoint.named():
-        check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
-    return Loaded(checkpoint, selection, table, folders)
-
-
-def context_of(
-    config: DictConfig, loaded: Loaded, world: CollectionConfig | World | None
-) -> tuple[CheckContext, dict[str, Any]]:
-    """The context of a checkpoint and its data, and `about`."""
-    checkpoint, selection, table, folders = loaded
+        check_space(checkpoint, world)
     path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
     chosen = {
         "training": sample_windows(table, table.training, config.windows, seed=[config.seed, 0]),
@@ -173,7 +125,7 @@ def context_of(
         table.batch(chosen["training"]),
         table.batch(chosen["validation"]),
         seed=config.seed,
-        world=world,
+        world=on_table if model.space == SPACE else world,
         space=model.space,
         training_episodes=episodes["training"],
         validation_episodes=episodes["validation"],
@@ -196,6 +148,34 @@ def context_of(
         "run": provenance(),
     }
     return context, about
+
+
+@user_input("checkpoint", "data")
+def load_trained(
+    config: DictConfig, accept: Accept | None = None
+) -> tuple[Checkpoint, WindowConfig, WindowTable, list[Path]]:
+    """The checkpoint that the options name, with its programs, and the windows of `data` as its training split them.
+
+    `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
+    """
+    checkpoint = load(config.checkpoint, trust=list(config.trust))
+    if accept is not None:
+        accept(checkpoint.model)
+    check_fit(checkpoint.model, checkpoint.geometry)
+    selection, segment_length, split = trained_windows(checkpoint)
+    folders = data_folders(config.data)
+    for folder in folders:
+        compare_data(folder, checkpoint.provenance)  # no dataset: say so before reading any
+    if checkpoint.model.space != (shared_space(folders) or SPACE):
+        raise UserError(f"{folders[0]} is of another world than checkpoint {checkpoint.path}: choose another dataset")
+    storage = Path(config.output) if Path(config.output).is_dir() else None
+    table = load_windows(
+        folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
+    )
+    # What the file says of its parts may be such that they can be built and not run.
+    with checkpoint.named():
+        check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
+    return checkpoint, selection, table, folders
 
 
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
