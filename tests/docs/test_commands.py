@@ -30,7 +30,7 @@ SMALL = {  # options that make each command a matter of a second
     "check": "windows=2 sections=[elbo]",
     "reproduce": "",
 }
-OTHER_WORLD = r"env\._target_=|data/pendulum|pusht|maze"  # which refuses options of the tabletop
+OTHER_WORLD = r"env\._target_=|data/pendulum|pusht"  # which refuses options of the tabletop
 NOT_RUN = {  # a part of a command, and why it does not run here
     "make ": "installs and tests everything",
     "source ": "of the shell",
@@ -38,6 +38,7 @@ NOT_RUN = {  # a part of a command, and why it does not run here
     "cavin_pyro.assets": "needs the network; tests/cavin_pyro/fetching runs it on small archives",
     "env.assets=": "needs files from publishers",
     "launcher=ray": "needs a cluster",
+    "maze": "needs an extra; tests/envs runs it",
     "export=": "needs an extra; tests/cavin_pyro/criticism runs it",
     "cavin_pyro.data export": "needs an extra; tests/cavin_pyro/data runs it",
     "cavin_pyro.data import": "needs an extra; tests/cavin_pyro/data runs it",

@@ -42,7 +42,7 @@ def options() -> set[str]:
     found |= keys(compose("plan", "task=rearrange"))
     found |= keys(compose("train", "model=single_latent", "guide=single_latent", "objective=iwae"))
     found |= keys(compose("train", "dynamics=contact"))
-    found |= {f"env.{name}" for name in compose("plan", "env=pusht").world}
+    found |= {f"env.{name}" for world in ("pusht", "maze") for name in compose("plan", f"env={world}").world}
     return found | GROUPS
 
 
