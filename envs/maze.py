@@ -25,17 +25,14 @@ Ways = dict[tuple[Cell, Cell], list[Cell]]
 
 
 class Place(Goal):
-    """The ball within `radius` of a place [2]; what is left is the straight distance, whatever the walls."""
+    """The ball within `radius` of a place [2]; a sparse reward."""
 
-    def __init__(self, space: Space, place: Any, *, radius: float, weight: float) -> None:
-        super().__init__(space, weight=weight)
+    def __init__(self, space: Space, place: Any, radius: float) -> None:
+        super().__init__(space)
         self._place, self._radius = [float(number) for number in place], radius
 
     def success(self, state: State) -> Tensor:
-        return self.distance(state) < self._radius
-
-    def distance(self, state: State) -> Tensor:
-        return (state.centers[..., 0, :] - state.centers.new_tensor(self._place)).norm(dim=-1)
+        return (state.centers[..., 0, :] - state.centers.new_tensor(self._place)).norm(dim=-1) < self._radius
 
 
 class Maze(World):
@@ -45,9 +42,9 @@ class Maze(World):
     them. Its state has one object, the ball, whose feature is the velocity. `info` of a reset: `goal` [2].
 
     Args:
-        cells: of the shortest way from the start to the goal, at least. stops: whether the goal ends an episode.
+        cells: of the shortest way from the start to the goal, at least.
         maximum_steps: after how many steps an episode is truncated; published, 80.
-        weight: of progress in the planner's reward. margin: the part of 0.45 m within which a plan has to end.
+        margin: the part of 0.45 m within which a plan has to end.
 
     Raises:
         ImportError: gymnasium-robotics is not installed. ValueError: an argument is not one of those above.
@@ -72,9 +69,7 @@ class Maze(World):
         self,
         *,
         cells: int = 10,
-        stops: bool = True,
         maximum_steps: int = 80,
-        weight: float = 0.0,
         margin: float = 0.8,
         render_mode: str | None = None,
     ) -> None:
@@ -90,8 +85,7 @@ class Maze(World):
         self._simulator = point_maze.PointMazeEnv(maze_map=maze, continuing_task=False, render_mode="rgb_array")
         self.ways = shortest_ways(np.array(maze) == 0)
         self._pairs = [pair for pair, way in self.ways.items() if len(way) >= cells]
-        self._stops, self._reward = stops, {"radius": margin * REACHED, "weight": weight}
-        self.maximum_steps, self.render_mode = maximum_steps, render_mode
+        self._radius, self.maximum_steps, self.render_mode = margin * REACHED, maximum_steps, render_mode
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -111,7 +105,7 @@ class Maze(World):
             raise ValueError(f"action must be 2 finite numbers, not {action}")
         for _ in range(REPEAT):
             seen = self._simulator.step(force)[0]["observation"]
-            success = self._stops and bool(np.linalg.norm(seen[:2] - self.place) < REACHED)
+            success = bool(np.linalg.norm(seen[:2] - self.place) < REACHED)
             if success:
                 break
         self._steps += 1
@@ -124,7 +118,7 @@ class Maze(World):
 
     def goal(self, device: str | torch.device = "cpu") -> Place:
         """See `World`."""
-        return Place(self.space, self.place, **self._reward)
+        return Place(self.space, self.place, self._radius)
 
     def policy(self, generator: np.random.Generator) -> Wanderer:
         """See `World`."""

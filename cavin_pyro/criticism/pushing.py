@@ -66,10 +66,8 @@ def statistics_of(nearness: Nearness, space: Space = SPACE) -> list[Statistic]:
     ends = [*_statistics_of_ends("h", nearness.pair, space), *_statistics_of_ends("f", nearness.pair, space)]
     if space != SPACE:
         return [*ends, Statistic("action", "length of an action", lambda outcome: outcome.actions.norm(dim=-1), "g")]
-    start, touching = (
-        "from a push's start to the nearest centre",
-        f"share of pushes that pass within {100 * nearness.tool:.1f} cm of a centre",
-    )
+    start = "from a push's start to the nearest centre"
+    touching = f"share of pushes that pass within {length_text(nearness.tool, space)} of a centre"
 
     def touched(outcome: GeneratedWindow) -> Tensor:
         return (path_distances(outcome).amin(-1) < nearness.tool).float().mean(-1)
@@ -96,10 +94,8 @@ def _statistics_of_ends(part: str, near: float, space: Space) -> list[Statistic]
     def close_pairs(outcome: GeneratedWindow) -> Tensor:  # every pair stands in the matrix twice
         return (pair_distances(end(outcome), outcome.first.mask) < near).sum((-1, -2)) / 2
 
-    move, moved = (
-        f"farthest move over the segment, {part}",
-        f"objects that move more than {length_text(space.center_scale, space)}, {part}",
-    )
+    scale, move = length_text(space.center_scale, space), f"farthest move over the segment, {part}"
+    moved = f"objects that move more than {scale}, {part}"
     close = f"pairs of centres nearer than {length_text(near, space)}, {part}"
     return [
         Statistic(f"farthest_move_{part}", move, lambda outcome: moves(outcome).amax(-1), part, unit),

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from cavin_pyro.criticism.estimates import UNKNOWN, Interval, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import length_text
 from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
-from cavin_pyro.data.collection import clutter_area, open_scene
+from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.pushing import state_of
@@ -137,9 +136,9 @@ class SubgoalRollout:
     plan: SegmentPlan
     before: Floats
     reached: Floats
-    unsafe: int
-    ineffective: int
-    lost: bool
+    unsafe: int = 0
+    ineffective: int = 0
+    lost: bool = False
 
 
 def motions(codes: tuple[str, ...]) -> tuple[str, ...]:
@@ -155,16 +154,10 @@ def subgoal_rollouts(
     Args:
         samples: N, the number of candidates for the closest motion.
     """
-    ways = motions(context.codes)
-    if isinstance(context.world, World):
-        with closing(context.world) as world:
-            for number in range(scenes):
-                yield [_rollout_in_world(context, world, number, way, samples) for way in ways]
-    elif context.world is not None:
-        with closing(open_scene(context.world)) as scene:
-            for number in range(scenes):
-                first = partial(sample_scene, scene, context.world.ranges, context.seed, number, objects)
-                yield [_rollout(context, scene, first(), number, way, objects, samples) for way in ways]
+    assert context.world is not None
+    with closing(context.world if isinstance(context.world, World) else open_scene(context.world)) as simulator:
+        for number in range(scenes):
+            yield [_rollout(context, simulator, number, way, objects, samples) for way in motions(context.codes)]
 
 
 def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, objects: int) -> Observation:
@@ -191,16 +184,17 @@ def _rollout_in_world(context: CheckContext, world: World, number: int, motion: 
         plan=SegmentPlan(plan.actions, subgoal, plan.predicted * real),
         before=before * real,
         reached=reached * real,
-        unsafe=0,
-        ineffective=0,
         lost=ended,
     )
 
 
 def _rollout(
-    context: CheckContext, scene: Scene, first: Observation, number: int, motion: str, objects: int, samples: int
+    context: CheckContext, scene: Scene | World, number: int, motion: str, objects: int, samples: int
 ) -> SubgoalRollout:
-    assert context.geometry is not None
+    if isinstance(scene, World):
+        return _rollout_in_world(context, scene, number, motion, samples)
+    assert context.geometry is not None and isinstance(context.world, CollectionConfig)
+    first = sample_scene(scene, context.world.ranges, context.seed, number, objects)
     state = state_of(vars(first), context.geometry).expand_plans(1)
     plan = plan_segment(context.model, state, motion, [context.seed, number], samples)
     reports = []

@@ -246,13 +246,10 @@ class PushingEnv(Uncopied, World):
 
     def goal(self, device: str | torch.device = "cpu") -> TaskReward:
         """The task's reward with the margin: one object for each of `tasks`, which keeps what it has computed."""
-        key = id(self.task), str(device)
-        if key in self._goals:
-            return self._goals[key]
-        made = TaskReward(self.task, reward=self._rules[0], margin=self.margin, device=device)
-        if any(self.task is one for one in self.tasks):
-            self._goals[key] = made
-        return made
+        known, key = self._goals if any(self.task is one for one in self.tasks) else {}, (id(self.task), str(device))
+        if key not in known:
+            known[key] = TaskReward(self.task, reward=self._rules[0], margin=self.margin, device=device)
+        return known[key]
 
     @property
     def on_frame(self) -> Callable[[], None] | None:
