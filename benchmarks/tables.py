@@ -210,21 +210,6 @@ def factors() -> str:
     return markdown([*head, *(f"{what}, {count} objects" for count in (3, 5) for what in ("success", "pushes"))], lines)
 
 
-def simulator() -> str:
-    """The simulator in the place of f at line 10."""
-    lines = []
-    for (task, objects), found in groups(read("simulator"), "task", "objects").items():
-        by = groups(found, "line_10")
-        by_f, by_simulator = by["f",], by["simulator",]
-        alone, others, p = paired(by_f, by_simulator)
-        test = f"{alone}, {others} (p = {p:.2g})"
-        lines.append(
-            [f"{task}, {objects}", len(by_f), rate(by_f), rate(by_simulator), test, pushes(by_f), pushes(by_simulator)]
-        )
-    head = ["task, objects", "scenes", "f", "the simulator", "succeeds alone: f, the simulator"]
-    return markdown([*head, "pushes, f", "pushes, the simulator"], lines)
-
-
 def accuracy() -> str:
     """Errors of predicted centres, in centimetres, of objects that moved and that did not."""
     rows = read("accuracy")
@@ -284,7 +269,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "more_objects": more_objects,
     "variants": variants,
     "factors": factors,
-    "simulator": simulator,
     "accuracy": accuracy,
     "pusht": pusht,
     "speed": lambda: as_stored("speed"),
