@@ -120,7 +120,8 @@ ADDITIONS = [
     for task, objects in (("clearing", 5), ("insertion", 3), ("crossing", 5))
 ]
 TRAININGS = 3  # runs/pusht-0 and so on, by the commands of docs/how-to/push-t.md
-PUSHT = {"75 ahead": ("planner.horizon=15",), "25 ahead": ("planner.horizon=6", "env.ahead=25", "env.maximum_steps=10")}
+PUSHT = {"75 ahead": ("env=pusht",), "25 ahead": ("env=pusht", "env.ahead=25", "env.maximum_steps=10")}
+DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6"}
 SEARCH = ("planner.samples=4096", "planner.reward_at=subgoals", "planner.shrinking_horizon=true")
 ICEM = ("planner.optimizer=icem", "planner.optimizer.iterations=10", "planner.optimizer.elite_fraction=0.03")
 CASCADE = (*SEARCH, *ICEM, "planner.optimizer.radius=1", "checkpoint=runs/pusht-{}/checkpoint.safetensors")
@@ -128,13 +129,13 @@ FLAT = ("planner=mpc", "planner.additions=[]", "pushes_per_plan=null", *CASCADE)
 
 
 def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> list[Row]:
-    return [Row(name, task, None, ("env=pusht", *PUSHT[task], *options)) for task in tasks]
+    return [Row(name, task, None, (*PUSHT[task], *options, DEPTH[task])) for task in tasks]
 
 
 PUSHT_ROWS = [
     *pusht("cascade", *CASCADE, tasks=list(PUSHT)),
     *pusht("flat: actions", *FLAT, tasks=list(PUSHT)),
-    *pusht("random actions", "planner=random", tasks=list(PUSHT)),
+    *(Row("random actions", task, None, (*options, "planner=random")) for task, options in PUSHT.items()),
     *pusht("cascade, 2,048 samples", *CASCADE, "planner.samples=2048"),
     *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
     *pusht("flat: actions, 16,384 samples", *FLAT, "planner.samples=16384"),
