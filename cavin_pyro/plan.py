@@ -12,7 +12,7 @@ def main(config: DictConfig) -> Figures:
 
     from cavin_pyro.config.device import choose_device
     from cavin_pyro.envs.tabletop.pushing import PushingEnv
-    from cavin_pyro.evaluation.factory import announce_objects, make_runner
+    from cavin_pyro.evaluation.factory import make_runner
     from cavin_pyro.evaluation.statistics import counted, plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
     from cavin_pyro.storage.provenance import provenance
@@ -24,7 +24,6 @@ def main(config: DictConfig) -> Figures:
         check_same_run(folder, config, ignore=("output", "video", "planner.compile"))
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
-        announce_objects(config)
         row = render_episode(runner, folder, seed=config.seed, video=config.video)
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})

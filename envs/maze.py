@@ -66,16 +66,12 @@ class Maze(World):
     observation_space = gymnasium.spaces.Box(-20.0, 20.0, (4,), np.float64)
 
     def __init__(
-        self,
-        *,
-        cells: int = 10,
-        maximum_steps: int = 80,
-        margin: float = 0.8,
-        render_mode: str | None = None,
+        self, *, cells: int = 10, maximum_steps: int = 80, margin: float = 0.8, render_mode: str | None = None
     ) -> None:
-        if maximum_steps < 1 or not 2 <= cells <= 20 or render_mode not in (None, "rgb_array"):
-            given = f"maximum_steps={maximum_steps}, cells={cells}, render_mode={render_mode!r}"
-            raise ValueError(f"give maximum_steps of 1 or more, cells from 2 to 20, render_mode rgb_array, not {given}")
+        numbers = maximum_steps >= 1 and 2 <= cells <= 20 and 0 < margin <= 1
+        if not numbers or render_mode not in (None, "rgb_array"):
+            wanted = "maximum_steps of 1 or more, cells from 2 to 20, margin up to 1, render_mode rgb_array"
+            raise ValueError(f"give {wanted}, not {maximum_steps}, {cells}, {margin} and {render_mode!r}")
         try:
             from gymnasium_robotics.envs.maze import maps, point_maze
         except ImportError as error:

@@ -132,6 +132,8 @@ class Goal(ABC):
     about = "all"
 
     def __init__(self, space: Space, *, weight: float = 0.0) -> None:
+        if not 0 <= weight < math.inf:
+            raise ValueError(f"weight must be zero or a positive number, not {weight}")
         self.space, self.weight = space, weight
 
     @abstractmethod
@@ -201,15 +203,23 @@ def check_world(world: World) -> None:
         raise ValueError(f"{name}: its action_space must be a box from -1 to 1, not {box}")
     state = world.state(world.reset(seed=0)[0])
     _check_state(world, state)
-    observation, *_, info = world.step(np.zeros(space.actions, np.float32))
+    observation, earned, ended, _, info = world.step(np.zeros(space.actions, np.float32))
     _check_state(world, world.state(observation))
     if "success" not in info:
         raise ValueError(f"{name}: info of a step must have success, and has {', '.join(info) or 'nothing'}")
+    if {type(ended), type(info["success"])} - {bool, np.bool_} or not math.isfinite(earned):
+        said = f"{earned}, {ended} and {info['success']}"
+        raise ValueError(f"{name}: a step must give a finite reward, terminated and success as bool, not {said}")
+    if not 1 <= world.maximum_steps < math.inf:
+        raise ValueError(f"{name}: maximum_steps must be a number of at least 1, not {world.maximum_steps}")
     plans = 5
     one = state.map(lambda field: field.expand(plans, *field.shape))
     goal = world.goal()
     values = one.values(goal.reads_features)
-    outcome = goal(values, values, one.mask)
+    try:
+        outcome = goal(values, values, one.mask)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise ValueError(f"{name}: its goal does not fit states [{plans}]: {str(error).splitlines()[0]}") from error
     for field in ("success", "failure", "reward"):  # the reward is made of the others
         value = getattr(outcome, field)
         if (
@@ -227,6 +237,8 @@ def _check_state(world: World, state: State) -> None:
     if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
         found = [list(field.shape) for field in state]
         raise ValueError(f"{name}: a state must have centers, features and mask (bool) of {shapes}, not {found}")
+    if not state.mask.any():
+        raise ValueError(f"{name}: a state must have an object, and its mask has none")
     for part, values in (("centers", state.centers), ("features", state.features)):
         if values.dtype != torch.float32 or not values.isfinite().all():
             raise ValueError(f"{name}: {part} must be finite float32 numbers, not {values.dtype} {values.tolist()}")

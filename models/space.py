@@ -71,6 +71,9 @@ class Space:
         scales = (self.center_scale, self.feature_scale, *self.action_scales)
         if not self.origin or not all(0 < number < math.inf for number in (*positive, *scales)):
             raise ValueError("lengths, ranges, limits, scales and sizes of a space must be positive numbers")
+        counts = (*self.action_sizes, self.frequencies, self.unit_features or 0)
+        if any(type(count) is not int for count in counts) or not all(map(math.isfinite, self.origin)):
+            raise ValueError("sizes, frequencies and unit_features of a space must be whole, its origin finite numbers")
         if self.frequencies < 0 or (self.unit_features or 0) < 0:
             raise ValueError("frequencies and unit_features of a space must not be negative")
         if self.turning and (self.positions < 2 or any(size != 2 for size in self.action_sizes)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Integral
 
 import torch
 
@@ -27,7 +28,9 @@ class OptimizerError(ValueError):
 
 
 def check_positive(name: str, value: int) -> None:
-    """Raise ValueError if a count is zero or negative."""
+    """Raise ValueError unless a count is a whole number of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ValueError(f"{name} must be a whole number, not {value}")
     if value < 1:
         raise ValueError(f"{name} must be at least 1, not {value}")
 

@@ -180,7 +180,7 @@ def _of_other_world(overrides: Sequence[str], *, plans: bool) -> list[str]:
     if not chosen or choice == "tabletop":
         return [word for word in overrides if word != chosen]
     own = "_target_" in chosen
-    if not own and choice not in presets("world"):
+    if choice in ("", "null") or (not own and choice not in presets("world")):
         raise UserError(
             f"unknown env {choice!r}: choose from {', '.join(presets('world'))}, or give env._target_=CLASS"
         )

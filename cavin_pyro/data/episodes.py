@@ -107,14 +107,20 @@ def checked_episode(
 
     A `UserError` says what is not.
     """
-    motions = checked("actions", actions, torch.float32, (None, space.actions))
-    if len(motions) and (largest := float(motions.abs().max())) > 1:
-        raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
+    motions = checked_actions(actions, None, space.actions)
     places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
     others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
     real = checked("mask", mask, torch.bool, (places.shape[1],))
     made = {"centers": places, "features": others, "actions": motions, "mask": real}
     return {name: tensor.numpy() for name, tensor in made.items()}
+
+
+def checked_actions(actions: Any, *shape: int | None) -> Tensor:
+    """As `checked`; they must lie in the box."""
+    motions = checked("actions", actions, torch.float32, shape)
+    if motions.numel() and (largest := float(motions.abs().max())) > 1:
+        raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
+    return motions
 
 
 def checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | None]) -> Tensor:

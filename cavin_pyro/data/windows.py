@@ -21,7 +21,7 @@ from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.data.episodes import checked, checked_episode, packed
+from cavin_pyro.data.episodes import checked, checked_actions, checked_episode, packed
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
@@ -104,10 +104,12 @@ class WindowTable:
         Raises:
             UserError: shapes that do not fit together, numbers that are not finite, or nothing to train on.
         """
-        pushes = checked("actions", actions, torch.float32, (None, None, None))
+        pushes = checked_actions(actions, None, None, None)
         W, T = pushes.shape[:2]
         places = checked("centers", centers, torch.float32, (W, T + 1, None, None))
         real = checked("mask", mask, torch.bool, places.shape[:3])
+        if not real.any(-1).all():
+            raise UserError("mask has a state without an object: leave out its window")
         outlines = checked("features", features, torch.float32, (*places.shape[:3], None))
         transitions = checked("transition_mask", transition_mask, torch.bool, (W, T))
         sequences = checked("sequence_mask", sequence_mask, torch.bool, (W,))

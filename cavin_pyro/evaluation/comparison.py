@@ -57,6 +57,8 @@ def compare(one: Evaluation, other: Evaluation) -> Comparison:
     if here is not None and there is not None:
         _check_same_scenes(here, there, other)
     solved = {row["seed"]: row["outcome"] == "success" for row in theirs}
+    if len(solved) < len(theirs) or len({row["seed"] for row in mine}) < len(mine):
+        raise UserError("an evaluation has a seed twice: give each scene once")
     pairs = [(row["outcome"] == "success", solved[row["seed"]]) for row in mine if row["seed"] in solved]
     if not pairs:
         raise UserError("the two evaluations have no seed in common: give both the same seed=")

@@ -18,8 +18,9 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.evaluation.comparison import compare, earlier_rows, sentences
-from cavin_pyro.evaluation.factory import EpisodeRunner, announce_objects, make_runner, planner_name
+from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner, planner_name
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.statistics import plan_summary, summarize, table
@@ -89,8 +90,6 @@ def run_missing(config: DictConfig, folder: Path) -> list[Row]:
     rows, seeds = begin(folder), seeds_of(config)
     missing = missing_seeds(seeds, rows)
     launcher = chosen_launcher(config)
-    if missing:
-        announce_objects(config)
     with (
         closing(run_jobs([(config, seed) for seed in missing], launcher)) as finished,
         progress_bar("evaluating", total=len(seeds), initial=len(seeds) - len(missing), unit="episode") as bar,
@@ -107,6 +106,8 @@ def run_missing(config: DictConfig, folder: Path) -> list[Row]:
 
 def seeds_of(config: DictConfig) -> Sequence[int]:
     """The seeds of an evaluation's episodes, or of those in its shard; one without an episode is a `UserError`."""
+    if config.seed + config.episodes > MAXIMUM_SEED + 1:
+        raise UserError(f"seed={config.seed} leaves no room for {config.episodes} seeds up to {MAXIMUM_SEED}: lower it")
     seeds = of_shard(range(config.seed, config.seed + config.episodes), config.shard)
     if not seeds:
         raise UserError(f"shard={config.shard} has none of {config.episodes} episodes: choose a smaller n")

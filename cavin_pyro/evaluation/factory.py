@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -23,7 +22,7 @@ from cavin_pyro.config.world import object_ranges, part_of, task_of, world_of
 from cavin_pyro.envs.tabletop.layouts import GENERATED
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts
-from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, SPACE
+from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.envs.world import ACTION_DECIMALS, World
 from cavin_pyro.evaluation.rollout import Episode, rollout
 from cavin_pyro.models.model import Model
@@ -79,21 +78,6 @@ def planner_name(config: DictConfig) -> str:
     """The planner's class, and its optimizer's where it has one: "CavinPlanner, Shooting"."""
     parts = (config.planner, config.planner.get("optimizer") or {})
     return ", ".join(str(part["_target_"]).rpartition(".")[2] for part in parts if part.get("_target_"))
-
-
-def announce_objects(config: DictConfig) -> None:
-    """Say on standard error, before the first plan, that scenes have more objects than the model was trained with."""
-    if config.planner.get("model_free") or config.world.get("_target_"):
-        return
-    trained_before = load(config.checkpoint, trust=list(config.trust))
-    path, model = trained_before.path, trained_before.config["model"]
-    trained, near = model.get("maximum_objects", OBJECT_SLOTS), model.get("neighbours")
-    if config.objects > trained:
-        print(
-            f"objects={config.objects}: checkpoint {path} was trained with at most {trained}; in its relations, each "
-            f"object has its {trained - 1 if near is None else near} nearest",
-            file=sys.stderr,
-        )
 
 
 def make_env(
@@ -175,8 +159,8 @@ def planner_of(
     if options.pop("model_free", False):
         with user_input("planner"):
             return _with_pushes(config, construct(options, action_dimension=action_dimension))
-    if model is None:
-        raise UserError(f"{planner_name(config)} needs a model: give one, or choose planner=random")
+    if not isinstance(model, torch.nn.Module):
+        raise UserError(f"{planner_name(config)} needs a model: give cavin_pyro.load(NAME).model, or planner=random")
     pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
     _check_planner(options, model.to(device))
     if options.get("feature_weight", 0.0) is None:  # features count as much as positions, by the likelihood's scales
@@ -237,8 +221,10 @@ def _additions(options: dict[str, Any], *, one_push: bool) -> list[Addition]:
 
     `planner.add` adds more, of which one replaces another of its class, and `planner.drop` leaves some out.
     """
-    listed, more, dropped = (list(options.pop(name, None) or []) for name in ("additions", "add", "drop"))
-    unknown = [str(name) for name in (*listed, *more, *dropped) if isinstance(name, str) and name not in ADDITIONS]
+    given = (options.pop(name, None) or [] for name in ("additions", "add", "drop"))
+    listed, more, dropped = ([names] if isinstance(names, str) else list(names) for names in given)
+    names = [name for name in (*listed, *more) if not isinstance(name, Mapping | Addition)] + dropped
+    unknown = [name for name in map(str, names) if name not in ADDITIONS]
     if unknown:
         raise UserError(f"unknown addition '{unknown[0]}': choose from {', '.join(ADDITIONS)}, or give a _target_")
     made: dict[type, Addition] = {}

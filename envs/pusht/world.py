@@ -133,6 +133,8 @@ class PushT(World):
             raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
         if ahead % REPEAT or not 0 <= ahead <= EPISODE * REPEAT:
             raise ValueError(f"ahead must be a multiple of {REPEAT} up to {EPISODE * REPEAT}, not {ahead}")
+        if not (0 <= weight < math.inf and 0 < margin <= 1):
+            raise ValueError(f"weight must not be negative, and margin above 0 and at most 1, not {weight}, {margin}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         try:

@@ -94,6 +94,9 @@ def test_a_world_without_a_slip_passes() -> None:
         ({"reset": lambda world, **_: (math.nan, {})}, r"centers must be finite float32 numbers, not .*nan"),
         ({"step": lambda world, _: (math.inf, 0.0, False, False, {})}, "centers must be finite float32 numbers"),
         ({"step": lambda world, _: (0.0, 0.0, False, False, {})}, "info of a step must have success, and has nothing"),
+        ({"step": lambda world, _: (0.0, 0.0, False, False, {"success": math.nan})}, "success as bool, not .* and nan"),
+        ({"maximum_steps": 0}, "maximum_steps must be a number of at least 1, not 0"),
+        ({"state": lambda world, place: State(torch.zeros(1, 1), torch.eye(3)[:1], ~REAL)}, "its mask has none"),
         (
             {"state": lambda world, place: State(torch.zeros(1, 1).double(), torch.zeros(1, 3), REAL)},
             r"centers must be finite float32 numbers, not torch\.float64",
@@ -153,6 +156,8 @@ def test_the_tabletop_is_the_world_where_none_is_chosen() -> None:
         ([TARGET, "env.width=3"], "Line.* got an unexpected keyword argument 'width'"),
         (["env._target_=fractions.Fraction"], "^env Fraction is no world: derive it from"),
         (["env._target_=nowhere.World"], "nowhere"),
+        (["env._target_="], "^unknown env ''"),
+        (["env=pusht", "env.margin=-1"], "margin above 0 and at most 1, not 1.0, -1"),
     ],
 )
 def test_what_no_world_takes_is_refused_in_one_line(options: list[str], said: str) -> None:

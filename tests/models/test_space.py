@@ -91,6 +91,8 @@ def test_projection_scales_the_first_numbers_and_leaves_the_free_ones() -> None:
         ({"length": 0.0}, "must be positive"),
         ({"feature_scale": math.nan}, "must be positive"),
         ({"frequencies": -1}, "must not be negative"),
+        ({"frequencies": 1.5}, "must be whole"),
+        ({"origin": (math.nan, 0.0)}, "its origin finite"),
         ({"turning": True, "action_sizes": (3,)}, "actions in parts of 2"),
     ],
 )

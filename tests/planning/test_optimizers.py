@@ -114,6 +114,7 @@ def test_an_optimizer_works_at_both_levels(toy: SimpleNamespace, name: str) -> N
     ("name", "options", "message"),
     [
         ("cem", {"iterations": 0}, "iterations must be at least 1, not 0"),
+        ("cem", {"iterations": 1.5}, "iterations must be a whole number, not 1.5"),
         ("cem", {"elite_fraction": 0}, "elite_fraction must be above 0 and at most 1, not 0"),
         ("icem", {"kept_elite_fraction": 2}, "kept_elite_fraction must be between 0 and 1, not 2"),
         ("cem", {"radius": 0.0}, "radius must be a positive number or null, not 0.0"),

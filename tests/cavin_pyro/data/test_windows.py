@@ -227,6 +227,8 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
         ({"mask": np.ones((6, 3))}, r"^mask has shape \[6, 3\], and must have \[6, 3, 3\]$"),
         ({"features": np.full((6, 3, 3, 64), np.nan)}, "^features has numbers that are not finite"),
         ({"episodes": [1] * 6}, "^windows of 1 episodes"),
+        ({"actions": np.full((6, 2, 4), 5.0)}, "^actions has numbers as large as 5, out of the box"),
+        ({"mask": np.zeros((6, 3, 3))}, "^mask has a state without an object"),
     ],
 )
 def test_arrays_that_are_no_windows_are_refused_in_one_line(wrong: dict[str, Any], said: str) -> None:
