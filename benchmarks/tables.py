@@ -240,7 +240,7 @@ def pusht() -> str:
     rows = read("pusht")
     tasks, lines = list(groups(rows, "task")), []
     for (name,), found in groups(rows, "row").items():
-        line: list[object] = [name, f"{statistics.median(ms for row in found for ms in row['planning_ms']):.0f}"]
+        line: list[object] = [name]
         for task in tasks:
             cell = groups(found, "task").get(task, [])
             by_training = sorted(groups(cell, "checkpoint").items())
@@ -251,7 +251,7 @@ def pusht() -> str:
             test = "" if name == rows[0]["row"] or not cell else f"; {alone}, {first} (p = {p:.2g})"
             line += [len(cell) or "", f"{rate(cell)}; {', '.join(shares)}{test}" if cell else ""]
         lines.append(line)
-    return markdown(["", "ms per plan", *(text for (task,) in tasks for text in ("pairs", task))], lines)
+    return markdown(["", *(text for (task,) in tasks for text in ("pairs", task))], lines)
 
 
 def as_stored(name: str) -> str:
