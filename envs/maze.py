@@ -19,6 +19,7 @@ from cavin_pyro.models.state import State
 
 REPEAT = 10  # steps of the simulator, 0.01 s each, in one step of the environment
 REACHED = 0.45  # metres from the goal, as published
+PIXELS = 50  # of a metre in pictures
 
 Cell = tuple[int, int]
 Ways = dict[tuple[Cell, Cell], list[Cell]]
@@ -71,14 +72,14 @@ class Maze(World):
         numbers = maximum_steps >= 1 and 2 <= cells <= 20 and 0 < margin <= 1
         if not numbers or render_mode not in (None, "rgb_array"):
             wanted = "maximum_steps of 1 or more, cells from 2 to 20, margin up to 1, render_mode rgb_array"
-            raise ValueError(f"give {wanted}, not {maximum_steps}, {cells}, {margin} and {render_mode!r}")
+            raise ValueError(f"give {wanted}, not {maximum_steps=}, {cells=}, {margin=}, {render_mode=}")
         try:
             from gymnasium_robotics.envs.maze import maps, point_maze
         except ImportError as error:
             line = f"the maze needs gymnasium-robotics ({error}): pip install -c constraints.txt -e '.[maze]'"
             raise ImportError(line) from error
         maze = maps.LARGE_MAZE
-        self._simulator = point_maze.PointMazeEnv(maze_map=maze, continuing_task=False, render_mode="rgb_array")
+        self._simulator = point_maze.PointMazeEnv(maze_map=maze, continuing_task=False)
         self.ways = shortest_ways(np.array(maze) == 0)
         self._pairs = [pair for pair, way in self.ways.items() if len(way) >= cells]
         self._radius, self.maximum_steps, self.render_mode = margin * REACHED, maximum_steps, render_mode
@@ -120,9 +121,22 @@ class Maze(World):
         """See `World`."""
         return Wanderer(generator, self.ways, self._simulator.maze)
 
+    def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
+        """See `World`."""
+        maze = self._simulator.maze
+        return PIXELS * (np.asarray(centers) * (1, -1) + (maze.x_map_center, maze.y_map_center))
+
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a colour image in mode rgb_array."""
-        return None if self.render_mode is None else np.array(self._simulator.render())
+        """Draw walls, goal and ball in mode rgb_array; the simulator's own pictures need OpenGL."""
+        if self.render_mode is None:
+            return None
+        walls = np.kron(np.array(self._simulator.maze.maze_map), np.ones((PIXELS, PIXELS)))
+        picture = np.where(walls == 1, 90, 245)[..., None].repeat(3, -1).astype(np.uint8)
+        places = np.indices(walls.shape)[::-1].transpose(1, 2, 0)
+        ball = self._simulator.point_env.data.qpos[:2]
+        for place, radius, colour in ((self.place, REACHED, (120, 200, 120)), (ball, 0.15, (200, 60, 60))):
+            picture[np.linalg.norm(places - self.pixels(place), axis=-1) < radius * PIXELS] = colour
+        return picture
 
     def close(self) -> None:
         """Free the simulator."""

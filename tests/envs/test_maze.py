@@ -26,6 +26,10 @@ def test_it_is_an_environment_and_a_world(env: Maze) -> None:
     check_env(env, skip_render_check=True)
     check_world(env)
     assert env.render() is None
+    env.render_mode = "rgb_array"
+    (column, row), picture = env.pixels(env.reset(seed=1)[0][:2]).astype(int), env.render()
+    assert picture[row, column].tolist() == [200, 60, 60] and picture[0, 0].tolist() == [90, 90, 90]  # ball and wall
+    env.render_mode = None
 
 
 def test_the_seed_and_the_policy_determine_an_episode_which_wanders_through_the_maze(env: Maze) -> None:
