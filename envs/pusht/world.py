@@ -140,9 +140,8 @@ class PushT(World):
         try:
             from gym_pusht.envs import pusht
         except ImportError as error:
-            raise ImportError(
-                f"Push-T needs gym-pusht ({error}): pip install -c constraints.txt -e '.[pusht]'"
-            ) from error
+            line = f"Push-T needs gym-pusht ({error}): pip install -c constraints.txt -e '.[pusht]'"
+            raise ImportError(line) from error
         self.criterion, self.maximum_steps, self.render_mode = criterion, maximum_steps, render_mode
         self.ahead, self._weight, self._margin = ahead // REPEAT, weight, margin
         self._module, self._simulator = pusht, pusht.PushTEnv(obs_type="state")

@@ -8,11 +8,10 @@ from __future__ import annotations
 import inspect
 
 from cavin_pyro.planning.checks import OptimizerError
-from cavin_pyro.planning.optimizers.base import Optimizer, samples_of_iteration
+from cavin_pyro.planning.optimizers.base import Optimizer, Shooting, samples_of_iteration
 from cavin_pyro.planning.optimizers.cem import CEM, ICEM
 from cavin_pyro.planning.optimizers.evolution import Evolution
 from cavin_pyro.planning.optimizers.mppi import MPPI
-from cavin_pyro.planning.optimizers.shooting import Shooting
 from cavin_pyro.planning.optimizers.smc import SMC
 
 __all__ = [

@@ -1,7 +1,8 @@
-"""The interface of optimizers, one method, and what several of them share."""
+"""The interface of optimizers, one method; random shooting, the simplest; and what several of the others share."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -22,6 +23,24 @@ class Optimizer(Protocol):
         only randomness to use. The planner chooses the best of all candidates that were evaluated, so this method
         returns nothing.
         """
+
+
+@dataclass(frozen=True)
+class Shooting:
+    """Random shooting, the paper's optimizer (section 3.2; Algorithm 1, lines 5 to 10): all samples from the prior.
+
+    replacement: "episodes which fail early will be replaced by duplicating episodes that are still active" (section
+    3.2); false leaves failed candidates as they are.
+    """
+
+    replacement: bool = True
+
+    def optimize(self, problem: SearchProblem, samples: int) -> None:
+        if not problem.reparameterized:
+            problem.sample(samples, replacement=self.replacement)
+            return
+        noise = problem.noise(samples)
+        problem.evaluate(noise, replacement=self.replacement, early_stopping=problem.early_stopping)
 
 
 class Population(NamedTuple):

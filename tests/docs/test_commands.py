@@ -19,7 +19,7 @@ import pytest
 from tests.cavin_pyro.conftest import Case, run_in_turn, run_script
 from tests.docs.pages import FENCE, PAGES, ROOT, Line, commands, name
 
-EPISODES = "maximum_steps=2 planner.samples=8"
+EPISODES = "maximum_steps=2 planner.samples=16"
 SMALL = {  # options that make each command a matter of a second
     "collect": "transitions=60 seed=4 steps=6 episodes_per_shard=4 workers=1",
     "pretrain": "steps=2 batch_size=4 clouds=40",
@@ -74,7 +74,7 @@ def small(line: Line) -> Case:
     given = {option.partition("=")[0] for option in line.options}
     more = [option for option in more if not (option.startswith("seed=") and "seed" in given)]
     if "planner=random" in line.options:
-        more.remove("planner.samples=8")
+        more.remove("planner.samples=16")
     if re.search(OTHER_WORLD, " ".join(line.tokens)):
         more = [option for option in more if not option.startswith(("maximum_steps=", "windows.minimum_move="))]
     more += ["device=cpu"] if "device=cuda" in line.options else []
