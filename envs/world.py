@@ -177,18 +177,6 @@ class Goal(ABC):
         return State(values[..., :size], values[..., size:], mask)
 
 
-def executed(action: NDArray[np.floating], decimals: int | None = ACTION_DECIMALS) -> NDArray[np.float32]:
-    """The action that is made: clipped to [-1, 1], and rounded.
-
-    Without rounding, an error of 1e-7 in a plan, of another processor or of compiled code, makes another episode.
-
-    Args:
-        action: [..., A]. decimals: of the result [..., A]; None does not round.
-    """
-    clipped = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
-    return (clipped if decimals is None else np.round(clipped, decimals)).astype(np.float32)
-
-
 def check_world(world: World) -> None:
     """Begin an episode, make a step, and check what the world says of them.
 

@@ -29,7 +29,7 @@ from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.envs.tabletop.workspace import SPACE
-from cavin_pyro.envs.world import World, executed
+from cavin_pyro.envs.world import World
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -174,7 +174,7 @@ def _rollout_in_world(context: CheckContext, world: World, number: int, motion: 
     plan = plan_segment(context.model, world.state(observation).expand_plans(1), motion, seed, samples)
     ended = False
     for action in plan.actions:
-        observation, _, ended, *_ = world.step(executed(action, None))
+        observation, _, ended, *_ = world.step(np.clip(action, -1.0, 1.0))
         if ended:
             break
     reached, real = world.positions(observation)[0], mask[:, None]

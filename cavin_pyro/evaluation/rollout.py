@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.envs.randomness import planner_seed
-from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World, executed
+from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
 from cavin_pyro.planning.records import apply
+from cavin_pyro.planning.rollout import project
 
 OUTCOMES = ("success", "violation", "fall", "timeout")
 
@@ -158,8 +159,8 @@ def rollout(
         seed: of the scene; the planner's randomness is derived from it and independent of the scene's.
         pushes_per_plan: pushes to execute before the next plan; None executes all T (paper, Algorithm 1, line 11). A
             planner with the addition `first_push` is for 1.
-        push_decimals: to which planned actions are rounded (`cavin_pyro.envs.world.executed`), so that an episode does
-            not depend on how a machine rounds; None executes them as planned.
+        push_decimals: to which planned actions are rounded (`cavin_pyro.planning.rollout.project`), so that an episode
+            does not depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
         callbacks: called in this order; without any, no frame is computed.
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
@@ -202,11 +203,10 @@ def rollout(
         episode.plan_records.append(record)
         for callback in callbacks:
             callback.on_plan(record)
-        actions = plan.actions[0].numpy()
+        actions = project(plan.actions[0], push_decimals).numpy()
         if not 1 <= (len(actions) if pushes_per_plan is None else pushes_per_plan) <= len(actions):
             raise UserError(f"pushes_per_plan must be between 1 and {len(actions)}, not {pushes_per_plan}")
         for number, action in enumerate(actions[:pushes_per_plan]):
-            action = executed(action, push_decimals)
             observation, earned, terminated, truncated, info = env.step(action)
             last = number == len(actions) - 1
             centers, _ = env.positions(observation)

@@ -14,12 +14,12 @@ import torch
 import cavin_pyro
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
-from cavin_pyro.envs.world import executed
 from cavin_pyro.evaluation.evaluation import episode_row, run_missing
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import OUTCOMES, Episode, EpisodeCallback, PlanRecord, Transition
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import CavinPlanner, Plan, RandomPlanner
+from cavin_pyro.planning.rollout import project
 from cavin_pyro.storage.checkpoint import save
 
 rollout = partial(cavin_pyro.rollout, pushes_per_plan=None)  # executes all T pushes of a plan
@@ -118,8 +118,8 @@ def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) 
     assert [transition.step for transition in episode.transitions] == list(range(1, len(episode.transitions) + 1))
     for transition in episode.transitions:
         record = episode.plan_records[(transition.step - 1) // 3]
-        planned = record.plan.actions[0, (transition.step - 1) % 3].numpy()
-        np.testing.assert_array_equal(transition.action, executed(planned))
+        planned = record.plan.actions[0, (transition.step - 1) % 3]
+        np.testing.assert_array_equal(transition.action, project(planned, 3))
     assert episode.outcome in OUTCOMES
     assert episode.total_reward == sum(transition.reward for transition in episode.transitions)
 
@@ -145,7 +145,7 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
     assert len(episode.transitions) == 4
     for record, end in zip(episode.plan_records, [*steps[1:], 4], strict=True):
         made = episode.transitions[record.step : end]
-        planned = executed(record.plan.actions[0, : len(made)].numpy())
+        planned = project(record.plan.actions[0, : len(made)], 3)
         np.testing.assert_array_equal([transition.action for transition in made], planned)
         np.testing.assert_array_equal(episode.reached(record), [transition.centers for transition in made])
 
