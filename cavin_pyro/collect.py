@@ -17,15 +17,13 @@ def main(config: DictConfig) -> None:
     """
     from cavin_pyro.config.errors import UserError
     from cavin_pyro.data.collection import collect, repair
-    from cavin_pyro.launching.launcher import chosen_launcher
     from cavin_pyro.storage.files import output_folder
 
     collection = _collection(config)
     with output_folder(config.output) as folder:
-        launcher = chosen_launcher(config)
         if config.repair:
-            print(f"{repair(collection, folder, workers=launcher)} files collected again")
-        metadata = collect(collection, folder, transitions=config.transitions, workers=launcher)
+            print(f"{repair(collection, folder, workers=config.workers)} files collected again")
+        metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
         if lost := metadata["episodes"] - _summarized(folder, metadata):
             raise UserError(
                 f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "

@@ -52,8 +52,6 @@ class LaunchOptions:
     """Where episodes are run; results do not depend on it, apart from times."""
 
     workers: int = option(2, "processes; results do not depend on it, apart from times", minimum=1, maximum=1024)
-    launcher: str = option("local", "processes here, or a Ray cluster (extra .[ray])", choices=("local", "ray"))
-    address: str | None = option(None, "running Ray cluster, host:6379; by default one on this machine is started")
 
 
 @dataclass

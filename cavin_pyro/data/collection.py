@@ -27,7 +27,7 @@ from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy, Intent
 from cavin_pyro.envs.tabletop.scene import PushReport, Scene
 from cavin_pyro.envs.tabletop.workspace import POINTS_PER_OBJECT, object_slots
-from cavin_pyro.launching.launcher import Launcher, as_launcher
+from cavin_pyro.launching.workers import run_jobs
 from cavin_pyro.storage.progress import progress_bar
 
 CLUTTER_SIDES = (0.40, 0.90)  # metres; objects start within a rectangle whose sides are sampled from this range
@@ -94,7 +94,7 @@ def collect(
     folder: Path,
     *,
     transitions: int = CollectConfig.transitions,
-    workers: int | Launcher = CollectConfig.workers,
+    workers: int = CollectConfig.workers,
 ) -> dict[str, Any]:
     """Collect whole shards until at least `transitions` pushes are on disk; resume an earlier run.
 
@@ -102,7 +102,7 @@ def collect(
     once its file is in place. A killed run therefore resumes after the last shard that counts.
 
     Args:
-        workers: processes of this machine, or a launcher.
+        workers: processes.
 
     Returns:
         The dataset's metadata.
@@ -219,13 +219,9 @@ def _collect_shard(job: tuple[Collection, int]) -> Arrays:
     return config.shard(number)
 
 
-def _shards(config: Collection, numbers: Iterable[int], *, workers: int | Launcher) -> Generator[Arrays, None, None]:
+def _shards(config: Collection, numbers: Iterable[int], *, workers: int) -> Generator[Arrays, None, None]:
     """The shards with these numbers, in their order."""
-    launcher = as_launcher(workers)
-    if launcher.here:
-        yield from (_collect_shard((config, number)) for number in numbers)
-        return
-    with closing(launcher.run(_collect_shard, ((config, number) for number in numbers), ordered=True)) as made:
+    with closing(run_jobs(_collect_shard, ((config, number) for number in numbers), workers, ordered=True)) as made:
         yield from (shard for _, shard in made)
 
 
@@ -253,7 +249,7 @@ def _begin(config: Collection, folder: Path) -> dict[str, Any]:
     return metadata
 
 
-def repair(config: Collection, folder: Path, *, workers: int | Launcher = 1) -> int:
+def repair(config: Collection, folder: Path, *, workers: int = 1) -> int:
     """Collect again the shards that are missing or corrupt; returns how many there were.
 
     Args:

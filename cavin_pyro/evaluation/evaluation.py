@@ -24,7 +24,7 @@ from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner, planner_na
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.statistics import plan_summary, summarize, table
-from cavin_pyro.launching.launcher import Launcher, as_launcher, chosen_launcher, of_shard
+from cavin_pyro.launching.workers import of_shard, run_jobs
 from cavin_pyro.storage.files import atomic_write, output_folder, write_json
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.storage.provenance import provenance
@@ -32,10 +32,7 @@ from cavin_pyro.storage.run_directory import check_same_run, write_config
 
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
-NOT_COMPARED = (  # options that may differ between runs of one evaluation
-    *("output", "episodes", "compare", "shard"),
-    *("workers", "launcher", "address"),
-)
+NOT_COMPARED = ("output", "episodes", "compare", "shard", "workers")  # may differ between runs of one evaluation
 
 
 def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]:
@@ -62,7 +59,6 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
         runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
         runner.env.close()
         seeds_of(config)
-        chosen_launcher(config)
         others = earlier_rows(Path(config.compare), config) if config.compare else []
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
@@ -89,9 +85,8 @@ def run_missing(config: DictConfig, folder: Path) -> list[Row]:
     """
     rows, seeds = begin(folder), seeds_of(config)
     missing = missing_seeds(seeds, rows)
-    launcher = chosen_launcher(config)
     with (
-        closing(run_jobs([(config, seed) for seed in missing], launcher)) as finished,
+        closing(run_episodes([(config, seed) for seed in missing], config.workers)) as finished,
         progress_bar("evaluating", total=len(seeds), initial=len(seeds) - len(missing), unit="episode") as bar,
     ):
         successes = sum(row["outcome"] == "success" for row in rows.values())
@@ -160,24 +155,17 @@ def episode_row(episode: Episode) -> Row:
 _runner: tuple[DictConfig, EpisodeRunner] | None = None  # one per process
 
 
-def run_jobs(jobs: Sequence[Job], workers: int | Launcher) -> Generator[tuple[int, Row], None, None]:
+def run_episodes(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Row], None, None]:
     """Run episodes, one per job; yields a job's number and its row, in any order.
 
     A process keeps environment and planner until a job has another configuration, so jobs that share one should follow
-    one another. Close the iterator when leaving it early. `workers`: processes of this machine, or a launcher. A worker
-    that was killed or stopped is a `WorkerError`.
+    one another. Close the iterator when leaving it early. A worker that was killed is a `WorkerError`.
     """
-    if not jobs:
-        return
-    launcher = as_launcher(workers)
-    if launcher.here:
-        try:
-            yield from ((number, _episode(job)) for number, job in enumerate(jobs))
-        finally:
-            _close()
-        return
-    with closing(launcher.run(_episode, jobs)) as rows:
-        yield from rows
+    try:
+        with closing(run_jobs(_episode, jobs, workers)) as rows:
+            yield from rows
+    finally:
+        _close()
 
 
 def _episode(job: Job) -> Row:

@@ -61,8 +61,6 @@ def check_options(config: DictConfig, device: torch.device) -> None:
     """Check the options that need neither a checkpoint nor the simulator; `device`: as the option `device` chose it."""
     part_of("robot", config.env.robot, config.env.assets)
     check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
-    if device.type != "cpu" and config.get("launcher") == "ray":
-        raise UserError(f"launcher=ray runs on processors, not on {device.type}: choose launcher=local or device=cpu")
     unread = [name for name, usual in asdict(GeneratedLayouts()).items() if config.generated[name] != usual]
     if unread and config.layout != GENERATED:
         raise UserError(f"generated.{unread[0]} is an option of layout=generated: give that, or leave it out")

@@ -17,8 +17,8 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import set_matmul_precision
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_jobs, seeds_of
-from cavin_pyro.launching.launcher import Launcher, of_shard
+from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_episodes, seeds_of
+from cavin_pyro.launching.workers import of_shard, run_jobs
 from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Cell, cells
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.sizes import SIZES, Size
@@ -130,9 +130,8 @@ def checkpoint_of(cell: Cell, home: Path, models: str | None) -> Path:
 def run_stages(stages: Sequence[Stage], workers: int) -> None:
     """Run what is unfinished in their order, `workers` at a time; a UserError: one has failed."""
     unfinished = [stage for stage in stages if not (stage.folder / RESULTS[stage.command]).exists()]
-    launcher, here = Launcher(workers=workers), ((number, run_stage(one)) for number, one in enumerate(unfinished))
     with (
-        closing(here if launcher.here else launcher.run(run_stage, unfinished)) as finished,
+        closing(run_jobs(run_stage, unfinished, workers)) as finished,
         progress_bar(stages[-1].command, total=len(unfinished), unit="run") as bar,
     ):
         for _ in finished:
@@ -194,7 +193,7 @@ def _evaluate(evaluations: Sequence[tuple[Cell, DictConfig]], workers: int) -> p
     queue = [(place, evaluations[place][1], seed) for _, place, seed in sorted(missing)]
     total = sum(cell.episodes for cell, _ in evaluations)
     with (
-        closing(run_jobs([(config, seed) for _, config, seed in queue], workers)) as finished,
+        closing(run_episodes([(config, seed) for _, config, seed in queue], workers)) as finished,
         progress_bar("evaluating", total=total, initial=total - len(queue), unit="episode") as bar,
     ):
         for number, row in finished:

@@ -35,7 +35,6 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "checkpoint=@nothing", "no checkpoint at"),
     ("plan", "checkpoint=@truncated", "truncated is truncated or no safetensors file"),
     ("plan", "checkpoint=@untrusted", "asks to run numpy.save, which is not part of this program"),
-    ("evaluate", "address=host:6379", "address=host:6379 is of launcher=ray"),
     ("train", "scales.center=1e308", "scales.center must be between 1e-12 and 1e12, not 1e+308"),
     ("train", "dynamics.maximum_displacement=nan", "dynamics.maximum_displacement must be finite, not nan"),
     ("train", "objective.elbo._target_=builtins.dict", "objective.elbo._target_=builtins.dict: AttributeError"),

@@ -7,7 +7,7 @@ import signal
 import time
 from contextlib import closing
 
-from cavin_pyro.launching.launcher import Launcher
+from cavin_pyro.launching.workers import run_jobs
 
 
 def act(job: tuple[str, float]) -> int:
@@ -15,9 +15,9 @@ def act(job: tuple[str, float]) -> int:
     what, seconds = job
     if what == "fail":
         raise ZeroDivisionError("a bug")
+    time.sleep(seconds)
     if what == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(seconds)
     return os.getpid()
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
     jobs = [("sleep", 0.5)] * 2 + [("sleep", 60.0)] * 2
     try:
-        with closing(Launcher(workers=2).run(act, jobs)) as results:
+        with closing(run_jobs(act, jobs, 2)) as results:
             for _, pid in results:
                 print(pid, flush=True)
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Jobs in worker processes, on a Ray cluster of two nodes where Ray is installed, and in jobs of submitit."""
+"""Jobs in worker processes, and in jobs of submitit."""
 
 from __future__ import annotations
 
@@ -19,41 +19,19 @@ import pytest
 
 from cavin_pyro.config.errors import UserError, WorkerError
 from cavin_pyro.data.collection import collect
-from cavin_pyro.launching.launcher import Launcher, of_shard
+from cavin_pyro.launching.workers import of_shard, run_jobs
 from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT, contents
 from tests.cavin_pyro.launching.work import act
 
 
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """The address of two nodes of one processor each."""
-    pytest.importorskip("ray", reason="Ray is not installed: it comes with the extra ray")
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_agent_register_timeout_ms": "120000"}  # of a busy machine
-    from ray.cluster_utils import Cluster
-
-    node = {"num_cpus": 1, "object_store_memory": 80_000_000}
-    two = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-    two.add_node(**node)
-    yield two.address
-    two.shutdown()
-
-
-@pytest.fixture(
-    params=["local", pytest.param("ray", marks=pytest.mark.filterwarnings("ignore"))]  # Ray leaves files open
-)
-def launcher(request: pytest.FixtureRequest) -> Launcher:
-    name = request.param
-    return Launcher(name, 2, request.getfixturevalue("cluster") if name == "ray" else None)
-
-
-def test_every_job_is_done_once_in_other_processes(launcher: Launcher) -> None:
-    found = dict(launcher.run(act, [("sleep", 0.1)] * 5))
+def test_every_job_is_done_once_in_other_processes() -> None:
+    found = dict(run_jobs(act, [("sleep", 0.1)] * 5, 2))
     assert sorted(found) == [0, 1, 2, 3, 4]
     assert os.getpid() not in found.values()
     assert not multiprocessing.active_children()
 
 
-def test_ordered_results_come_in_order_and_few_jobs_are_taken_ahead(launcher: Launcher) -> None:
+def test_ordered_results_come_in_order_and_few_jobs_are_taken_ahead() -> None:
     given = []
 
     def jobs() -> Iterator[tuple[str, float]]:
@@ -61,23 +39,21 @@ def test_ordered_results_come_in_order_and_few_jobs_are_taken_ahead(launcher: La
             given.append(number)
             yield "sleep", 0.3 if number == 0 else 0.0
 
-    handler = signal.getsignal(signal.SIGTERM)
-    with closing(launcher.run(act, jobs(), ordered=True)) as results:
+    with closing(run_jobs(act, jobs(), 2, ordered=True)) as results:
         assert [next(results)[0] for _ in range(8)] == list(range(8))
-        assert signal.getsignal(signal.SIGTERM) is handler
     assert len(given) <= 8 + 4
     assert not multiprocessing.active_children()
 
 
-def test_a_bug_in_a_job_is_raised_as_it_is(launcher: Launcher) -> None:
+def test_a_bug_in_a_job_is_raised_as_it_is() -> None:
     with pytest.raises(ZeroDivisionError, match="^a bug$") as caught:
-        list(launcher.run(act, [("fail", 0.0)]))
+        list(run_jobs(act, [("fail", 0.0)], 2))
     assert 'raise ZeroDivisionError("a bug")' in str(caught.value.__cause__)
     assert not multiprocessing.active_children()
 
 
-def test_collected_bytes_do_not_depend_on_where(launcher: Launcher, pushes: Path, small: Any, tmp_path: Path) -> None:
-    collect(small.pushes, tmp_path, transitions=60, workers=launcher)
+def test_collected_bytes_do_not_depend_on_where(pushes: Path, small: Any, tmp_path: Path) -> None:
+    collect(small.pushes, tmp_path, transitions=60, workers=2)
     ours, theirs = contents(tmp_path), contents(pushes)
     names = {"metadata.json", *(f"episodes-{number:05d}.h5" for number in range(3))}
     assert {name: ours[name] for name in names} == {name: theirs[name] for name in names}
@@ -86,9 +62,9 @@ def test_collected_bytes_do_not_depend_on_where(launcher: Launcher, pushes: Path
 def test_a_killed_worker_is_one_line_after_what_was_finished() -> None:
     kept = []
     with pytest.raises(WorkerError, match="^a worker process was killed, perhaps .* to resume$"):
-        for number, _ in Launcher(workers=1).run(act, [("sleep", 0.0), ("killed", 0.0), ("sleep", 0.0)]):
+        for number, _ in run_jobs(act, [("sleep", 0.0), ("killed", 1.0), ("sleep", 0.0), ("sleep", 60.0)], 2):
             kept.append(number)
-    assert kept == [0]
+    assert kept == [0, 2]
     assert not multiprocessing.active_children()
 
 
@@ -113,23 +89,6 @@ def _running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] != "Z"  # nobody waits for an orphan
     except FileNotFoundError:
         return False
-
-
-def test_a_job_whose_process_is_killed_is_run_again_by_ray(cluster: str, tmp_path: Path) -> None:
-    assert dict(Launcher("ray", address=cluster).run(_killed_once, [str(tmp_path / "begun")])) == {0: "done"}
-
-
-def _killed_once(mark: str) -> str:
-    if not Path(mark).exists():
-        Path(mark).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return "done"
-
-
-def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"launcher=ray needs Ray .*pip install -c constraints.txt -e '\.\[ray\]'"):
-        list(Launcher("ray").run(act, [("sleep", 0.0)]))
 
 
 def test_jobs_of_a_submitit_sweep_make_the_bytes_of_runs_alone(shell: SimpleNamespace, tmp_path: Path) -> None:
