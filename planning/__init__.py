@@ -9,6 +9,7 @@ from cavin_pyro.planning.baselines import (
     CavinWithoutEffectsPlanner,
     CvaeMpcPlanner,
     MpcPlanner,
+    PolicyPlanner,
     RandomPlanner,
     SectarPlanner,
 )
@@ -24,6 +25,7 @@ __all__ = [
     "Plan",
     "Planner",
     "PlanningModel",
+    "PolicyPlanner",
     "RandomPlanner",
     "Reward",
     "RewardFunction",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -20,8 +20,10 @@ from cavin_pyro.planning.protocol import (
     Plan,
     PlanningModel,
     Query,
+    Reward,
     RewardFunction,
     SegmentRollout,
+    as_reward,
 )
 from cavin_pyro.planning.returns import best_of
 from cavin_pyro.planning.rollout import actions_of, predict_states, project
@@ -256,20 +258,62 @@ class RandomPlanner:
         Raises ValueError unless there are scenes, with a generator for each.
         """
         check_scenes(state, generators)
-        environments, objects = state.mask.shape
         size = self.segment_length, self.action_dimension
-        empty = state.centers.new_empty
-        actions = 2 * uniform_each(size, generators, state.centers.device) - 1
-        return Plan(
-            actions=actions,
-            planned_actions=actions,
-            effect_codes=empty(environments, 0, 0),
-            motion_codes=empty(environments, 0, 0),
-            subgoals=state.map(lambda field: field[:, None][:, :0]),
-            segments=torch.zeros(environments, dtype=torch.int64, device=actions.device),
-            predicted_centers=empty(environments, 0, objects, state.centers.shape[-1]),
-            expected_return=state.centers.new_full((environments,), torch.nan),
-            expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
-            candidate_centers=empty(environments, 0, 0, objects, state.centers.shape[-1]),
-            candidate_returns=empty(environments, 0),
-        )
+        return without_prediction(state, 2 * uniform_each(size, generators, state.centers.device) - 1)
+
+
+class Policy(Protocol):
+    """What acts without predicting, such as a script that belongs to a world."""
+
+    def __call__(self, state: State, reward: Reward, observed: Any, /) -> Tensor:
+        """The next action `[1, A]` of one scene, `state: []`; `observed`: what else the world shows of it."""
+
+
+class PolicyPlanner:
+    """The actions of a policy, one a plan, for one scene at a time: a floor for planners.
+
+    `action_dimension`: A.
+    """
+
+    segment_length = 1
+
+    def __init__(self, policy: Policy, *, action_dimension: int) -> None:
+        self.policy, self.action_dimension = policy, action_dimension
+
+    @torch.inference_mode()
+    def plan(
+        self,
+        state: State,
+        *,
+        reward: RewardFunction,
+        generators: Sequence[torch.Generator],
+        observed: Any = None,
+        steps_left: int | None = None,
+    ) -> Plan:
+        """Ask the policy for the scene `state: [1]`; ValueError: several scenes, or another action than `[1, A]`."""
+        check_scenes(state, generators)
+        if len(generators) > 1:
+            raise ValueError(f"a policy acts in one scene at a time, not in {len(generators)}")
+        actions = self.policy(state.map(lambda field: field[0]), as_reward(reward), observed)
+        if actions.shape != (1, self.action_dimension):
+            raise ValueError(f"a policy must give an action [1, {self.action_dimension}], not {list(actions.shape)}")
+        return without_prediction(state, actions[None])
+
+
+def without_prediction(state: State, actions: Tensor) -> Plan:
+    """A plan `[B]` that has nothing but its actions `[B, T, A]`."""
+    environments, objects, positions = state.centers.shape
+    empty = state.centers.new_empty
+    return Plan(
+        actions=actions,
+        planned_actions=actions,
+        effect_codes=empty(environments, 0, 0),
+        motion_codes=empty(environments, 0, 0),
+        subgoals=state.map(lambda field: field[:, None][:, :0]),
+        segments=torch.zeros(environments, dtype=torch.int64, device=actions.device),
+        predicted_centers=empty(environments, 0, objects, positions),
+        expected_return=state.centers.new_full((environments,), torch.nan),
+        expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
+        candidate_centers=empty(environments, 0, 0, objects, positions),
+        candidate_returns=empty(environments, 0),
+    )

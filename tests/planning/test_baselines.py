@@ -19,7 +19,9 @@ from cavin_pyro.planning import (
     CvaeMpcPlanner,
     MpcPlanner,
     Plan,
+    PolicyPlanner,
     RandomPlanner,
+    Reward,
     SectarPlanner,
 )
 from cavin_pyro.planning.additions import PerturbedRollouts
@@ -259,3 +261,18 @@ def test_pushes_depend_on_the_environments_own_generator_only(toy: SimpleNamespa
     alone = planner.plan(toy.scenes([[(0.7, 0.7)]]), generators=toy.generators(4))
     assert torch.equal(together.actions[1], alone.actions[0])
     assert not torch.equal(together.actions[0], together.actions[1])
+
+
+def test_a_policy_acts_in_one_scene_with_an_action_of_the_world(toy: SimpleNamespace) -> None:
+    def push(state: State, reward: Reward, observed: Any) -> torch.Tensor:
+        return torch.cat((state.centers[0, :2], torch.ones(2)))[None]
+
+    state, reward = toy.scenes([[(0.25, 0.5)]]), toy.GoalDisc((0.2, 0.0))
+    plan = PolicyPlanner(push, action_dimension=4).plan(state, reward=reward, generators=toy.generators(0))
+    assert plan.actions.tolist() == [[[0.25, 0.5, 1.0, 1.0]]] and plan.share_reaching_goal is None
+    with pytest.raises(ValueError, match=r"must give an action \[1, 3\], not \[1, 4\]"):
+        PolicyPlanner(push, action_dimension=3).plan(state, reward=reward, generators=toy.generators(0))
+    with pytest.raises(ValueError, match="one scene at a time, not in 2"):
+        PolicyPlanner(push, action_dimension=4).plan(
+            toy.scenes([[(0.0, 0.0)]] * 2), reward=reward, generators=toy.generators(0, 1)
+        )
