@@ -20,6 +20,7 @@ class Size:
             seeds; each of them gets scenes of its own, which are the same for all methods.
         first_scene: seed of the first scene; no other run uses these scenes. The training seed at place i has those
             from first_scene + 1000 i on.
+        prior: of methods with codes; N(0, I), `standard`, is the paper's.
         collection, pretraining, training, planning: overrides of `collect`, `pretrain`, `train` and `evaluate`.
     """
 
@@ -31,6 +32,7 @@ class Size:
     tasks: tuple[str, ...] = TASKS
     object_counts: tuple[int, ...] = OBJECT_COUNTS
     rewards: tuple[str, ...] = REWARDS
+    prior: str = "conditional"
     collection: tuple[str, ...] = ()
     pretraining: tuple[str, ...] = ()
     training: tuple[str, ...] = ()
@@ -53,7 +55,6 @@ QUICK_TRAINING = (
     "trainer.matmul_precision=bfloat16",
     "trainer.patience=100",
     "windows.negative_fraction=0.5",
-    "prior=conditional",
 )
 
 SIZES: dict[str, Size] = {
@@ -63,6 +64,7 @@ SIZES: dict[str, Size] = {
         episodes=1,
         bottom_episodes=1,
         first_scene=50_000,
+        prior="standard",
         collection=("episodes_per_shard=5",),
         pretraining=("clouds=100", "steps=2", "batch_size=8"),
         training=TINY_TRAINING,
@@ -85,12 +87,12 @@ SIZES: dict[str, Size] = {
         first_scene=90_000,
         training=(*QUICK_TRAINING, "trainer.steps=36000"),
     ),
-    "paper": Size(
+    "paper": Size(  # its data, prior, learning rate and steps
         transitions=500_000,
-        training_seeds=(0, 1, 2),
+        training_seeds=(0, 1, 2, 3, 4),
         episodes=1_000,
         bottom_episodes=300,
         first_scene=100_000,
-        training=("prior=conditional",),
+        prior="standard",
     ),
 }

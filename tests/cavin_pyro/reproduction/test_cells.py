@@ -65,6 +65,20 @@ def test_every_command_line_of_a_stage_is_accepted(method: str) -> None:
         assert composed.env.segmentation == "clusters" and composed.criterion == "published"
 
 
+def test_codes_of_the_papers_size_have_its_prior_and_dimensions_and_a_choice_replaces_it() -> None:
+    for scale, given, prior, dimension in (
+        ("paper", (), "Standard", 32),
+        ("paper", ("prior=conditional",), "Conditional", 16),
+        ("medium", (), "Conditional", 16),
+        ("medium", ("prior=standard",), "Standard", 32),
+    ):
+        size = chosen_size(compose("reproduce", f"scale={scale}", *given, "output=-"))
+        config = compose("train", *training(size, Path("home"), "cvae_mpc", 0).options, "output=-")
+        assert config.prior._target_.endswith(f"{prior}Prior") and config.model.motion_dimension == dimension
+        contact = compose("train", *training(size, Path("home"), "contact", 0).options, "output=-")
+        assert contact.prior._target_.endswith("ObjectMixturePrior")
+
+
 def test_the_papers_planners_have_no_additions_and_ours_have_some() -> None:
     for method in METHODS.values():
         assert tuple(method.planners) == PLANNERS
