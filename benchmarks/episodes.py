@@ -119,12 +119,17 @@ ADDITIONS = [
     for name, options in LEFT_OUT.items()
     for task, objects in (("clearing", 5), ("insertion", 3), ("crossing", 5))
 ]
-TRAININGS = 3  # runs/pusht-0 and so on, by the commands of docs/how-to/push-t.md
-PUSHT = {"75 ahead": ("env=pusht",), "25 ahead": ("env=pusht", "env.ahead=25", "env.maximum_steps=10")}
-DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6"}
+TRAININGS = 3  # runs/pusht-0 and so on, by docs/how-to/push-t.md; runs/pusht-normal-0 and so on with prior=standard
+PUSHT = {
+    "75 ahead": ("env=pusht",),
+    "25 ahead": ("env=pusht", "env.ahead=25", "env.maximum_steps=10"),
+    "coverage": ("env=pusht", "env.criterion=coverage", "env.maximum_steps=60"),
+}
+BOTH = ("75 ahead", "25 ahead")
+DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6", "coverage": "planner.horizon=15"}
 SEARCH = ("planner.samples=4096", "planner.reward_at=subgoals", "planner.shrinking_horizon=true")
 ICEM = ("planner.optimizer=icem", "planner.optimizer.iterations=10", "planner.optimizer.elite_fraction=0.03")
-CASCADE = (*SEARCH, *ICEM, "planner.optimizer.radius=1", "checkpoint=runs/pusht-{}/checkpoint.safetensors")
+CASCADE = (*SEARCH, *ICEM, "checkpoint=runs/pusht-{}/checkpoint.safetensors")
 FLAT = ("planner=mpc", "planner.additions=[]", "pushes_per_plan=null", *CASCADE)
 
 
@@ -133,14 +138,15 @@ def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> lis
 
 
 PUSHT_ROWS = [
-    *pusht("cascade", *CASCADE, tasks=list(PUSHT)),
-    *pusht("flat: actions", *FLAT, tasks=list(PUSHT)),
-    *(Row("random actions", task, None, (*options, "planner=random")) for task, options in PUSHT.items()),
+    *pusht("cascade", *CASCADE, tasks=BOTH),
+    *pusht("cascade, N(0, I)", *CASCADE, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors", tasks=BOTH),
+    *pusht("flat: actions", *FLAT, tasks=BOTH),
+    *(Row("random actions", task, None, (*PUSHT[task], "planner=random")) for task in BOTH),
     *pusht("cascade, 2,048 samples", *CASCADE, "planner.samples=2048"),
     *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
     *pusht("flat: actions, 16,384 samples", *FLAT, "planner.samples=16384"),
-    *pusht("cascade, codes anywhere", *CASCADE, "planner.optimizer.radius=null"),
     *pusht("cascade, whole horizon", *CASCADE, "planner.shrinking_horizon=false"),
+    *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
     *pusht("cascade, shooting", *SEARCH, "planner.optimizer=shooting", CASCADE[-1]),
 ]
 TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "pusht": PUSHT_ROWS}

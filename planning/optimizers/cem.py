@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cavin_pyro.planning import records
-from cavin_pyro.planning.checks import check_fraction, check_optional, check_positive, check_weight
+from cavin_pyro.planning.checks import check_fraction, check_positive, check_weight
 from cavin_pyro.planning.optimizers.base import Population, best, samples_of_iteration
 from cavin_pyro.planning.rollout import SearchProblem
 
@@ -23,22 +23,19 @@ class CEM:
 
     iterations: number of iterations, which share the samples equally. elite_fraction: fraction of an iteration's
     candidates for the next fit. momentum: weight of the last mean and scale in the next. Failed candidates become
-    copies of active ones, as in shooting. radius: in units of √D, beyond which the noise of a segment is shortened, so
-    that a code stays where the prior has its mass, and the model its data; None does not.
+    copies of active ones, as in shooting.
 
-    Raises ValueError for counts below 1, fractions outside of their range, and a radius that is not positive.
+    Raises ValueError for counts below 1 and fractions outside of their range.
     """
 
     iterations: int = 4
     elite_fraction: float = 0.1
     momentum: float = 0.1
-    radius: float | None = None
 
     def __post_init__(self) -> None:
         check_positive("iterations", self.iterations)
         check_fraction("elite_fraction", self.elite_fraction, positive=True)
         check_fraction("momentum", self.momentum)
-        check_optional("radius", self.radius)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""
@@ -50,9 +47,6 @@ class CEM:
                 noise = mean + scale * noise
                 if number == self.iterations - 1:
                     noise[:, -1:] = mean
-            if self.radius is not None:
-                longest = self.radius * noise.shape[-1] ** 0.5
-                noise = noise * (longest / noise.norm(dim=-1, keepdim=True)).clamp(max=1.0)
             candidates = problem.evaluate(noise, replacement=True)
             wanted = max(1, round(self.elite_fraction * count))
             population = self.competing(Population(candidates.noise, candidates.returns), elites, wanted)

@@ -87,16 +87,6 @@ def test_returns_that_are_not_finite_do_no_harm(toy: SimpleNamespace, name: str)
     assert ((-found.returns.max(-1).values / 2).sqrt() < TOLERANCE[name]).all()
 
 
-@pytest.mark.parametrize("name", ["cem", "icem"])
-def test_codes_stay_within_a_radius(toy: SimpleNamespace, name: str) -> None:
-    free, held = (
-        search(replace(make_optimizer(name, samples=SAMPLES), radius=radius), problem_of(toy, 0), SAMPLES).noise
-        for radius in (None, 0.5)
-    )
-    longest = 0.5 * free.shape[-1] ** 0.5
-    assert free.norm(dim=-1).max() > longest >= held.norm(dim=-1).max() - 1e-5
-
-
 @each_optimizer
 def test_an_optimizer_works_at_both_levels(toy: SimpleNamespace, name: str) -> None:
     # A goal too far to reach, straight ahead: the best is 0.15 m in each of four segments; motions follow.
@@ -117,7 +107,6 @@ def test_an_optimizer_works_at_both_levels(toy: SimpleNamespace, name: str) -> N
         ("cem", {"iterations": 1.5}, "iterations must be a whole number, not 1.5"),
         ("cem", {"elite_fraction": 0}, "elite_fraction must be above 0 and at most 1, not 0"),
         ("icem", {"kept_elite_fraction": 2}, "kept_elite_fraction must be between 0 and 1, not 2"),
-        ("cem", {"radius": 0.0}, "radius must be a positive number or null, not 0.0"),
         ("icem", {"exponent": -1}, "exponent must be zero or a positive number, not -1"),
         ("mppi", {"temperature": 0}, "temperature must be a positive number or null, not 0"),
         ("evolution", {"initial_fraction": 0}, "initial_fraction must be above 0 and at most 1, not 0"),
