@@ -119,7 +119,7 @@ ADDITIONS = [
     for name, options in LEFT_OUT.items()
     for task, objects in (("clearing", 5), ("insertion", 3), ("crossing", 5))
 ]
-TRAININGS = 3  # runs/pusht-0 and so on, by docs/how-to/push-t.md; runs/pusht-normal-0 and so on with prior=standard
+TRAININGS = 3  # runs/pusht-0 and so on, by docs/how-to/push-t.md, pusht-normal-0 with prior=standard; runs/maze-0
 PUSHT = {
     "75 ahead": ("env=pusht",),
     "25 ahead": ("env=pusht", "env.ahead=25", "env.maximum_steps=10"),
@@ -130,18 +130,23 @@ DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6", "cov
 SEARCH = ("planner.samples=4096", "planner.reward_at=subgoals", "planner.shrinking_horizon=true")
 ICEM = ("planner.optimizer=icem", "planner.optimizer.iterations=10", "planner.optimizer.elite_fraction=0.03")
 CASCADE = (*SEARCH, *ICEM, "checkpoint=runs/pusht-{}/checkpoint.safetensors")
-FLAT = ("planner=mpc", "planner.additions=[]", "pushes_per_plan=null", *CASCADE)
+ACTIONS = ("planner=mpc", "planner.additions=[]")
+FLAT = (*ACTIONS, "pushes_per_plan=null", *CASCADE)
 
 
 def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> list[Row]:
     return [Row(name, task, None, (*PUSHT[task], *options, DEPTH[task])) for task in tasks]
 
 
-PUSHT_ROWS = [
+MAZE = ("env=maze", "planner.horizon=60", "checkpoint=runs/maze-{}/checkpoint.safetensors")
+WORLDS = [
     *pusht("cascade", *CASCADE, tasks=BOTH),
     *pusht("cascade, N(0, I)", *CASCADE, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors", tasks=BOTH),
     *pusht("flat: actions", *FLAT, tasks=BOTH),
     *(Row("random actions", task, None, (*PUSHT[task], "planner=random")) for task in BOTH),
+    Row("cascade", "maze", None, (*MAZE, "planner.motion_horizon=first_segment", "planner.samples=4096")),
+    Row("flat: actions", "maze", None, (*MAZE, *ACTIONS, "planner.samples=2048", "planner.optimizer=cem")),
+    Row("random actions", "maze", None, ("env=maze", "planner=random")),
     *pusht("cascade, 2,048 samples", *CASCADE, "planner.samples=2048"),
     *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
     *pusht("flat: actions, 16,384 samples", *FLAT, "planner.samples=16384"),
@@ -149,7 +154,7 @@ PUSHT_ROWS = [
     *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
     *pusht("cascade, shooting", *SEARCH, "planner.optimizer=shooting", CASCADE[-1]),
 ]
-TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "pusht": PUSHT_ROWS}
+TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "worlds": WORLDS}
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 

@@ -235,9 +235,9 @@ def _errors(values: Sequence[float]) -> str:
     return f"{statistics.mean(values):.2f} / {statistics.median(values):.2f}" if values else ""
 
 
-def pusht() -> str:
-    """Success in Push-T, that of each training, and against the first row in the same pairs of start and goal."""
-    rows = read("pusht")
+def worlds() -> str:
+    """Success in other worlds, that of each training, and against the first row in the same pairs of start and goal."""
+    rows = read("worlds")
     tasks, lines = list(groups(rows, "task")), []
     for (name,), found in groups(rows, "row").items():
         line: list[object] = [name]
@@ -247,8 +247,9 @@ def pusht() -> str:
             shares = [
                 f"{100 * statistics.mean(row['outcome'] == 'success' for row in some):.0f}" for _, some in by_training
             ]
-            alone, first, p = paired(cell, groups(rows, "row", "task")[rows[0]["row"], *task])
-            test = "" if name == rows[0]["row"] or not cell else f"; {alone}, {first} (p = {p:.2g})"
+            first = groups(rows, "row", "task").get((rows[0]["row"], *task), [])
+            alone, others, p = paired(cell, first)
+            test = f"; {alone}, {others} (p = {p:.2g})" if cell and first and name != rows[0]["row"] else ""
             line += [len(cell) or "", f"{rate(cell)}; {', '.join(shares)}{test}" if cell else ""]
         lines.append(line)
     return markdown(["", *(text for (task,) in tasks for text in ("pairs", task))], lines)
@@ -270,7 +271,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "variants": variants,
     "factors": factors,
     "accuracy": accuracy,
-    "pusht": pusht,
+    "worlds": worlds,
     "speed": lambda: as_stored("speed"),
     "criticism": lambda: as_stored("criticism"),
 }
