@@ -280,7 +280,7 @@ class ReproduceConfig(DeviceOptions):
         "methods; contact is CAVIN with networks that see contact",
         choices=f"{REPRODUCE}.methods.METHODS",
     )
-    prior: str | None = option(None, "prior of codes; by default the scale's", choices=("standard", "conditional"))
+    priors: str | None = option(None, "priors of codes; by default the scale's", choices=("standard", "conditional"))
     planners: list[str] = option(["paper", "ours"], "kinds of planners", choices=f"{REPRODUCE}.cells.PLANNERS")
     tasks: list[str] = option(PAPER_TASKS, "tasks", choices=f"{REPRODUCE}.sizes.TASKS")
     objects: list[int] = option(

@@ -69,7 +69,7 @@ def chosen_size(config: DictConfig) -> Size:
         UserError: more episodes than there are scenes.
     """
     size = SIZES[config.scale]
-    names = ("episodes", "bottom_episodes", "first_scene", "prior")
+    names = ("episodes", "bottom_episodes", "first_scene", "priors")
     given = {name: config[name] for name in names if config[name] is not None}
     most = SCENES_PER_TRAINING * len(size.training_seeds)
     for name in ("episodes", "bottom_episodes"):
@@ -118,7 +118,7 @@ def training(size: Size, home: Path, name: str, seed: int, *, device: str = "cpu
     """A method with a training seed, on the data and features of all."""
     method, pointnet = METHODS[name], home / "pretrain" / "pointnet.safetensors"
     inputs = (f"data={home / 'data'}", *([f"pointnet={pointnet}"] if method.reads_point_clouds else []))
-    chosen = (f"prior={size.prior}", *method.training, *(() if size.prior == "standard" else method.tuned))
+    chosen = (f"prior={size.priors}", *method.training, *(() if size.priors == "standard" else method.tuned))
     options = (*inputs, *size.training, *chosen, f"seed={seed}", f"device={device}")
     return Stage("train", options, home / "train" / f"{name}-{seed}")
 

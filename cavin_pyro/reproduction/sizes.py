@@ -20,7 +20,7 @@ class Size:
             seeds; each of them gets scenes of its own, which are the same for all methods.
         first_scene: seed of the first scene; no other run uses these scenes. The training seed at place i has those
             from first_scene + 1000 i on.
-        prior: of methods with codes; N(0, I), `standard`, is the paper's.
+        priors: of methods with codes; N(0, I), `standard`, is the paper's.
         collection, pretraining, training, planning: overrides of `collect`, `pretrain`, `train` and `evaluate`.
     """
 
@@ -32,7 +32,7 @@ class Size:
     tasks: tuple[str, ...] = TASKS
     object_counts: tuple[int, ...] = OBJECT_COUNTS
     rewards: tuple[str, ...] = REWARDS
-    prior: str = "conditional"
+    priors: str = "conditional"
     collection: tuple[str, ...] = ()
     pretraining: tuple[str, ...] = ()
     training: tuple[str, ...] = ()
@@ -64,7 +64,7 @@ SIZES: dict[str, Size] = {
         episodes=1,
         bottom_episodes=1,
         first_scene=50_000,
-        prior="standard",
+        priors="standard",
         collection=("episodes_per_shard=5",),
         pretraining=("clouds=100", "steps=2", "batch_size=8"),
         training=TINY_TRAINING,
@@ -93,6 +93,6 @@ SIZES: dict[str, Size] = {
         episodes=1_000,
         bottom_episodes=300,
         first_scene=100_000,
-        prior="standard",
+        priors="standard",
     ),
 }

@@ -68,9 +68,9 @@ def test_every_command_line_of_a_stage_is_accepted(method: str) -> None:
 def test_codes_of_the_papers_size_have_its_prior_and_dimensions_and_a_choice_replaces_it() -> None:
     for scale, given, prior, dimension in (
         ("paper", (), "Standard", 32),
-        ("paper", ("prior=conditional",), "Conditional", 16),
+        ("paper", ("priors=conditional",), "Conditional", 16),
         ("medium", (), "Conditional", 16),
-        ("medium", ("prior=standard",), "Standard", 32),
+        ("medium", ("priors=standard",), "Standard", 32),
     ):
         size = chosen_size(compose("reproduce", f"scale={scale}", *given, "output=-"))
         config = compose("train", *training(size, Path("home"), "cvae_mpc", 0).options, "output=-")
@@ -113,7 +113,7 @@ def test_shards_share_the_trainings_without_overlap() -> None:
         config = compose("reproduce", "scale=paper", f"shard={shard}", "output=-")
         parts.append([*chosen_trainings(size, config)])
         assert {(cell.method, cell.training_seed) for cell in chosen_cells(size, config)} == set(parts[-1])
-    assert len(parts[0]) == 4 * 3 and sorted(parts[0]) == sorted(pair for part in parts[1:] for pair in part)
+    assert len(parts[0]) == 4 * 5 and sorted(parts[0]) == sorted(pair for part in parts[1:] for pair in part)
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,10 @@ RADIUS = 0.03
 def scene(*places: tuple[float, float]) -> tuple[State, ObservedPoints]:
     """Discs at these places, and a slot of padding."""
     centers = torch.tensor([[x, y, 0.02] for x, y in places] + [[0.0, 0.0, 0.0]])
-    angles = torch.linspace(0, 2 * torch.pi, POINTS_PER_OBJECT)
-    rim = RADIUS * torch.stack((angles.cos(), angles.sin()), -1)
-    points = (centers[:-1, None, :2] + rim).reshape(1, -1, 2)
+    angles = torch.linspace(0, 16 * torch.pi, POINTS_PER_OBJECT)  # a spiral to the rim and once around
+    radii = RADIUS * torch.linspace(0, 8 / 7, POINTS_PER_OBJECT)[:, None].clamp(max=1)
+    disc = radii * torch.stack((angles.cos(), angles.sin()), -1)
+    points = (centers[:-1, None, :2] + disc).reshape(1, -1, 2)
     state = State(centers, torch.zeros(len(centers), 1), torch.arange(len(centers)) < len(places))
     return state, ObservedPoints(points, torch.tensor([REACH_LOW]), torch.tensor([REACH_HIGH]))
 
