@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cavin_pyro.envs.world import Goal, World
+from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
@@ -69,10 +70,10 @@ class Maze(World):
     def __init__(
         self, *, cells: int = 10, maximum_steps: int = 80, margin: float = 0.8, render_mode: str | None = None
     ) -> None:
-        numbers = maximum_steps >= 1 and 2 <= cells <= 20 and 0 < margin <= 1
-        if not numbers or render_mode not in (None, "rgb_array"):
-            wanted = "maximum_steps of 1 or more, cells from 2 to 20, margin up to 1, render_mode rgb_array"
-            raise ValueError(f"give {wanted}, not {maximum_steps=}, {cells=}, {margin=}, {render_mode=}")
+        check_number("maximum_steps", maximum_steps, 1, whole=True)
+        check_number("cells", cells, 2, 20, whole=True)
+        check_number("margin", margin, high=1, positive=True)
+        check_choice("render_mode", render_mode, (None, "rgb_array"))
         try:
             from gymnasium_robotics.envs.maze import maps, point_maze
         except ImportError as error:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
@@ -132,8 +133,7 @@ class Goal(ABC):
     about = "all"
 
     def __init__(self, space: Space, *, weight: float = 0.0) -> None:
-        if not 0 <= weight < math.inf:
-            raise ValueError(f"weight must be zero or a positive number, not {weight}")
+        check_number("weight", weight)
         self.space, self.weight = space, weight
 
     @abstractmethod
@@ -198,8 +198,7 @@ def check_world(world: World) -> None:
     if {type(ended), type(info["success"])} - {bool, np.bool_} or not math.isfinite(earned):
         said = f"{earned}, {ended} and {info['success']}"
         raise ValueError(f"{name}: a step must give a finite reward, terminated and success as bool, not {said}")
-    if not 1 <= world.maximum_steps < math.inf:
-        raise ValueError(f"{name}: maximum_steps must be a number of at least 1, not {world.maximum_steps}")
+    check_number(f"{name}: maximum_steps", world.maximum_steps, 1)
     plans = 5
     one = state.map(lambda field: field.expand(plans, *field.shape))
     goal = world.goal()
@@ -210,13 +209,11 @@ def check_world(world: World) -> None:
         raise ValueError(f"{name}: its goal does not fit states [{plans}]: {str(error).splitlines()[0]}") from error
     for field in ("success", "failure", "reward"):  # the reward is made of the others
         value = getattr(outcome, field)
-        if (
-            not isinstance(value, Tensor)
-            or value.shape != (plans,)
-            or (value.dtype == torch.bool) == (field == "reward")
-        ):
-            shape = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
-            raise ValueError(f"{name}: for states [{plans}] its goal must give {field} [{plans}], not {shape}")
+        wanted, given = f"{'numbers' if field == 'reward' else 'bool'} [{plans}]", type(value).__name__
+        if isinstance(value, Tensor):
+            given = f"{'bool' if value.dtype == torch.bool else 'numbers'} {[*value.shape]}"
+        if given != wanted:
+            raise ValueError(f"{name}: for states [{plans}] its goal must give {field} as {wanted}, not {given}")
 
 
 def _check_state(world: World, state: State) -> None:

@@ -12,6 +12,7 @@ from pyro import distributions
 from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.part import Part
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -135,8 +136,7 @@ def _filled(space: Space, center: Any, feature: Any, action: Any) -> dict[str, A
     if len(parts) != len(space.action_sizes):
         raise ValueError(f"scales.action needs {len(space.action_sizes)} numbers, not {len(parts)}")
     for name, value in (("center", center), ("feature", feature), *[("action", part) for part in parts]):
-        if not 1e-12 < value < 1e12:  # beyond, its square or a density overflows
-            raise ValueError(f"scales.{name} must be between 1e-12 and 1e12, not {value:g}")
+        check_number(f"scales.{name}", value, 1e-12, 1e12)  # beyond, its square or a density overflows
     return {"center": center, "feature": feature, "action": parts}
 
 
@@ -216,8 +216,7 @@ class IsotropicStudentT(Isotropic):
         """Raises `ValueError` for degrees of freedom of 2 or less, which have no variance, or a ratio of 0 or less."""
         if not df > 2:
             raise ValueError(f"df must be more than 2, not {df:g}")
-        if ratio is not None and not 0 < ratio < math.inf:
-            raise ValueError(f"ratio must be positive, not {ratio:g}")
+        check_number("ratio", 1 if ratio is None else ratio, positive=True)
         self.df, self.ratio = df, ratio
         super().__init__(loc, scale, validate_args=validate_args)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pyro
@@ -10,6 +9,7 @@ from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.networks.dynamics import ActionGenerator, MetaDynamics
 from cavin_pyro.models.priors.prior import Prior
@@ -52,8 +52,7 @@ class SingleLatentModel(Model):
         Raises:
             ValueError: an `action_weight` that is not a positive number.
         """
-        if not 0 < action_weight < math.inf:
-            raise ValueError(f"action_weight must be a positive number, not {action_weight}")
+        check_number("action_weight", action_weight, positive=True)
         super().__init__(**shared)
         self.effect_dimension = effect_dimension
         self.action_weight = action_weight

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.state import State
 
 
@@ -60,22 +61,26 @@ class Space:
     def __post_init__(self) -> None:
         for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name, usual in (("subgoal_range", 3.0 * self.step_range), ("center_scale", self.length / 50)):
-            object.__setattr__(self, name, getattr(self, name) or usual)
         parts = (self.action_names, self.action_limits, self.action_scales)
         if not self.action_sizes or any(len(one) != len(self.action_sizes) for one in (*parts, {*self.action_names})):
             raise ValueError(
                 f"a space has different names, limits and scales for each of its {len(self.action_sizes)} action parts"
             )
-        positive = (self.length, self.step_range, self.subgoal_range, *self.action_limits, *self.action_sizes)
-        scales = (self.center_scale, self.feature_scale, *self.action_scales)
-        if not self.origin or not all(0 < number < math.inf for number in (*positive, *scales)):
-            raise ValueError("lengths, ranges, limits, scales and sizes of a space must be positive numbers")
-        counts = (*self.action_sizes, self.frequencies, self.unit_features or 0)
-        if any(type(count) is not int for count in counts) or not all(map(math.isfinite, self.origin)):
-            raise ValueError("sizes, frequencies and unit_features of a space must be whole, its origin finite numbers")
-        if self.frequencies < 0 or (self.unit_features or 0) < 0:
-            raise ValueError("frequencies and unit_features of a space must not be negative")
+        for name in ("length", "step_range", "feature_scale", "action_limits", "action_scales"):
+            given = getattr(self, name)
+            for value in given if isinstance(given, tuple) else [given]:
+                check_number(f"{name} of a space", value, positive=True)
+        for name, usual in (("subgoal_range", 3.0 * self.step_range), ("center_scale", self.length / 50)):
+            check_number(f"{name} of a space", getattr(self, name))
+            object.__setattr__(self, name, getattr(self, name) or usual)
+        for value in self.origin:
+            check_number("origin of a space", value, -1e30, 1e30)  # torch counts in float32
+        for value in self.action_sizes:
+            check_number("action_sizes of a space", value, 1, whole=True)
+        check_number("unit_features of a space", self.unit_features or 0, whole=True)
+        check_number("frequencies of a space", self.frequencies, 0, 24, whole=True)  # float32 tells no shorter waves
+        if not self.origin or not isinstance(self.turning, bool):
+            raise ValueError("a space has an origin [P] of at least a number, and turning is True or False")
         if self.turning and (self.positions < 2 or any(size != 2 for size in self.action_sizes)):
             raise ValueError("a turning space has positions of at least 2 numbers, and actions in parts of 2")
 

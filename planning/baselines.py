@@ -8,10 +8,11 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.cavin import EffectSpace
-from cavin_pyro.planning.checks import NoFiniteCandidateError, check_positive, check_scenes
+from cavin_pyro.planning.checks import NoFiniteCandidateError, check_scenes
 from cavin_pyro.planning.protocol import (
     ActionModel,
     EffectActionModel,
@@ -239,8 +240,8 @@ class RandomPlanner:
     """
 
     def __init__(self, segment_length: int = 3, *, action_dimension: int) -> None:
-        check_positive("segment_length", segment_length)
-        check_positive("action_dimension", action_dimension)
+        check_number("segment_length", segment_length, 1, whole=True)
+        check_number("action_dimension", action_dimension, 1, whole=True)
         self.segment_length, self.action_dimension = segment_length, action_dimension
 
     @torch.inference_mode()
@@ -257,7 +258,7 @@ class RandomPlanner:
 
         Raises ValueError unless there are scenes, with a generator for each.
         """
-        check_scenes(state, generators)
+        check_scenes(state, generators, steps_left)
         size = self.segment_length, self.action_dimension
         return without_prediction(state, 2 * uniform_each(size, generators, state.centers.device) - 1)
 
@@ -291,7 +292,7 @@ class PolicyPlanner:
         steps_left: int | None = None,
     ) -> Plan:
         """Ask the policy for the scene `state: [1]`; ValueError: several scenes, or another action than `[1, A]`."""
-        check_scenes(state, generators)
+        check_scenes(state, generators, steps_left)
         if len(generators) > 1:
             raise ValueError(f"a policy acts in one scene at a time, not in {len(generators)}")
         actions = self.policy(state.map(lambda field: field[0]), as_reward(reward), observed)

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 from torch import Generator, Tensor
 
+from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import HOOKS, Choice, ChosenEffect
-from cavin_pyro.planning.checks import check_choice, check_fraction, check_weight
 from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, Query, SegmentRollout
@@ -51,8 +51,8 @@ class CavinPlanner(SearchingPlanner):
         self.model: PlanningModel = model
         check_choice("motion_horizon", motion_horizon, ("full_horizon", "first_segment"))
         self.feature_weight = feature_weight or 0.0
-        check_weight("feature_weight", self.feature_weight)
-        check_fraction("motion_share", motion_share, positive=True)
+        check_number("feature_weight", self.feature_weight)
+        check_number("motion_share", motion_share, high=1, positive=True)
         self.motion_samples = max(1, int(motion_share * samples))
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from numbers import Integral
 
 import torch
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.state import State
 
 
@@ -27,17 +26,9 @@ class OptimizerError(ValueError):
     """An optimizer breaks the interface `cavin_pyro.planning.optimizers.Optimizer`; the message names its class."""
 
 
-def check_positive(name: str, value: int) -> None:
-    """Raise ValueError unless a count is a whole number of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise ValueError(f"{name} must be a whole number, not {value}")
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1, not {value}")
-
-
 def check_horizon(horizon: int, segment_length: int) -> None:
     """Raise ValueError, naming the nearest valid ones, unless H is a positive multiple of T (section 3.2)."""
-    check_positive("horizon", horizon)
+    check_number("horizon", horizon, 1, whole=True)
     if horizon % segment_length:
         below = horizon - horizon % segment_length
         nearest = [str(valid) for valid in (below, below + segment_length) if valid > 0]
@@ -45,18 +36,6 @@ def check_horizon(horizon: int, segment_length: int) -> None:
             f"horizon={horizon} is not divisible by the model's segment length T={segment_length}: "
             f"choose {' or '.join(nearest)}"
         )
-
-
-def check_weight(name: str, value: float) -> None:
-    """Raise ValueError unless a weight is finite and not negative."""
-    if not (math.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} must be zero or a positive number, not {value}")
-
-
-def check_optional(name: str, value: float | None) -> None:
-    """Raise ValueError unless it is None or a positive number."""
-    if value is not None and not 0 < value < math.inf:
-        raise ValueError(f"{name} must be a positive number or null, not {value}")
 
 
 def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:
@@ -67,21 +46,10 @@ def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:
     return limits[0], limits[1]
 
 
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raise ValueError unless a value is one of the choices, which it names."""
-    if value not in choices:
-        raise ValueError(f"unknown {name} '{value}': choose {', '.join(choices[:-1])} or {choices[-1]}")
-
-
-def check_fraction(name: str, value: float, *, positive: bool = False) -> None:
-    """Raise ValueError unless a number lies between 0 and 1; `positive` excludes 0."""
-    if not (0 <= value <= 1) or (positive and value == 0):
-        raise ValueError(f"{name} must be {'above 0 and at most 1' if positive else 'between 0 and 1'}, not {value}")
-
-
-def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
-    """Raise ValueError unless `state` is a batch `[B]` each with an object and a generator of its own."""
+def check_scenes(state: State, generators: Sequence[torch.Generator], steps_left: int | None = None) -> None:
+    """Raise ValueError unless `state` is a batch `[B]`, each finite and with an object and a generator of its own."""
     centers = state.centers
+    check_number("steps_left", 1 if steps_left is None else steps_left, 1)
     if centers.ndim != 3 or state.mask.shape != centers.shape[:-1] or not len(centers):
         raise ValueError(
             "a planner takes states of at least one scene, with centers [B, M, P] and mask [B, M], "
@@ -98,6 +66,10 @@ def check_scenes(state: State, generators: Sequence[torch.Generator]) -> None:
     if kinds[:2] != (torch.float32, torch.float32) or kinds[2] != torch.bool:
         found = ", ".join(str(kind).removeprefix("torch.") for kind in kinds)
         raise ValueError(f"a planner takes centers and features of float32 and a mask of bool, not {found}")
+    for name in ("centers", "features"):
+        wrong = ~getattr(state, name).isfinite().all(-1) & state.mask
+        if wrong.any():
+            raise NoFiniteCandidateError(int(wrong.any(-1).nonzero()[0]), f"the {name} of its state are not finite")
     if len(generators) != len(centers):
         raise ValueError(f"one generator per environment: {len(centers)} needed, {len(generators)} given")
     if len({id(generator) for generator in generators}) != len(generators):

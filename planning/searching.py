@@ -11,6 +11,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions import Addition, make_additions
@@ -18,10 +19,8 @@ from cavin_pyro.planning.backends import make_backend
 from cavin_pyro.planning.checks import (
     NoFiniteCandidateError,
     OptimizerError,
-    check_choice,
     check_horizon,
     check_limits,
-    check_positive,
     check_scenes,
 )
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
@@ -91,7 +90,7 @@ class SearchingPlanner(ABC):
         compile: bool | str = False,
     ) -> None:
         """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names."""
-        check_positive("samples", samples)
+        check_number("samples", samples, 1, whole=True)
         check_horizon(horizon, model.segment_length)
         check_choice("reward_at", reward_at, REWARD_AT)
         self.stride_limits = None if stride_limits is None else check_limits("stride_limits", stride_limits)
@@ -132,7 +131,7 @@ class SearchingPlanner(ABC):
             ValueError: a state that is not a batch of at least one scene, another number of generators than B, or an
                 environment without a finite candidate, which is named.
         """
-        check_scenes(state, generators)
+        check_scenes(state, generators, steps_left)
         size, plans, reward = ENVIRONMENTS_ON_PROCESSOR, [], as_reward(reward)
         if state.centers.device.type != "cpu":
             size = max(1, PLANS_ON_ACCELERATOR // self.samples)

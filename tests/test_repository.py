@@ -189,7 +189,7 @@ def test_planning_starts_without_pyro_pybullet_and_the_other_packages() -> None:
     assert set(names) <= loaded
     assert not loaded & {"pyro", "pybullet"}
     others = {name for name in loaded - set(names) if name.startswith("cavin_pyro.")}
-    assert others <= {"cavin_pyro.models", "cavin_pyro.models.state"}
+    assert others <= {"cavin_pyro.models", "cavin_pyro.models.checks", "cavin_pyro.models.state"}
 
 
 def make(folder: Path, *arguments: str) -> str:

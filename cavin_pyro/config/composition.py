@@ -37,6 +37,7 @@ OUTPUT = {  # the folder of a run for which the user names none
 SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video"}
 SAME_RUN |= {"episodes", "compare"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
+VALUE = re.compile(r"""'(\\.|[^'\\])*'|"(\\.|[^"\\])*"|[^\s,:'"(){}\[\]=]([^,:'"(){}\[\]]*[^\s,:'"(){}\[\]])?""")
 OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")
 
 
@@ -145,7 +146,7 @@ def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
 def of_sweep(overrides: Sequence[str]) -> tuple[set[str], list[str]]:
     """The options that vary in a sweep, and what Hydra is told about the folder of its runs."""
     parsed = [_parsed(word) for word in overrides]
-    folder = [f"hydra.sweep.dir={one.value()}" for one in parsed if one.key_or_group == "output"]
+    folder = [_quoted(f"hydra.sweep.dir={one.value()}") for one in parsed if one.key_or_group == "output"]
     return {one.get_key_element() for one in parsed if one.is_sweep_override()}, folder
 
 
@@ -169,8 +170,18 @@ def rewritten(overrides: Sequence[str], *, plans: bool = False) -> list[str]:
             word = f"++{word.lstrip('+')}"
         elif "." in key and (PRESETS / group).is_dir() and re.fullmatch(r"(?!null$)[A-Za-z_][\w.,]*", value):
             word = f"{group}={value}"
-        words.append(word)
+        words.append(_quoted(word))
     return words
+
+
+def _quoted(word: str) -> str:
+    """An override whose values with letters outside of ASCII, which Hydra's grammar lacks, are in quotes."""
+    key, sign, value = word.partition("=")
+    for one in reversed([*VALUE.finditer(value)]):
+        if not one[0].isascii() and one[0][0] not in "'\"":
+            quoted = QuotedString(one[0], Quote.single).with_quotes()
+            value = value[: one.start()] + quoted + value[one.end() :]
+    return key + sign + value
 
 
 def _of_other_world(overrides: Sequence[str], *, plans: bool) -> list[str]:
@@ -181,9 +192,7 @@ def _of_other_world(overrides: Sequence[str], *, plans: bool) -> list[str]:
         return [word for word in overrides if word != chosen]
     own = "_target_" in chosen
     if choice in ("", "null") or (not own and choice not in presets("world")):
-        raise UserError(
-            f"unknown env {choice!r}: choose from {', '.join(presets('world'))}, or give env._target_=CLASS"
-        )
+        raise UserError(f"unknown env {choice!r}: choose from {', '.join(presets('world'))}, or env._target_=CLASS")
     words = [] if own else [f"world={choice}"]
     for word in overrides:
         key, _, value = word.lstrip("+").partition("=")

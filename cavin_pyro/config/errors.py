@@ -27,21 +27,24 @@ class WorkerError(UserError):
 
 
 @contextmanager
-def user_input(*sections: str) -> Iterator[None]:
+def user_input(*sections: str, where: str = "") -> Iterator[None]:
     """Turn whatever is raised while the user's choices are read, or parts built from them, into a `UserError`.
 
-    Wrap only that, so that an error anywhere else stays a bug with a traceback. For `sections` see `UserError`.
+    Wrap only that, so that an error anywhere else stays a bug with a traceback. For `sections` see `UserError`. `where`
+    heads the line, such as the file that was read.
     """
     try:
         yield
     except OSError:  # `guarded` says what a disk refuses
         raise
     except UserError as error:
+        if where:
+            raise UserError(f"{where}: {error}") from error
         error.sections = error.sections or sections
         raise
     except Exception as error:
         kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "
-        refused = UserError(f"{kind}{one_line(error)}{kind and '; --traceback shows where'}")
+        refused = UserError(f"{where and f'{where}: '}{kind}{one_line(error)}{kind and '; --traceback shows where'}")
         refused.sections = sections
         raise refused from error
 

@@ -79,6 +79,8 @@ def build_model(config: Config) -> Model:
     """
     sizes, parts, kinds = dict(config["model"]), dict[str, Any](), list[str]()
     if "prior" in config:
+        if missing := [name for name in ("_target_", "feature_dimension", "width") if name not in sizes]:
+            raise UserError(f"the section model has no {', '.join(missing)}: give one that train has written")
         own_prior = sizes.pop("prior", None) or {}
         check_sizes("model", sizes)
         section = "model.prior" if own_prior.get("_target_") else "prior"
@@ -96,7 +98,7 @@ def build_model(config: Config) -> Model:
     model = build_part("model", sizes, **parts)
     if not isinstance(model, Model):
         raise UserError(f"model {type(model).__name__} is no program: derive it from cavin_pyro.models.model.Model")
-    if "prior" in config and not kinds and config["prior"]["_target_"] != STANDARD_PRIOR:
+    if "prior" in config and not kinds and config["prior"].get("_target_") != STANDARD_PRIOR:
         raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
     return model
 

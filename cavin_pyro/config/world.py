@@ -67,10 +67,8 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
         raise UserError(f"env.ranges.names must name an object, or be null for all: choose from {', '.join(every)}")
     for name, usual in (("names", every), ("target", ())):
         ranges[name] = tuple(ranges[name] or usual)
-        try:
+        with user_input(where=f"env.ranges.{name}"):
             chosen(ranges[name], objects)
-        except ValueError as error:
-            raise UserError(str(error).replace(":", f" in env.ranges.{name}:", 1)) from error
     for name, (least, most) in LIMITS.items():
         if (given := ranges[name]) is not None:
             if len(given) != 2 or not least <= given[0] <= given[1] <= most:

@@ -173,7 +173,7 @@ def load_trained(
         folders, checkpoint.geometry, selection, segment_length=segment_length, seed=split, storage=storage
     )
     # What the file says of its parts may be such that they can be built and not run.
-    with checkpoint.named():
+    with user_input(where=f"checkpoint {checkpoint.path}"):
         check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
     return checkpoint, selection, table, folders
 

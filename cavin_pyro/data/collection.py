@@ -76,9 +76,7 @@ def collecting_world(env: DictConfig) -> CollectionConfig:
     part_of("robot", env.robot, env.assets)
     if env.robot != WorldConfig.robot:
         robot = env.robot if isinstance(env.robot, str) else env.robot.get("_target_")
-        raise UserError(
-            f"random pushes are made with env.robot=stick, not {robot}: its pushes are equivalent and faster"
-        )
+        raise UserError(f"pushes are collected with env.robot=stick, not {robot}: they are equivalent, and faster")
     named: Any = OmegaConf.to_container(env)
     return CollectionConfig(
         ranges=object_ranges(env),

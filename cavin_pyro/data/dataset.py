@@ -18,6 +18,7 @@ an action.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +28,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, OBJECT_SLOTS, POINTS_PER_OBJECT, object_slots
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write_json
 
@@ -164,6 +166,9 @@ def _check_agreement(arrays: Arrays, metadata: Mapping[str, Any]) -> None:
         raise ValueError(f"array length: {arrays['length'].max()} pushes in an episode of {pushes}")
     if {"target", "mask"} <= set(arrays) and arrays["target"].max() >= (slots := arrays["mask"].shape[1]):
         raise ValueError(f"array target: object {arrays['target'].max()} of {slots}")
+    for name, least in (("shape", 0), ("scale", 1e-6)):
+        if {name, "mask"} <= set(arrays) and (arrays[name][arrays["mask"]] < least).any():
+            raise ValueError(f"array {name}: {arrays[name][arrays['mask']].min()} of an object that is there")
     known = len(metadata.get("shape_names", ()))
     if "shape" in arrays and "shape_names" in metadata and arrays["shape"].max() >= known:
         raise ValueError(f"array shape: object {arrays['shape'].max()} of {known} in metadata.json")
@@ -253,9 +258,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     """
     path = folder / "metadata.json"
     if not path.exists():
-        raise UserError(
-            f"no dataset in {folder}: make one with python -m cavin_pyro.collect transitions=100000 output={folder}"
-        )
+        raise UserError(f"no dataset in {folder}: make one with python -m cavin_pyro.collect output={folder}")
     metadata = read_json(path)
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise UserError(f"{path} does not describe a dataset of this program")
@@ -264,19 +267,27 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             f"dataset {folder} has format version {metadata.get('version')}, this program reads {FORMAT_VERSION}: "
             "collect it again"
         )
-    try:
+    with user_input(where=f"{path} is damaged, collect the dataset again"):
         _check_metadata(metadata, files=sum(1 for _ in folder.glob("episodes-*.h5")))
-    except ValueError as error:
-        raise UserError(f"{path} is damaged: {error}; collect the dataset again") from error
     return metadata
 
 
 def _check_metadata(metadata: Mapping[str, Any], *, files: int) -> None:
-    _check_collection(metadata)
+    configuration = metadata["configuration"]
+    usual = {"steps": None, "episodes_per_shard": 1, "maximum_objects": 1}
+    if "space" in configuration:
+        space_of(metadata)
+        usual = {"objects": None, "features": None, **usual}
+        if "_target_" not in configuration["world"]:
+            raise ValueError("its world has no _target_")
+    for name in COUNTS:
+        check_number(name, metadata.get(name), 1, whole=True)
+    for name, value in usual.items():
+        most = MAXIMUM_OBJECTS if name == "maximum_objects" else math.inf
+        check_number(name, configuration.get(name, value), 1, most, whole=True)
     names = metadata.get("shape_names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("shape_names must be a list of names")
-    configuration = metadata["configuration"]
     if not isinstance(configuration.get("ranges") or {}, dict):
         raise ValueError("ranges must be a table")
     shards, episodes, transitions = (metadata[name] for name in COUNTS)
@@ -287,29 +298,6 @@ def _check_metadata(metadata: Mapping[str, Any], *, files: int) -> None:
         raise ValueError(f"it counts {shards} files of episodes, but {files} are there")
     if type(seed_of(metadata)) is not (str if "sha256" in configuration else int):
         raise ValueError("seed must be a whole number")
-
-
-def _check_collection(metadata: Any) -> None:
-    """Check the counts of a dataset, and what of its configuration is counted with."""
-    configuration = metadata.get("configuration") if isinstance(metadata, dict) else None
-    if not isinstance(configuration, dict) or not all(map(_is_count, (metadata.get(name) for name in COUNTS))):
-        raise ValueError("configuration or counts are missing")
-    usual = {"steps": None, "episodes_per_shard": 1, "maximum_objects": 1}
-    if "space" in configuration:
-        try:
-            space_of(metadata)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"its space cannot be used ({error})") from error
-        usual = {"objects": None, "features": None, **usual}
-        if not isinstance(configuration.get("world"), dict) or "_target_" not in configuration["world"]:
-            raise ValueError("its world has no _target_")
-    sizes: dict[str, Any] = {name: configuration.get(name, value) for name, value in usual.items()}
-    if not all(map(_is_count, sizes.values())) or sizes["maximum_objects"] > MAXIMUM_OBJECTS:
-        raise ValueError(f"{', '.join(sizes)} must be whole numbers, the last {MAXIMUM_OBJECTS} at most")
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and value >= 1
 
 
 def seed_of(metadata: Mapping[str, Any]) -> Any:
@@ -386,11 +374,10 @@ def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = F
                 raise
             print(f"left out: {error.args[0]}", flush=True)
             continue
-        if repeated := known.intersection(arrays["episode"].tolist()):
-            raise UserError(
-                f"shard {path} repeats episode {min(repeated)}: delete it and collect again with repair=true"
-            )
-        known.update(arrays["episode"].tolist())
+        for episode in arrays["episode"].tolist():
+            if episode in known:
+                raise UserError(f"shard {path} repeats episode {episode}: delete it and collect again with repair=true")
+            known.add(episode)
         whole += 1
         yield number, arrays
     if whole == 0:

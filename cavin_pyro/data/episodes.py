@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.world import world_of
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.randomness import collection_streams
@@ -110,7 +110,7 @@ def checked_episode(
     motions = checked_actions(actions, None, space.actions)
     places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
     others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
-    real = checked("mask", mask, torch.bool, (places.shape[1],))
+    real = checked_mask(mask, places.shape[1])
     made = {"centers": places, "features": others, "actions": motions, "mask": real}
     return {name: tensor.numpy() for name, tensor in made.items()}
 
@@ -123,16 +123,32 @@ def checked_actions(actions: Any, *shape: int | None) -> Tensor:
     return motions
 
 
+def checked_mask(mask: Any, *shape: int) -> Tensor:
+    """As `checked`; each state must have an object."""
+    real = checked("mask", mask, torch.bool, shape)
+    if not real.any(-1).all():
+        raise UserError("mask has a state without an object: leave out its window or episode")
+    return real
+
+
 def checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | None]) -> Tensor:
-    """The array as a tensor of this shape, in which None stands for any size; without an array, ones."""
-    given: Any = np.ones([size or 0 for size in shape], bool) if array is None else array
-    tensor = torch.as_tensor(np.array(given) if isinstance(given, list) else given, dtype=dtype)
-    fits = tensor.dim() == len(shape)
-    if not fits or any(want not in (None, have) for have, want in zip(tensor.shape, shape, strict=True)):
+    """The array as a tensor of this shape, in which None stands for any size but 0; without a mask, ones."""
+    if array is None and dtype == torch.bool:
+        array = np.ones(shape, bool)
+    try:
+        given = array if isinstance(array, Tensor) else torch.as_tensor(np.asarray(array))
+    except (TypeError, ValueError, RuntimeError) as error:  # of objects, words, or lists of different lengths
+        raise UserError(f"{name} must be an array of numbers: {one_line(error)}") from error
+    fits = given.dim() == len(shape) and 0 not in given.shape
+    if not fits or any(want not in (None, have) for have, want in zip(given.shape, shape, strict=True)):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise UserError(f"{name} has shape {[*tensor.shape]}, and must have [{wanted}]")
+        wanted = f"[{wanted}]{', none of them 0' if 0 in given.shape else ''}"
+        raise UserError(f"{name} has shape {[*given.shape]}, and must have {wanted}")
+    tensor = given.detach().to(dtype) if not given.is_complex() else given
     if not tensor.isfinite().all():
         raise UserError(f"{name} has numbers that are not finite: leave them out")
+    if tensor.is_complex() or not (dtype.is_floating_point or bool((tensor == given).all())):
+        raise UserError(f"{name} has {given.dtype} numbers, which are no {dtype}".replace("torch.", ""))
     return tensor
 
 

@@ -6,6 +6,7 @@ Minari is an optional extra, imported here and for the export alone.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from omegaconf import OmegaConf
 
 from cavin_pyro import __version__
 from cavin_pyro.config.composition import compose
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.world import world_of
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
@@ -42,7 +43,8 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
         import minari
     except ImportError as error:
         raise UserError(f"import needs Minari ({error}): pip install -c constraints.txt -e '.[minari]'") from error
-    named = f"env{'._target_' if '.' in env[0] else ''}={env[0]}"
+    chosen = re.sub(r"^(env\.)?_target_=|^env=", "", env[0])
+    named = f"env{'._target_' if '.' in chosen else ''}={chosen}"
     config = compose("collect", named, *(f"env.{option}" for option in env[1:]))
     world, section = world_of(config), OmegaConf.to_container(config.world)
     if world is None or not isinstance(section, dict):
@@ -56,11 +58,9 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
     episodes = []
     with progress_bar("importing", total=int(source.total_episodes), unit="episode") as bar:
         for number, one in enumerate(source.iterate_episodes()):
-            try:
+            with user_input(where=f"episode {number} of minari:{identity}"):
                 states = [_at(one.observations, step) for step in range(len(one) + 1)]
                 episodes.append(recorded(world, states, one.actions))
-            except UserError as error:
-                raise UserError(f"episode {number} of minari:{identity}: {error}") from error
             bar.update()
     steps = max((len(one["actions"]) for one in episodes), default=0)
     if not 1 <= steps <= dataset.LARGEST["S"]:

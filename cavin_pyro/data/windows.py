@@ -19,10 +19,12 @@ from torch.nn import functional
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.device import send
 from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.data.episodes import checked, checked_actions, checked_episode, packed
+from cavin_pyro.data.episodes import checked, checked_actions, checked_episode, checked_mask, packed
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
@@ -75,6 +77,7 @@ class WindowTable:
         self._objects = torch.cat([(part * slots).amax(-1) for part in states.mask.split(2**16)])
 
     @classmethod
+    @user_input()
     def from_arrays(
         cls,
         *,
@@ -107,9 +110,7 @@ class WindowTable:
         pushes = checked_actions(actions, None, None, None)
         W, T = pushes.shape[:2]
         places = checked("centers", centers, torch.float32, (W, T + 1, None, None))
-        real = checked("mask", mask, torch.bool, places.shape[:3])
-        if not real.any(-1).all():
-            raise UserError("mask has a state without an object: leave out its window")
+        real = checked_mask(mask, *places.shape[:3])
         outlines = checked("features", features, torch.float32, (*places.shape[:3], None))
         transitions = checked("transition_mask", transition_mask, torch.bool, (W, T))
         sequences = checked("sequence_mask", sequence_mask, torch.bool, (W,))
@@ -152,10 +153,20 @@ class WindowTable:
         Raises:
             UserError: shapes that do not fit, numbers that are not finite, an action out of its box, or no window.
         """
-        masks: Any = [None] * len(actions) if mask is None else mask
         with user_input():
-            every: Any = zip(centers, features, actions, masks, strict=True)
-            episodes = [checked_episode(space, *one) for one in every]
+            check_number("segment_length", segment_length, 1, whole=True)
+            check_number("negative_fraction", negative_fraction, high=1)
+            parts = [centers, features, actions, [None] * len(actions) if mask is None else mask]
+            if not isinstance(space, Space) or len({*map(len, parts)}) > 1:
+                given = f"{type(space).__name__} and {', '.join(str(len(part)) for part in parts)}"
+                raise UserError(f"give a Space, and as many centers, features, actions and masks, not {given}")
+            episodes: list[Arrays] = []
+            sizes: dict[str, int] = {}  # of the first
+            for number, one in enumerate(zip(*parts, strict=True)):
+                with user_input(where=f"episode {number}"):
+                    episodes.append(checked_episode(space, *one, **sizes))
+                M, F = episodes[0]["features"].shape[1:]
+                sizes = {"objects": M, "feature_dimension": F}
             longest = max((len(one["actions"]) for one in episodes), default=0)
             held = _held_out(torch.arange(len(episodes)), longest, validation_fraction, seed).numpy()
             together = packed(episodes, range(len(episodes)), longest)
@@ -201,10 +212,11 @@ class WindowTable:
         """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`.
 
         Raises:
-            ValueError: there are none.
+            ValueError: there are none, or no windows of these numbers.
         """
-        if not len(indices):
-            raise ValueError("a batch needs at least one window")
+        low, high = torch.as_tensor(indices).aminmax() if len(indices) else (-1, -1)
+        if not 0 <= int(low) <= int(high) < len(self.starts):
+            raise ValueError(f"a batch needs numbers of windows from 0 to {len(self.starts) - 1}, at least one")
         positions = self.starts[indices, None] + self._steps
         objects = int(self._objects[positions].max())
         positions = send(positions, self._actions.device)
@@ -293,12 +305,11 @@ def shared_space(folders: Sequence[Path]) -> Space | None:
 
 def _held_out(numbers: Tensor, steps: int, fraction: float, seed: int) -> Tensor:
     """Which of the windows or episodes, by the number of their episode, are for validation: at least of one episode."""
+    check_number("validation_fraction", fraction, high=1, positive=True)
+    check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
     distinct = numbers.unique()
-    if len(distinct) < 2 or not 0 < fraction < 1 or steps == 0:
-        raise UserError(
-            f"windows of {len(distinct)} episodes with {steps} pushes and validation_fraction={fraction:g}: "
-            "give at least two episodes and a push, and a fraction between 0 and 1"
-        )
+    if len(distinct) < 2 or steps == 0:
+        raise UserError(f"windows of {len(distinct)} episodes with {steps} pushes: give at least two and a push")
     count = min(max(1, round(fraction * len(distinct))), len(distinct) - 1)
     order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
     return torch.isin(numbers, distinct[order[:count]])

@@ -6,21 +6,21 @@ classes that it names must be defined in this program's packages, or in a module
 
 from __future__ import annotations
 
-import errno
 import json
+import os
 import sysconfig
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, contiguous_format, nn
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model, construct, describe
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
@@ -55,9 +55,9 @@ class Checkpoint:
     @cached_property
     def model(self) -> Model:
         """The model program with its trained parameters, in evaluation mode and without gradients, or a `UserError`."""
-        if "model" not in self.config:
+        if not self.config.get("model"):
             raise UserError(f"checkpoint {self.path} holds no model: give one that train has written")
-        with self.named():
+        with user_input(where=f"checkpoint {self.path}"):
             built = build_model(self.config)
         return self._filled("model", built)
 
@@ -65,7 +65,7 @@ class Checkpoint:
     def guide(self) -> Guide:
         """The guide of `model`, likewise; one that infers no other windows than those of its training is refused."""
         model = self.model
-        with self.named():
+        with user_input(where=f"checkpoint {self.path}"):
             guide = build_guide(self.config, model) if "guide" in self.config else None
         if guide is None or (guide.state_dict() and not any(name.startswith("guide.") for name in self.tensors)):
             raise UserError(f"checkpoint {self.path} holds no guide: give one that train has written")
@@ -97,14 +97,6 @@ class Checkpoint:
         if weight is None:
             raise UserError(f"checkpoint {self.path} holds no PointNet: give one that pretrain or train has written")
         return self._filled("pointnet", PointNet(feature_dimension=len(weight)))
-
-    @contextmanager
-    def named(self) -> Iterator[None]:
-        """Name the file in what is wrong with its configuration, which the user may never have seen."""
-        try:
-            yield
-        except UserError as error:
-            raise UserError(f"checkpoint {self.path}: {error}") from error
 
     def _filled(self, part: str, module: Module) -> Module:
         self.load_into(part, module)
@@ -160,7 +152,8 @@ def save(
 
     Raises:
         UserError: nothing to save, or a guide without its model; a part is no `cavin_pyro.models.part.Part`, or was
-            built with something that no file can describe.
+            built with something that no file can describe; weights that are not finite, or that `config` or another
+            part contradicts. Nothing is written then.
     """
     parts = {"model": model, "guide": guide, "geometry": geometry, **others}
     if all(part is None for part in parts.values()) or (guide is not None and model is None):
@@ -168,14 +161,24 @@ def save(
     stored = dict(config or {})
     if model is not None and "model" not in stored:
         stored |= describe(model=model, guide=guide, geometry=geometry)
+    saved = {name: module.state_dict() for name, module in parts.items() if module is not None}
     tensors = {
-        f"{_stored_name(part, module)}.{name}": value.detach().cpu().clone(memory_format=contiguous_format)
-        for part, module in parts.items()
-        if module is not None
-        for name, value in module.state_dict().items()
+        f"{_stored_name(part, parts[part])}.{name}": value.detach().cpu().clone(memory_format=contiguous_format)
+        for part, weights in saved.items()
+        for name, value in weights.items()
     }
-    with atomic_write(Path(path)) as temporary:
+    if len(tensors) < sum(map(len, saved.values())):
+        raise UserError("two of the parts to save have weights of the same name: give one of them by another keyword")
+    check_finite(tensors, "these parts cannot be saved")
+    made = Checkpoint(Path(path), stored, {}, tensors)
+    inferring = guide if guide is not None and guide.amortized else None  # others have weights once they have run
+    # A training draws its random numbers as if nothing were built here.
+    with user_input(where="config does not describe the parts to save"), torch.random.fork_rng(devices=[]):
+        for name, part in (("model", model), ("guide", inferring), ("geometry", geometry)):
+            _ = part is None or getattr(made, name)
+    with user_input():
         content = checkpoint_bytes(tensors, stored, of_this_process() if provenance is None else provenance)
+    with atomic_write(Path(path)) as temporary:
         temporary.write_bytes(content)
 
 
@@ -203,10 +206,8 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
         raise UserError(f'trust must be a list of modules, ["{trust}"] in Python, not "{trust}"')
     path = find_checkpoint(name_or_path)
     header, tensors = read_checkpoint(path)
-    try:
+    with user_input(where=f"checkpoint {path} has a damaged header"):
         config, provenance = json.loads(header["config"]), json.loads(header["provenance"])
-    except (KeyError, ValueError, RecursionError) as error:
-        raise UserError(f"checkpoint {path} has a damaged header ({error})") from error
     whole = isinstance(config, dict) and isinstance(provenance, dict)
     if not whole or not all(isinstance(config.get(name, {}), dict) for name in BUILT_SECTIONS):
         raise UserError(f"checkpoint {path} has a damaged header (its configuration or provenance has no sections)")
@@ -221,11 +222,11 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
 
 def find_checkpoint(name: str | Path) -> Path:
     """The file of a shipped checkpoint by its name, such as `cavin`, or of another by its path, or a `UserError`."""
-    path = Path(name)
-    if path.suffix or len(path.parts) > 1 or _is_file(path):
+    path = Path(name)  # os.path.isfile, unlike that of paths, takes any name
+    if path.suffix or len(path.parts) > 1 or os.path.isfile(path):
         return path
     shipped = shipped_folder() / f"{name}.safetensors"
-    if not _is_file(shipped):
+    if not os.path.isfile(shipped):
         names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.safetensors")))
         raise UserError(f"unknown checkpoint {name!r}: choose from {names}, or give the path of a .safetensors file")
     return shipped
@@ -238,19 +239,9 @@ def shipped_folder() -> Path:
     return installed if installed.exists() and not checkout.exists() else checkout
 
 
-def _is_file(path: Path) -> bool:
-    """Whether there is such a file; a name that is too long for one is none."""
-    try:
-        return path.is_file()
-    except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:
-            return False
-        raise UserError(f"checkpoint {path} cannot be read: {error.strerror}") from error
-
-
 def read_checkpoint(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     """The header of a checkpoint, and its weights: those that were saved, all finite, or a `UserError`."""
-    if not _is_file(path):
+    if not os.path.isfile(path):
         raise UserError(f"no checkpoint at {path}: give the path of a .safetensors file that train has written")
     try:
         with safe_open(path, framework="pt") as file:
@@ -262,7 +253,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
         raise UserError(f"checkpoint {path} is truncated or no safetensors file ({error})") from error
     if header.get("format") != FORMAT and path.name == "resume.safetensors":
         pretrained = path.with_name("pointnet.safetensors")
-        beside = pretrained if _is_file(pretrained) else path.with_name("checkpoint.safetensors")
+        beside = pretrained if os.path.isfile(pretrained) else path.with_name("checkpoint.safetensors")
         raise UserError(f"{path} is what a training resumes from, not a checkpoint: give {beside}")
     if header.get("format") != FORMAT:
         raise UserError(f"{path} is a safetensors file of another program, not a checkpoint of cavin_pyro")
@@ -273,11 +264,16 @@ def read_checkpoint(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     digest = header.get("sha256")  # which older checkpoints lack
     if digest is not None and digest != tensors_digest(tensors):
         raise UserError(f"checkpoint {path} is damaged: its weights are not those that were saved (SHA-256)")
-    for name, value in tensors.items():
-        if value.is_floating_point() and not bool(value.isfinite().all()):
-            raise UserError(f"checkpoint {path} is damaged: {name} holds values that are not finite")
+    check_finite(tensors, f"checkpoint {path} is damaged")
     return header, tensors
 
 
-def _stored_name(part: str, module: nn.Module) -> str:
+def check_finite(tensors: Mapping[str, Tensor], line: str) -> None:
+    """Raise a `UserError`, which begins with `line`, for weights that are not finite."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise UserError(f"{line}: {name} holds values that are not finite")
+
+
+def _stored_name(part: str, module: nn.Module | None) -> str:
     return "pointnet" if part == "geometry" and isinstance(module, PointNet) else part

@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from cavin_pyro.config.errors import UserError
-from cavin_pyro.config.options import flat_options
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.options import flat_options, shown
 from cavin_pyro.storage.files import CONFIG_NAME, atomic_write, holds_no_result, read_json, write_json
 
 
@@ -32,15 +30,13 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
     path = folder / CONFIG_NAME
     if not path.exists() or holds_no_result(folder):
         return  # there is nothing to protect
-    try:
+    with user_input(where=f"{path} is damaged, choose another output=DIR"):
         earlier = stored_options(path)
-    except (OSError, OmegaConfBaseException, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): choose another output=DIR") from error
     now = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
         if name not in ignore and now.get(name) != earlier.get(name):
             raise UserError(
-                f"{folder} holds a run with {name}={earlier.get(name)}, not {now.get(name)}: "
+                f"{folder} holds a run with {name}={shown(earlier.get(name))}, not {shown(now.get(name))}: "
                 "resume with the same options, or choose another output=DIR"
             )
 
@@ -61,13 +57,6 @@ def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
         write_json(path, now)
     elif (earlier := read_json(path)) != now:
         raise UserError(
-            f"{folder} holds a run with other data, {_of_transitions(earlier)} instead of {_of_transitions(now)}: "
+            f"{folder} holds a run with other data, {earlier} instead of {now}: "
             "resume with the same data=DIR, or choose another output=DIR"
         )
-
-
-def _of_transitions(data: Any) -> str:
-    try:
-        return " and ".join(f"{dataset['transitions']} transitions ({dataset['fingerprint']})" for dataset in data)
-    except (TypeError, KeyError):
-        return "something unreadable"

@@ -34,6 +34,8 @@ def check_targets(config: Any, path: Path, trust: Sequence[str], depth: int = 0)
             if str(config["_target_"]).startswith(OLDER_NAMES):
                 config["_target_"] = f"cavin_pyro.{config['_target_']}"
             _check_target(config["_target_"], path, trust)
+        if hydras := {"_args_", "_recursive_", "_convert_"} & set(config):
+            raise UserError(f"checkpoint {path} has {min(hydras)} in its configuration, which is refused")
         config = [*config, *config.values()]
     for entry in config if isinstance(config, list) else ():
         check_targets(entry, path, trust, depth + 1)

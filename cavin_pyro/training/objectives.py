@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +12,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
 from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
@@ -53,6 +53,8 @@ class Objective:
         counterfactual_weight: float = 0.0,
         rollout_weight: float = 0.0,
     ) -> None:
+        if not isinstance(elbo, ELBO):
+            raise ValueError(f"objective.elbo must be an ELBO of Pyro, such as Trace_ELBO, not {type(elbo).__name__}")
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
         self.warm_up_steps = warm_up_steps
@@ -61,11 +63,9 @@ class Objective:
         for name, weight in self.kl_weights.items():
             if name not in CODES:
                 raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
-            if not weight > 0:
-                raise ValueError(f"objective.kl_weights.{name} must be positive, not {weight:g}")
+            check_number(f"objective.kl_weights.{name}", weight, positive=True)
         for name in ("warm_up_steps", "counterfactual_weight", "rollout_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"objective.{name} must be 0 or more, not {getattr(self, name):g}")
+            check_number(f"objective.{name}", getattr(self, name))
         if counterfactual_weight and elbo.num_particles != 1:
             raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
         if counterfactual_weight and not isinstance(elbo, DifferentiableBound):

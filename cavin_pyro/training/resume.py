@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import user_input
 from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import atomic_write
 
@@ -32,7 +32,7 @@ def write_resume(path: Path, tensors: Mapping[str, Tensor], state: Mapping[str, 
 @contextmanager
 def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
     """Yield a resume file's tensors and state; what does not fit within the block is a damaged file, a `UserError`."""
-    try:
+    with user_input(where=f"{path} is damaged: delete it to start again, or choose another output=DIR"):
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -41,11 +41,6 @@ def resuming(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         if odd := [name for name, value in tensors.items() if not bool(value.isfinite().all())]:
             raise ValueError(f"{odd[0]} is not finite")
         yield tensors, json.loads(header.get("state", "{}"))
-    except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise UserError(
-            f"{path} is damaged ({line}): delete it to start again, or choose another output=DIR"
-        ) from error
 
 
 def section(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:

@@ -272,10 +272,7 @@ def _keep_best(run: Trainer, path: Path, save: Callable[[int, dict[str, float]],
     """Make sure that a resumed run still has its best checkpoint, which a later validation need not surpass."""
     if not path.exists() and run.best_step == run.step:
         save(run.step, run.rows[-1])
-    try:
+    wanted = f"the best checkpoint of this run, of step {run.best_step}, and later weights cannot replace it"
+    then = f"restore it, delete {run.resume_path.name} to start again, or choose another output=DIR"
+    with user_input(where=f"{path} is {wanted}: {then}"):
         read_checkpoint(path)
-    except UserError as error:
-        raise UserError(
-            f"{path}, the best checkpoint of this run, of step {run.best_step}, is gone or damaged, and later weights "
-            f"cannot replace it: restore it, delete {run.resume_path.name} to start again, or choose another output=DIR"
-        ) from error

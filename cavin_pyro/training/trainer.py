@@ -82,6 +82,7 @@ class Trainer:
         self._captured: CapturedLoss | None = None
         self._mirror_signs = None if mirror_signs is None else mirror_signs.to(windows.device)
         trained = [parameter for parameter in self._loss.parameters() if parameter.requires_grad]
+        trained = trained or [*self._loss.requires_grad_(True).parameters()]  # of a checkpoint, as `load` froze it
         self._optimizer = torch.optim.Adam(trained, lr=config.learning_rate, fused=True)
         self._batches = torch.Generator().manual_seed(seed)
         set_matmul_precision(config.matmul_precision)

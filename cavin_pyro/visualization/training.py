@@ -40,7 +40,7 @@ def draw_training(path: Path, rows: Sequence[Mapping[str, str | float]]) -> None
         curves = {part: table[f"{part}_{name}"].dropna() for part in COLORS if f"{part}_{name}" in table}
         for part, curve in curves.items():
             panel.plot(curve, color=COLORS[part], linewidth=1.4, marker="o" if len(curve) == 1 else None, label=part)
-        later = pd.concat([curve[len(curve) // 20 :] for curve in curves.values()])
+        later = pd.concat([curve.iloc[len(curve) // 20 :] for curve in curves.values()])
         if len(later) and np.ptp(later) > 0:  # a steep beginning would flatten all that follows
             panel.set_ylim(later.min() - 0.1 * np.ptp(later), later.max() + 0.1 * np.ptp(later))
         panel.set_title(name.replace("_", " "), fontsize=10)

@@ -30,6 +30,7 @@ from cavin_pyro.envs.pusht.policy import (
 )
 from cavin_pyro.envs.randomness import named_stream
 from cavin_pyro.envs.world import Goal, NoRoomError, World
+from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
@@ -127,16 +128,14 @@ class PushT(World):
         margin: float = 0.7,
         render_mode: str | None = None,
     ) -> None:
-        if criterion not in CRITERIA:
-            raise ValueError(f"unknown criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
-        if maximum_steps < 1:
-            raise ValueError(f"maximum_steps must be at least 1, not {maximum_steps}")
-        if ahead % REPEAT or not 0 <= ahead <= EPISODE * REPEAT:
-            raise ValueError(f"ahead must be a multiple of {REPEAT} up to {EPISODE * REPEAT}, not {ahead}")
-        if not (0 <= weight < math.inf and 0 < margin <= 1):
-            raise ValueError(f"weight must not be negative, and margin above 0 and at most 1, not {weight}, {margin}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        check_choice("criterion", criterion, CRITERIA)
+        check_number("maximum_steps", maximum_steps, 1, whole=True)
+        check_number("ahead", ahead, 0, EPISODE * REPEAT, whole=True)
+        if ahead % REPEAT:
+            raise ValueError(f"ahead must be a multiple of {REPEAT}, not {ahead}")
+        check_number("weight", weight)
+        check_number("margin", margin, high=1, positive=True)
+        check_choice("render_mode", render_mode, (None, "rgb_array"))
         try:
             from gym_pusht.envs import pusht
         except ImportError as error:

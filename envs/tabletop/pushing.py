@@ -34,6 +34,7 @@ from cavin_pyro.envs.tabletop.workspace import (
     tile_center,
 )
 from cavin_pyro.envs.world import Geometry, World
+from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.state import State
 
 EPISODE_STEPS = 60
@@ -103,14 +104,10 @@ class PushingEnv(Uncopied, World):
         show_tiles: bool = True,
         robot: str | RobotFactory = "stick",
     ) -> None:
-        if objects not in range(1, MAXIMUM_OBJECTS + 1):
-            raise ValueError(f"objects must be a whole number from 1 to {MAXIMUM_OBJECTS}, not {objects}")
-        if maximum_steps not in range(1, 10**9):
-            raise ValueError(f"maximum_steps must be a whole number of at least 1, not {maximum_steps}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
-        if not isinstance(show_tiles, bool):
-            raise ValueError(f"show_tiles must be True or False, not {show_tiles!r}")
+        check_number("objects", objects, 1, MAXIMUM_OBJECTS, whole=True)
+        check_number("maximum_steps", maximum_steps, 1, whole=True)
+        check_choice("render_mode", render_mode, (None, "rgb_array"))
+        check_choice("show_tiles", show_tiles, (True, False))
         if isinstance(task, Task) and (layout != 0 or tiles):
             raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
         self._generate: Callable[[np.random.Generator], Task] | None = None

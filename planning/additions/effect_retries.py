@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions.addition import Addition
-from cavin_pyro.planning.checks import check_positive
 from cavin_pyro.planning.protocol import Plan, Query
 from cavin_pyro.planning.returns import best_of
 from cavin_pyro.planning.rollout import Candidates
@@ -35,7 +35,7 @@ class EffectRetries(Addition):
     retries: int = 3
 
     def __post_init__(self) -> None:
-        check_positive("retries", self.retries)
+        check_number("retries", self.retries, 1, whole=True)
 
     def revise(
         self, plan: Plan, *, scene: Query, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning.additions.addition import Addition
-from cavin_pyro.planning.checks import check_positive
 from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.protocol import Query
 
@@ -23,7 +23,7 @@ class NearestObjects(Addition):
     objects: int = 2
 
     def __post_init__(self) -> None:
-        check_positive("objects", self.objects)
+        check_number("objects", self.objects, 1, whole=True)
 
     def focus(self, focus: Focus, scene: Query) -> Focus:
         """See `Addition`; all objects in scenes of up to `objects`."""

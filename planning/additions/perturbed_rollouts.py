@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records, returns
 from cavin_pyro.planning.additions.addition import Addition, Choice
-from cavin_pyro.planning.checks import check_positive, check_weight
 from cavin_pyro.planning.protocol import Reward, TransitionModel, unwrap
 from cavin_pyro.planning.returns import SubgoalDistance, TrackingState, prefer
 from cavin_pyro.planning.rollout import predict_states
@@ -58,12 +58,12 @@ class PerturbedRollouts(Addition):
     failure_cost: float = 0.3
 
     def __post_init__(self) -> None:
-        check_positive("candidates", self.candidates)
-        check_positive("rollouts", self.rollouts)
-        check_positive("rounds", self.rounds)
-        check_positive("reduction_factor", self.reduction_factor)
-        check_weight("start_noise", self.start_noise)
-        check_weight("failure_cost", self.failure_cost)
+        check_number("candidates", self.candidates, 1, whole=True)
+        check_number("rollouts", self.rollouts, 1, whole=True)
+        check_number("rounds", self.rounds, 1, whole=True)
+        check_number("reduction_factor", self.reduction_factor, 1, whole=True)
+        check_number("start_noise", self.start_noise)
+        check_number("failure_cost", self.failure_cost)
 
     def rank(self, scores: Tensor, choice: Choice) -> Tensor:
         """See `Addition`: all but the best on average are left out."""

@@ -10,8 +10,8 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning.additions.addition import Addition, Choice
-from cavin_pyro.planning.checks import check_weight
 from cavin_pyro.planning.returns import prefer
 
 
@@ -36,7 +36,7 @@ class Touchdown(Addition):
     distance: float = 0.015
 
     def __post_init__(self) -> None:
-        check_weight("distance", self.distance)
+        check_number("distance", self.distance)
 
     def rank(self, scores: Tensor, choice: Choice) -> Tensor:
         observed = choice.scene.observed

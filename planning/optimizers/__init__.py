@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 
+from cavin_pyro.models.checks import check_choice
 from cavin_pyro.planning.checks import OptimizerError
 from cavin_pyro.planning.optimizers.base import Optimizer, Shooting, samples_of_iteration
 from cavin_pyro.planning.optimizers.cem import CEM, ICEM
@@ -43,8 +44,7 @@ def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = 
     `optimize` that takes other arguments; and for fewer samples than iterations.
     """
     if isinstance(optimizer, str):
-        if optimizer not in OPTIMIZERS:
-            raise ValueError(f"unknown {argument} '{optimizer}': choose from {', '.join(OPTIMIZERS)}")
+        check_choice(argument, optimizer, OPTIMIZERS)
         optimizer = OPTIMIZERS[optimizer]()
     if isinstance(optimizer, type) or not isinstance(optimizer, Optimizer):
         raise ValueError(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning import records
-from cavin_pyro.planning.checks import check_fraction, check_positive, check_weight
 from cavin_pyro.planning.optimizers.base import Population, best, samples_of_iteration
 from cavin_pyro.planning.rollout import SearchProblem
 
@@ -33,9 +33,9 @@ class CEM:
     momentum: float = 0.1
 
     def __post_init__(self) -> None:
-        check_positive("iterations", self.iterations)
-        check_fraction("elite_fraction", self.elite_fraction, positive=True)
-        check_fraction("momentum", self.momentum)
+        check_number("iterations", self.iterations, 1, whole=True)
+        check_number("elite_fraction", self.elite_fraction, high=1, positive=True)
+        check_number("momentum", self.momentum, high=1)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""
@@ -78,8 +78,8 @@ class ICEM(CEM):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fraction("kept_elite_fraction", self.kept_elite_fraction)
-        check_weight("exponent", self.exponent)
+        check_number("kept_elite_fraction", self.kept_elite_fraction, high=1)
+        check_number("exponent", self.exponent)
 
     def colour(self, noise: Tensor) -> Tensor:
         """Noise `[B, n, K, D]` that is coloured over the segments."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning import records
-from cavin_pyro.planning.checks import check_fraction, check_positive, check_weight
 from cavin_pyro.planning.optimizers.base import Population, best, samples_of_iteration
 from cavin_pyro.planning.rollout import SearchProblem
 from cavin_pyro.planning.sampling import noise_each, uniform_each
@@ -39,12 +39,12 @@ class Evolution:
     step: float = 0.5
 
     def __post_init__(self) -> None:
-        check_positive("generations", self.generations)
-        check_fraction("initial_fraction", self.initial_fraction, positive=True)
-        check_positive("parents", self.parents)
-        check_weight("deletion_rate", self.deletion_rate)
-        check_weight("mutation_rate", self.mutation_rate)
-        check_fraction("step", self.step, positive=True)
+        check_number("generations", self.generations, 1, whole=True)
+        check_number("initial_fraction", self.initial_fraction, high=1, positive=True)
+        check_number("parents", self.parents, 1, whole=True)
+        check_number("deletion_rate", self.deletion_rate)
+        check_number("mutation_rate", self.mutation_rate)
+        check_number("step", self.step, high=1, positive=True)
 
     @property
     def iterations(self) -> int:

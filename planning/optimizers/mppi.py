@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from cavin_pyro.planning.checks import check_fraction, check_optional, check_positive
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning.optimizers.base import samples_of_iteration
 from cavin_pyro.planning.optimizers.weights import adapt_temperature
 from cavin_pyro.planning.rollout import SearchProblem
@@ -30,10 +30,10 @@ class MPPI:
     shrink: float = 0.6
 
     def __post_init__(self) -> None:
-        check_positive("iterations", self.iterations)
-        check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
-        check_fraction("shrink", self.shrink, positive=True)
-        check_optional("temperature", self.temperature)
+        check_number("iterations", self.iterations, 1, whole=True)
+        check_number("effective_sample_size", self.effective_sample_size, high=1, positive=True)
+        check_number("shrink", self.shrink, high=1, positive=True)
+        check_number("temperature", 1 if self.temperature is None else self.temperature, positive=True)
 
     def optimize(self, problem: SearchProblem, samples: int) -> None:
         """See `Optimizer`; the last candidate is the last mean, unless it was replaced."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cavin_pyro.planning.checks import check_fraction, check_optional, check_positive
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning.optimizers.weights import adapt_temperature, effective_sample_size, log_mean
 from cavin_pyro.planning.protocol import Evidence
 from cavin_pyro.planning.rollout import Candidates, SearchProblem, join
@@ -47,12 +47,11 @@ class SMC:
     temperature: float | None = None
 
     def __post_init__(self) -> None:
-        check_fraction("effective_sample_size", self.effective_sample_size, positive=True)
-        if self.moves < 0:
-            raise ValueError(f"moves must be at least 0, not {self.moves}")
-        check_positive("block", self.block)
-        check_fraction("step", self.step, positive=True)
-        check_optional("temperature", self.temperature)
+        check_number("effective_sample_size", self.effective_sample_size, high=1, positive=True)
+        check_number("moves", self.moves, whole=True)
+        check_number("block", self.block, 1, whole=True)
+        check_number("step", self.step, high=1, positive=True)
+        check_number("temperature", 1 if self.temperature is None else self.temperature, positive=True)
 
     def particles(self, samples: int, segments: int) -> int:
         """n, for which extending and moving costs at most N = `samples` whole plans; at least 1."""

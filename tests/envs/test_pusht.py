@@ -126,7 +126,7 @@ def test_the_outline_is_the_block_of_the_simulator() -> None:
     ("call", "message"),
     [
         (lambda: PushT(criterion="close"), "^unknown criterion 'close': choose from pose, coverage, none$"),
-        (lambda: PushT(maximum_steps=0), "^maximum_steps must be at least 1, not 0$"),
+        (lambda: PushT(maximum_steps=0), "^maximum_steps must be a whole number of at least 1, not 0$"),
         (lambda: PushT().reset(options={"goal": [1.0, 2.0]}), "^goal must be 5 finite numbers, not "),
         (lambda: PushT().reset(options={"state": [np.nan] * 5}), "^state must be 5 or 7 finite numbers, not "),
     ],

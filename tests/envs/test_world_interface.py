@@ -105,7 +105,7 @@ def test_a_world_without_a_slip_passes() -> None:
             {"state": lambda world, place: State(torch.zeros(1, 1), torch.full((1, 3), 2.0), REAL)},
             r"the first 2 of a feature must be a vector of length 1 .* not \[\[2\.0, 2\.0, 2\.0\]\]",
         ),
-        ({"goal": lambda world: Slips(SPACE)}, r"for states \[5\] its goal must give success \[5\], not \[5, 1\]"),
+        ({"goal": lambda world: Slips(SPACE)}, r"its goal must give success as bool \[5\], not bool \[5, 1\]$"),
     ],
 )
 def test_each_slip_of_a_world_is_refused_in_one_line(members: dict[str, Any], said: str) -> None:
@@ -150,14 +150,14 @@ def test_the_tabletop_is_the_world_where_none_is_chosen() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["env=nowhere"], "^unknown env 'nowhere': choose from .*pusht.*, or give env._target_=CLASS$"),
+        (["env=nowhere"], "^unknown env 'nowhere': choose from .*pusht.*, or env._target_=CLASS$"),
         ([TARGET, "task=crossing"], "^task is an option of env=tabletop: leave it out"),
         (["env=pusht", "tiles.goal=[[1,2]]"], "^tiles.goal is an option of env=tabletop"),
         ([TARGET, "env.width=3"], "Line.* got an unexpected keyword argument 'width'"),
         (["env._target_=fractions.Fraction"], "^env Fraction is no world: derive it from"),
         (["env._target_=nowhere.World"], "nowhere"),
         (["env._target_="], "^unknown env ''"),
-        (["env=pusht", "env.margin=-1"], "margin above 0 and at most 1, not 1.0, -1"),
+        (["env=pusht", "env.margin=-1"], "^margin must be a number above 0 and at most 1, not -1"),
     ],
 )
 def test_what_no_world_takes_is_refused_in_one_line(options: list[str], said: str) -> None:

@@ -58,9 +58,7 @@ def test_what_is_not_positive_is_refused() -> None:
         IsotropicNormal(torch.zeros(3), 0.0)
     with pytest.raises(ValueError, match="df must be more than 2, not 2"):
         IsotropicStudentT(2.0, torch.zeros(1, 3), torch.ones(1))
-    with pytest.raises(ValueError, match="ratio must be positive, not nan"):
-        IsotropicStudentT(3.0, torch.zeros(1, 3), torch.ones(1), float("nan"))
-    with pytest.raises(ValueError, match="scales.action must be between 1e-12 and 1e12, not -1"):
+    with pytest.raises(ValueError, match="scales.action must be a number of at least 1e-12 and at most 1e.12, not -1"):
         LikelihoodScales(SPACE, action=(-1.0, 1.0))
     with pytest.raises(ValueError):
         IsotropicNormal(torch.zeros(1), 1.0, validate_args=True).log_prob(torch.tensor([float("nan")]))

@@ -204,12 +204,6 @@ def test_scales_and_priors_are_parts_like_any_other(random_window: Callable[...,
     assert all(one.grad.abs() > 0 for one in model.scales.parameters())
 
 
-@pytest.mark.parametrize("weight", [0, -1.0, math.inf, math.nan])
-def test_a_weight_of_actions_is_positive(weight: float) -> None:
-    with pytest.raises(ValueError, match=f"^action_weight must be a positive number, not {weight}$"):
-        SingleLatentModel(action_weight=weight, **SIZES)
-
-
 def contact_model(scales: LikelihoodScales) -> tuple[CascadedModel, Window]:
     """With an f that predicts scales, which it needs for `PredictedScales` alone."""
     torch.manual_seed(0)

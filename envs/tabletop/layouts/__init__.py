@@ -20,6 +20,7 @@ import yaml
 from cavin_pyro.envs.tabletop.tasks import TASKS, GeneratedLayouts, Task
 from cavin_pyro.envs.tabletop.tasks.reach import check_reach
 from cavin_pyro.envs.tabletop.tasks.tiles import TileSet
+from cavin_pyro.models.checks import check_choice
 
 RANDOM, GENERATED = "random", "generated"
 _FOLDER = Path(__file__).parent
@@ -32,8 +33,7 @@ def task_class(task: str | type[Task]) -> type[Task]:
         ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
     """
     if isinstance(task, str):
-        if task not in TASKS:
-            raise ValueError(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
+        check_choice("task", task, TASKS)
         return TASKS[task]
     if not (isinstance(task, type) and issubclass(task, Task)):
         raise ValueError(f"{task!r} is no task: derive it from cavin_pyro.envs.tabletop.tasks.Task")

@@ -21,6 +21,7 @@ from cavin_pyro.envs.tabletop.objects.shapes import (
     random_shape,
     write_mesh,
 )
+from cavin_pyro.models.checks import check_choice
 
 SCANS = "ycb"  # the folder's name within the assets, and the prefix of its objects' names
 FARTHEST = 100.0  # metres; larger numbers are not metres
@@ -140,8 +141,7 @@ def load_object_set(name: str | ObjectSet, assets: str | Path | None = None) -> 
     """
     if not isinstance(name, str):
         return name
-    if name not in OBJECT_SETS:
-        raise ValueError(f"unknown object set {name!r}: choose from {', '.join(OBJECT_SETS)}")
+    check_choice("object set", name, OBJECT_SETS)
     return OBJECT_SETS[name](assets)
 
 

@@ -12,6 +12,7 @@ from cavin_pyro.envs.tabletop.robots.panda import panda
 from cavin_pyro.envs.tabletop.robots.robot import Robot
 from cavin_pyro.envs.tabletop.robots.sawyer import sawyer
 from cavin_pyro.envs.tabletop.robots.stick import StickRobot
+from cavin_pyro.models.checks import check_choice
 
 RobotFactory = Callable[[PhysicsWorld], Robot]
 """Puts a robot into an empty world."""
@@ -33,6 +34,5 @@ def robot_factory(robot: str | RobotFactory, assets: str | Path | None = None) -
     """
     if not isinstance(robot, str):
         return robot
-    if robot not in ROBOTS:
-        raise ValueError(f"unknown robot {robot!r}: choose from {', '.join(ROBOTS)}")
+    check_choice("robot", robot, ROBOTS)
     return ROBOTS[robot](assets)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from cavin_pyro.envs.tabletop.segmentation.clusters import ClusterSegmenter
 from cavin_pyro.envs.tabletop.segmentation.segmenter import MaskSegmenter, Pixels, Segmenter, TrueMasks
 from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS
+from cavin_pyro.models.checks import check_choice
 
 SegmenterFactory = Callable[[int], Segmenter]
 """Makes a segmenter that finds at most so many objects."""
@@ -25,8 +26,7 @@ def segmenter_of(segmentation: str | SegmenterFactory, true_masks: TrueMasks, sl
     """
     if not isinstance(segmentation, str):
         return segmentation(slots)
-    if segmentation not in SEGMENTERS:
-        raise ValueError(f"unknown segmentation {segmentation!r}: choose from {', '.join(SEGMENTERS)}")
+    check_choice("segmentation", segmentation, SEGMENTERS)
     return SEGMENTERS[segmentation](true_masks, slots)
 
 

@@ -12,6 +12,7 @@ from cavin_pyro.envs.tabletop.sensors.sensor import (
     Rendering,
     SensorFactory,
 )
+from cavin_pyro.models.checks import check_choice
 
 CAMERAS: dict[str, SensorFactory] = {"ideal": IdealSensor, "kinect2": Kinect2}
 
@@ -26,8 +27,7 @@ def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:
         return IdealSensor(camera)
     if not isinstance(camera, str):
         return camera
-    if camera not in CAMERAS:
-        raise ValueError(f"unknown camera {camera!r}: choose from {', '.join(CAMERAS)}")
+    check_choice("camera", camera, CAMERAS)
     return CAMERAS[camera]()
 
 

@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, TILE_COUNT, Tile, tile_center
+from cavin_pyro.models.checks import check_choice, check_number
 
 ROOM = 0.05  # metres that the tool's reach extends beyond the centre of a tile that layouts use
 # Metres beyond the centre of a tile on which the target starts, so that the tool gets behind it on every side: it may
@@ -47,10 +48,8 @@ class GeneratedLayouts:
     shape: str = ANY_SHAPE
 
     def __post_init__(self) -> None:
-        if self.tiles not in range(FEWEST, MOST + 1):
-            raise ValueError(f"generated.tiles must be a whole number from {FEWEST} to {MOST}, not {self.tiles}")
-        if self.shape not in (*SHAPES, ANY_SHAPE):
-            raise ValueError(f"unknown generated.shape {self.shape!r}: choose from {', '.join((*SHAPES, ANY_SHAPE))}")
+        check_number("generated.tiles", self.tiles, FEWEST, MOST, whole=True)
+        check_choice("generated.shape", self.shape, (*SHAPES, ANY_SHAPE))
 
     def sample(self, what: str, by_shape: Mapping[str, Sequence[Choice]], generator: np.random.Generator) -> Choice:
         """One of the choices of the wanted shape; of any shape, all shapes that there are are equally likely.

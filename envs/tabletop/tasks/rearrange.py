@@ -17,6 +17,7 @@ from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.tasks.task import Marking, Step, Task
 from cavin_pyro.envs.tabletop.tasks.tiles import TileSet
 from cavin_pyro.envs.tabletop.workspace import MAXIMUM_OBJECTS, TABLE_HIGH, TABLE_LOW, TILE_SIDE, Tile, tile_center
+from cavin_pyro.models.checks import check_number
 
 TOLERANCE = 0.03  # metres between an object's centre and its place, on the table, at most
 LEAST_TOLERANCE = 0.01  # metres; a planner's margin leaves at least this
@@ -48,8 +49,7 @@ class Rearrange(Task):
     def check(self) -> None:
         """The places are on the table."""
         object.__setattr__(self, "places", _places(self.places))
-        if not (isinstance(self.clearance, int | float) and self.clearance >= 0.0):
-            raise ValueError(f"clearance must be at least 0 metres, not {self.clearance!r}")
+        check_number("clearance", self.clearance)  # metres
 
     @cached_property
     def _padded(self) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 from cavin_pyro.envs.tabletop.tasks.task import Step, Task
 from cavin_pyro.envs.tabletop.tasks.tiles import DistanceField, grid, table_distance
 from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
+from cavin_pyro.models.checks import check_choice, check_number
 
 REWARD_NAMES = ("dense", "sparse")
 CRITERIA = ("strict", "published")
@@ -104,12 +105,9 @@ class TaskReward:
         criterion: str = "strict",
         device: str | torch.device = "cpu",
     ) -> None:
-        if reward not in REWARD_NAMES:
-            raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARD_NAMES)}")
-        if criterion not in CRITERIA:
-            raise ValueError(f"unknown criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
-        if not margin >= 0.0:
-            raise ValueError(f"margin must be at least 0 metres, not {margin}")
+        check_choice("reward", reward, REWARD_NAMES)
+        check_choice("criterion", criterion, CRITERIA)
+        check_number("margin", margin)
         self.device = torch.device(device)
         self.task, self.dense, self.margin = task.to(self.device), reward == "dense", margin
         self.criterion = criterion

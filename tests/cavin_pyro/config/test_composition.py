@@ -40,6 +40,11 @@ def test_every_preset_is_composed_and_helps_with_whole_sentences(command: str, o
         assert meaning.count("(") <= len(re.findall(r"[])]", meaning)) and "`" not in meaning
 
 
+def test_a_path_may_have_letters_outside_of_ascii() -> None:
+    config = compose("train", "data=[a/ü=ü,b ü/c]", "output='ü\\'s'")
+    assert (config.data, config.output) == (["a/ü=ü", "b ü/c"], "ü's")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_lists_the_usual_options_or_every_one_with_its_meaning_and_valid_examples(command: str) -> None:
     config, choices = composed(command, [])
@@ -93,7 +98,6 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("reward=medium", "unknown reward 'medium': choose from dense, sparse"),
     ("tsak=crossing", "unknown option 'tsak': did you mean task? valid are checkpoint, "),
     ("planner.sampels=3", "unknown option 'planner.sampels': did you mean samples? valid under planner are "),
-    ("planner=random planner.samples=3", "unknown option 'planner.samples': valid under planner are "),
     ("sum.what.else=3", "unknown option 'sum.what.else': valid are "),
     ("check device=cuda", "unknown option 'device': it is an option of pretrain, "),
     ("+unknown=1", "unknown option 'unknown': valid are "),
@@ -111,10 +115,8 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("planner.samples=null", "planner.samples=null: field 'planner.samples' is not Optional"),
     ("trust=os", "trust=os: Invalid value assigned: str is not a ListConfig, list or tuple"),
     ("train guide=[]", "guide must be one of auto_iaf, "),
-    ("train prior=[[]]", "; choose from conditional, flow, "),
     ("train objective=[1,2]", "; choose from counterfactual, iwae, "),
     ("train objective.elbo.num_particles=nan", "objective.elbo.num_particles=nan: Value 'nan'"),
-    ("train objective.elbo.max_plate_nesting=x", "objective.elbo.max_plate_nesting=x: Value 'x'"),
     ("train windows.held_out_objects=[[]]", "windows.held_out_objects must be a plain list such as [a,b], not [[]]"),
     ("video=${oc.decode:'maybe'}", "'maybe' is not a valid bool"),
     (f"seed={'1' * 5000}", "value has 5000 digits"),

@@ -92,6 +92,8 @@ SPOILT: dict[str, tuple[Callable[[Path, Arrays], Any], str]] = {
     "not finite": (changed("actions", lambda one: one * np.nan), "actions has values outside of -1 to 1: nan to nan"),
     "longer": (changed("length", lambda one: one + 7), "array length: 13 pushes in an episode of 6"),
     "an object too many": (changed("target", lambda one: one + 5), r"array target: object \d of 5"),
+    "an object of no shape": (changed("shape", lambda one: one * 0 - 1), "array shape: -1 of an object that is there"),
+    "an object of no size": (changed("scale", lambda one: one * 0), "array scale: 0.0 of an object that is there"),
     "elsewhere": (linked, "actions is no array in this file"),
     "unpacks to 660 gigabytes": (bomb, r"centers has shape \[1000000000, 11, 5, 3\]"),
 }
@@ -104,7 +106,7 @@ def test_a_shard_that_does_not_fit_is_named_and_can_be_skipped(
     change, said = SPOILT[kind]
     path = shard_path(own_pushes, 1)
     change(path, read_shard(path))
-    names = ("actions", "length", "mask", "target")
+    names = ("actions", "length", "mask", "target", "shape", "scale")
     with pytest.raises(UserError, match=rf"^shard .*episodes-00001\.h5 is missing or corrupt \(.*({said})") as refused:
         list(iterate_shards(own_pushes, names))
     assert "\n" not in str(refused.value) and "repair=true" in str(refused.value)
@@ -122,6 +124,10 @@ def test_shards_come_in_order_and_none_repeats_an_episode(own_pushes: Path) -> N
     assert read_metadata(own_pushes)["transitions"] == sum(arrays["length"].sum() for _, arrays in shards)
     shard_path(own_pushes, 2).write_bytes(shard_path(own_pushes, 0).read_bytes())
     with pytest.raises(UserError, match=r"episodes-00002\.h5 repeats episode 0"):
+        list(iterate_shards(own_pushes, ("length",)))
+    path = shard_path(own_pushes, 0)
+    changed("episode", lambda one: one * 0 + 9)(path, read_shard(path))
+    with pytest.raises(UserError, match=r"episodes-00000\.h5 repeats episode 9"):
         list(iterate_shards(own_pushes, ("length",)))
     for number in range(3):
         shard_path(own_pushes, number).unlink()
@@ -146,8 +152,11 @@ def test_padding_adds_slots_without_objects(pushes: Path) -> None:
     [
         ({"format": "photographs"}, "does not describe a dataset of this program"),
         ({"version": 2}, "has format version 2, this program reads 1: collect it again"),
-        ({"shards": 0}, "is damaged: configuration or counts are missing"),
-        ({"configuration": {"steps": 6, "maximum_objects": 11}}, "must be whole numbers, the last 10 at most"),
+        ({"shards": 0}, "is damaged, .*: shards must be a whole number of at least 1, not 0$"),
+        (
+            {"configuration": {"steps": 6, "maximum_objects": 11}},
+            "of at least 1 and at most 10, not 11$",
+        ),
         ({"shards": 10**9}, "files have not 12 episodes"),
         ({"shards": 10**9, "episodes": 4 * 10**9}, "counts 1000000000 files of episodes, but 3 are there"),
     ],

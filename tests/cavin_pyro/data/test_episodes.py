@@ -170,9 +170,16 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
     model = FlatModel(space=Point.space, feature_dimension=1, maximum_objects=1, width=8)
     cavin_pyro.fit(model, FlatGuide(model, width=8), table, steps=1, batch_size=4, output=tmp_path / "mine")
     assert cavin_pyro.load(tmp_path / "mine" / "checkpoint.safetensors").geometry is None
-    given["actions"][0] = given["actions"][0][1:]
-    with pytest.raises(UserError, match=r"^centers has shape \[\d+, 1, 2\], and must have"):
-        WindowTable.from_episodes(Point.space, **given)
+    for wrong, said in (
+        ({"actions": [given["actions"][0][1:], *given["actions"][1:]]}, r"^episode 0: centers has shape \[\d+, 1, 2\]"),
+        ({"features": [*given["features"][:9], given["features"][9].repeat(2, 2)]}, "^episode 9: features has shape"),
+        ({"mask": [[False]] * 10}, "^episode 0: mask has a state without an object"),
+        ({"mask": [[True]]}, "^give a Space, and as many .* not Space and 10, 10, 10, 1$"),
+        ({"space": {}}, "^give a Space, .*, not dict and "),
+        ({"segment_length": 1.5}, "^segment_length must be a whole number of at least 1, not 1.5$"),
+    ):
+        with pytest.raises(UserError, match=said):
+            WindowTable.from_episodes(**{"space": Point.space, **given, **wrong})
 
 
 def minari_dataset(name: str, *, largest: float = 1.0, flaw: float = 1.0, size: int = 2) -> None:

@@ -186,7 +186,7 @@ def test_intact_shards_of_a_damaged_dataset_are_used_with_skip_corrupt(
 def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
     arrays = made_up_episodes(60)
     arrays["shape"] = np.random.default_rng(0).integers(3, size=(60, OBJECTS), dtype=np.int8)
-    arrays["scale"][:20, 1] = 0.0  # padding, whatever its shape says
+    arrays["scale"][:20, 1], arrays["mask"][:20, 1] = 0.0, False  # padding, whatever its shape says
     without_mug = ~((arrays["shape"] > 0) & (arrays["scale"] > 0)).any(axis=-1)
     table = load(tmp_path, arrays, replace(EVERY, held_out_objects=["mug"]))
     assert 0 < without_mug.sum() < 60
@@ -218,6 +218,9 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
     held_out = set(table.episodes[table.validation].tolist())
     assert len(held_out) == 1 and not held_out & set(table.episodes[table.training].tolist())
     assert sorted([*table.training.tolist(), *table.validation.tolist()]) == list(range(6))
+    for there_are_none in ([-1], [0, 6], []):
+        with pytest.raises(ValueError, match="^a batch needs numbers of windows from 0 to 5, at least one$"):
+            table.batch(torch.tensor(there_are_none))
 
 
 @pytest.mark.parametrize(
@@ -229,6 +232,12 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
         ({"episodes": [1] * 6}, "^windows of 1 episodes"),
         ({"actions": np.full((6, 2, 4), 5.0)}, "^actions has numbers as large as 5, out of the box"),
         ({"mask": np.zeros((6, 3, 3))}, "^mask has a state without an object"),
+        ({"mask": np.full((6, 3, 3), np.nan)}, "^mask has float64 numbers, which are no bool$"),
+        ({"episodes": np.arange(6) / 2}, "^episodes has float64 numbers, which are no int64$"),
+        ({"features": None}, "^features must be an array of numbers: "),
+        ({"actions": [[[0.0]], [[0.0], [0.0]]]}, "^actions must be an array of numbers: "),
+        ({"actions": np.zeros((6, 2, 0))}, r"must have \[any, any, any\], none of them 0$"),
+        ({"validation_fraction": "x"}, "^validation_fraction must be a number above 0 and at most 1, not 'x'$"),
     ],
 )
 def test_arrays_that_are_no_windows_are_refused_in_one_line(wrong: dict[str, Any], said: str) -> None:

@@ -68,7 +68,7 @@ def test_a_model_built_in_python_needs_no_configuration(tmp_path: Path) -> None:
     assert type(again.geometry) is Outline and again.provenance["program"].startswith("cavin_pyro")
 
 
-def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: Path) -> None:
+def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(small: SimpleNamespace, tmp_path: Path) -> None:
     class Own(CascadedModel):
         """No other program can import it."""
 
@@ -79,10 +79,17 @@ def test_what_a_checkpoint_cannot_describe_is_refused_with_its_place(tmp_path: P
         with pytest.raises(UserError, match=said):
             save(tmp_path / "a.safetensors", model=model)
     model, guide = CascadedModel(space=SPACE), CascadedGuide(CascadedModel(space=SPACE))
+    wider, spoilt = small.config() | {"model": small.config()["model"] | {"width": 16}}, nn.Linear(1, 1)
+    nn.init.constant_(spoilt.weight, float("nan"))
     for parts, said in (
         ({"model": model, "guide": guide}, "^the guide was built for another model"),
         ({"guide": guide}, "^save needs the model of this guide: give model="),
         ({"config": {"model": {}}}, "^save needs a part: give model="),
+        ({**small.parts(), "config": wider}, "^config does not describe the parts to save: .*of another architecture"),
+        ({**small.parts(), "config": {"model": {}}}, "^config does not describe the parts to save: .*holds no model"),
+        ({**small.parts(), "pointnet": PointNet()}, "^two of the parts to save have weights of the same name"),
+        ({"net": nn.Linear(1, 1), "config": {"own": {1j}}}, "^TypeError: Object of type set is not JSON serializable"),
+        ({"net": spoilt}, r"^these parts cannot be saved: net\.weight holds values that are not finite"),
     ):
         with pytest.raises(UserError, match=said):
             save(tmp_path / "a.safetensors", **parts)

@@ -122,6 +122,7 @@ DEEP: dict[str, Any] = functools.reduce(lambda inner, _: {"more": inner}, range(
         ("model", "more", [{"deep": ["${scales}"]}], "has an interpolation"),
         ("model", "more", DEEP, "over 20 levels deep"),
         ("guide", "width", 30_000, r"guide\.width=30000, but no layer in it has more than \d+ units"),  # 3.6 gigabytes
+        *(("prior", name, [0], f"has {name} in its") for name in ("_args_", "_recursive_", "_convert_")),
         ("prior", "_target_", 5, "asks to run"),
         ("prior", "_target_", ["os.system"], "asks to run"),
         ("prior", "_target_", "os.system", "not part of this program$"),  # nobody is told to trust Python's modules

@@ -46,7 +46,7 @@ def test_a_run_resumes_with_the_same_configuration(tmp_path: Path) -> None:
         ({"seed": 4, "name": "a-3"}, "a run with seed=3, not 4"),
         ({"trainer": {"steps": 20, "rates": [0.1, 0.2]}}, "a run with trainer.steps=10, not 20"),
         ({"trainer": {"steps": 10, "rates": [0.1, 0.3]}}, r"trainer.rates=\[0.1, 0.2\], not \[0.1, 0.3\]"),
-        ({"extra": 1}, "a run with extra=None, not 1"),
+        ({"extra": 1}, "a run with extra=null, not 1"),
     ],
 )
 def test_a_run_with_another_configuration_is_refused_and_the_option_is_named(
@@ -84,7 +84,7 @@ def test_training_resumes_with_the_same_data_in_any_folder(tmp_path: Path) -> No
     check_same_data(tmp_path, [{**data, "episodes": 13}])
     noted = (tmp_path / "data.json").read_text()
     for other in ([{**data, "fingerprint": "34cd"}], [{**data, "transitions": 70}], [data, data]):
-        with pytest.raises(UserError, match=r"other data, 60 transitions \(12ab\) instead of .* or choose another"):
+        with pytest.raises(UserError, match=r"other data, .*60.*12ab.* instead of .* or choose another"):
             check_same_data(tmp_path, other)
     assert (tmp_path / "data.json").read_text() == noted
 

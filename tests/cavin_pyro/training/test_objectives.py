@@ -195,9 +195,7 @@ def test_the_rollout_term_is_the_distance_of_predictions_from_predictions(progra
     ("options", "said"),
     [
         ({"kl_weights": {"code": 1.0}}, "kl_weights has no 'code'"),
-        ({"kl_weights": {"effect_code": 0.0}}, "kl_weights.effect_code must be positive"),
-        ({"warm_up_steps": -1}, "objective.warm_up_steps must be 0 or more"),
-        ({"rollout_weight": float("nan")}, "objective.rollout_weight must be 0 or more"),
+        ({"kl_weights": {"effect_code": 0.0}}, "kl_weights.effect_code must be a number above 0"),
         ({"elbo": Trace_ELBO(num_particles=2), "counterfactual_weight": 1.0}, "takes one particle"),
         ({"elbo": RenyiELBO(), "warm_up_steps": 10}, "has no KL terms to weight"),
         ({"elbo": JitTrace_ELBO()}, "JitTrace_ELBO compiles with torch.jit.trace"),

@@ -349,7 +349,7 @@ def test_a_changed_resume_file_is_named(name: str, own: Path, small: SimpleNames
         CHANGES[name](tensors)
         tensors = {one: value.contiguous() for one, value in tensors.items()}
         save_file(tensors, path, metadata={**header, "sha256": tensors_digest(tensors)} if forged else header)
-        with pytest.raises(UserError, match=r"resume\.safetensors is damaged \(.*\): delete it to start again") as no:
+        with pytest.raises(UserError, match=r"resume\.safetensors is damaged: delete it to start again, .*: ") as no:
             trainer(small, own).resume()
         assert "\n" not in str(no.value)
 
@@ -373,7 +373,7 @@ def test_a_run_whose_best_checkpoint_is_gone_says_so_or_writes_it_again(own: Pat
     content = path.read_bytes()
     _keep_best(run, path, lambda step, row: saved.append(step))
     path.write_bytes(content[:-5])
-    with pytest.raises(UserError, match="is gone or damaged, and later weights cannot replace it: restore"):
+    with pytest.raises(UserError, match="and later weights cannot replace it: restore it, .* is truncated or no"):
         _keep_best(run, path, lambda step, row: saved.append(step))
     assert not saved
     path.unlink()

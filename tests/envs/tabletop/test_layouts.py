@@ -206,7 +206,7 @@ def test_every_scene_has_its_own_layout_with_room_for_five_objects(task: str, ti
 @pytest.mark.parametrize(
     ("task", "wanted", "problem"),
     [
-        ("crossing", {"tiles": 3}, r"^generated\.tiles must be a whole number from 4 to 14, not 3$"),
+        ("crossing", {"tiles": 3}, r"^generated\.tiles must be a whole number of at least 4 and at most 14, not 3$"),
         ("crossing", {"tiles": 8, "shape": "straight"}, r"^no bridge of 8 tiles .* choose generated\.shape=l, u, s, w"),
         ("insertion", {"tiles": 9}, r"^ways to a slot have 4 to 8 tiles and any shape: choose generated\.tiles=4 to 8"),
         ("gathering", {}, r"^task gathering has no generated layouts: give another layout, or another task$"),

@@ -197,11 +197,9 @@ def test_the_same_seed_and_actions_give_the_same_episode(make: Make) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"objects": 11}, r"^objects must be a whole number from 1 to 10, not 11$"),
-        ({"maximum_steps": 2.5}, r"^maximum_steps must be a whole number of at least 1, not 2.5$"),
-        ({"reward": "shaped"}, r"^unknown reward 'shaped': choose from dense, sparse$"),
+        ({"objects": 11}, r"^objects must be a whole number of at least 1 and at most 10, not 11$"),
+        ({"margin": "x"}, r"^margin must be a number of at least 0, not 'x'$"),
         ({"camera": "webcam"}, r"^unknown camera 'webcam': choose from ideal, kinect2$"),
-        ({"segmentation": "guess"}, r"^unknown segmentation 'guess': choose from mask, clusters$"),
         ({"object_set": "toys"}, r"^unknown object set 'toys': choose from builtin, ycb, mixed, random$"),
         ({"task": BRIDGE, "tiles": {"goal": [[2, 3]]}}, r"^a task object has its own layout"),
     ],
