@@ -118,12 +118,14 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
     if isinstance(error, UserError):
         said, sections = str(error), {section.partition(".")[0] for section in error.sections}
         given = [word for word in words if re.split(r"[./=]", word.lstrip("+"))[0] in sections]
-        about = given if error.__cause__ else []
+        about, places = given if error.__cause__ else [], dict[int, str]()
         for key, _, value in (word.lstrip("+").partition("=") for word in given):
             if key in said:
                 return said
-            if re.search(rf"\b{key.rpartition('.')[2]}\b", said) or (len(value) > 3 and value in said):
-                about = [f"{key}={value}"]
+            own = f"|{re.escape(value)}" if len(value) > 3 else ""
+            if found := re.search(rf"\b{re.split('[./]', key)[-1]}\b{own}", said):
+                places[found.start()] = f"{key}={value}"
+        about = [places[min(places)]] if places else about  # what is wrong is named before what it would take
         return f"{', '.join(about)}: {said}" if about else said
     if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
         return _refusal(error)

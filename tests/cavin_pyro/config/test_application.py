@@ -144,6 +144,8 @@ def test_whatever_is_raised_while_choices_are_read_is_bad_input_of_the_options_i
     assert said.startswith(f"{head}OverflowError: too large; --traceback ")
     said = ended(read(raising(ValueError("center is wrong"))), capsys, words=words)[1]
     assert said == "scales.center=1e308: center is wrong"
+    said = ended(read(raising(ValueError("optimizer lacks samples"))), capsys, words=[*words, "planner.samples=8"])[1]
+    assert said == "planner/optimizer=cem: optimizer lacks samples"
     assert len(ended(read(raising(ValueError("1" * 5000))), capsys)[1]) < 500
 
 

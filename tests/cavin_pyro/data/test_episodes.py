@@ -169,7 +169,8 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
     assert len(table.validation) and not set(table.episodes[table.validation]) & set(table.episodes[table.training])
     model = FlatModel(space=Point.space, feature_dimension=1, maximum_objects=1, width=8)
     cavin_pyro.fit(model, FlatGuide(model, width=8), table, steps=1, batch_size=4, output=tmp_path / "mine")
-    assert cavin_pyro.load(tmp_path / "mine" / "checkpoint.safetensors").geometry is None
+    again = cavin_pyro.load(tmp_path / "mine" / "checkpoint.safetensors")
+    assert again.geometry is None and cavin_pyro.fit(again.model, again.guide, table, steps=1, batch_size=4).step == 1
     for wrong, said in (
         ({"actions": [given["actions"][0][1:], *given["actions"][1:]]}, r"^episode 0: centers has shape \[\d+, 1, 2\]"),
         ({"features": [*given["features"][:9], given["features"][9].repeat(2, 2)]}, "^episode 9: features has shape"),
