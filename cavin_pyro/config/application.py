@@ -92,6 +92,7 @@ def guarded(action: Callable[[], T], name: str | None = None, words: Sequence[st
     printed that stops early, such as `head`, ends the command silently, with the status of SIGPIPE. `name`: of the
     command, if it has begun its work: an interruption says whether it resumes. `words`: its options as typed.
     """
+    sys.stdout, sys.stderr = (one or open(os.devnull, "w") for one in (sys.stdout, sys.stderr))  # noqa: SIM115  (closed)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # its encoding may lack letters of a path
     try:
