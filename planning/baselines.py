@@ -233,36 +233,6 @@ class CavinWithoutEffectsPlanner(ActionSearch):
     has_codes = True
 
 
-class RandomPlanner:
-    """Uniform random actions: each number ~ Uniform(-1, 1), normalised.
-
-    `action_dimension`: A. `segment_length`: T, the number of actions per plan. Raises ValueError if one is less than 1.
-    """
-
-    def __init__(self, segment_length: int = 3, *, action_dimension: int) -> None:
-        check_number("segment_length", segment_length, 1, whole=True)
-        check_number("action_dimension", action_dimension, 1, whole=True)
-        self.segment_length, self.action_dimension = segment_length, action_dimension
-
-    @torch.inference_mode()
-    def plan(
-        self,
-        state: State,
-        *,
-        generators: Sequence[torch.Generator],
-        reward: RewardFunction | None = None,
-        observed: Any = None,
-        steps_left: int | None = None,
-    ) -> Plan:
-        """Sample `[B, T, A]` actions for the scenes `state: [B]`; without prediction or choice.
-
-        Raises ValueError unless there are scenes, with a generator for each.
-        """
-        check_scenes(state, generators, steps_left)
-        size = self.segment_length, self.action_dimension
-        return without_prediction(state, 2 * uniform_each(size, generators, state.centers.device) - 1)
-
-
 class Policy(Protocol):
     """What acts without predicting, such as a script that belongs to a world."""
 
@@ -286,35 +256,55 @@ class PolicyPlanner:
         self,
         state: State,
         *,
-        reward: RewardFunction,
         generators: Sequence[torch.Generator],
+        reward: RewardFunction | None = None,
         observed: Any = None,
         steps_left: int | None = None,
     ) -> Plan:
-        """Ask the policy for the scene `state: [1]`; ValueError: several scenes, or another action than `[1, A]`."""
+        """Actions for the scenes `state: [B]`, without prediction or choice.
+
+        Raises ValueError unless there are scenes, with a generator for each, and for what `act` cannot do.
+        """
         check_scenes(state, generators, steps_left)
+        actions = self.act(state, reward, generators, observed)
+        environments, objects, positions = state.centers.shape
+        empty = state.centers.new_empty
+        return Plan(
+            actions=actions,
+            planned_actions=actions,
+            effect_codes=empty(environments, 0, 0),
+            motion_codes=empty(environments, 0, 0),
+            subgoals=state.map(lambda field: field[:, None][:, :0]),
+            segments=torch.zeros(environments, dtype=torch.int64, device=actions.device),
+            predicted_centers=empty(environments, 0, objects, positions),
+            expected_return=state.centers.new_full((environments,), torch.nan),
+            expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
+            candidate_centers=empty(environments, 0, 0, objects, positions),
+            candidate_returns=empty(environments, 0),
+        )
+
+    def act(self, state: State, reward: Any, generators: Sequence[torch.Generator], observed: Any) -> Tensor:
+        """`[B, T, A]`, here of one scene; ValueError: several, or another action than `[1, A]`."""
         if len(generators) > 1:
             raise ValueError(f"a policy acts in one scene at a time, not in {len(generators)}")
         actions = self.policy(state.map(lambda field: field[0]), as_reward(reward), observed)
         if actions.shape != (1, self.action_dimension):
             raise ValueError(f"a policy must give an action [1, {self.action_dimension}], not {list(actions.shape)}")
-        return without_prediction(state, actions[None])
+        return actions[None]
 
 
-def without_prediction(state: State, actions: Tensor) -> Plan:
-    """A plan `[B]` that has nothing but its actions `[B, T, A]`."""
-    environments, objects, positions = state.centers.shape
-    empty = state.centers.new_empty
-    return Plan(
-        actions=actions,
-        planned_actions=actions,
-        effect_codes=empty(environments, 0, 0),
-        motion_codes=empty(environments, 0, 0),
-        subgoals=state.map(lambda field: field[:, None][:, :0]),
-        segments=torch.zeros(environments, dtype=torch.int64, device=actions.device),
-        predicted_centers=empty(environments, 0, objects, positions),
-        expected_return=state.centers.new_full((environments,), torch.nan),
-        expected_success=torch.zeros(environments, dtype=torch.bool, device=actions.device),
-        candidate_centers=empty(environments, 0, 0, objects, positions),
-        candidate_returns=empty(environments, 0),
-    )
+class RandomPlanner(PolicyPlanner):
+    """Uniform random actions: each number ~ Uniform(-1, 1), normalised.
+
+    `action_dimension`: A. `segment_length`: T, the number of actions per plan. Raises ValueError if one is less than 1.
+    """
+
+    def __init__(self, segment_length: int = 3, *, action_dimension: int) -> None:
+        check_number("segment_length", segment_length, 1, whole=True)
+        check_number("action_dimension", action_dimension, 1, whole=True)
+        self.segment_length, self.action_dimension = segment_length, action_dimension
+
+    def act(self, state: State, reward: Any, generators: Sequence[torch.Generator], observed: Any) -> Tensor:
+        """Samples `[B, T, A]`."""
+        size = self.segment_length, self.action_dimension
+        return 2 * uniform_each(size, generators, state.centers.device) - 1
