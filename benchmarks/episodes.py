@@ -107,13 +107,11 @@ FARTHER = [
 LEFT_OUT = {  # an addition, and the options without it
     "nothing": (),
     "one push per plan": ("pushes_per_plan=null",),
-    "perturbed rollouts": ("planner.drop=[perturbed_rollouts]",),
     "failure avoidance": ("planner.drop=[failure_avoidance]",),
     "margin": ("margin=0",),
     "touchdown": ("planner.drop=[touchdown]",),
     "plans about the target": ("planner.drop=[nearest_objects]",),
     "first push": ("planner.drop=[first_push]",),
-    "another effect": ("planner.drop=[effect_retries]",),
     "fewer motions": ("planner.motion_share=1",),
 }
 ADDITIONS = [

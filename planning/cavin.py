@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 from torch import Generator, Tensor
@@ -15,7 +14,7 @@ from cavin_pyro.planning.focus import Focus
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import EffectModel, ModelRequirements, Plan, PlanningModel, Query, SegmentRollout
 from cavin_pyro.planning.returns import SubgoalDistance, TrackingCost, best_of, interpolate, select_segment
-from cavin_pyro.planning.rollout import Candidates, actions_of, predict_states, project
+from cavin_pyro.planning.rollout import actions_of, predict_states, project
 from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.planning.searching import SearchingPlanner, summary
 
@@ -57,7 +56,7 @@ class CavinPlanner(SearchingPlanner):
         self.motion_optimizer = make_optimizer(
             motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
         )
-        self.motion_horizon = motion_horizon
+        self.whole_horizon = motion_horizon == "full_horizon"
 
     def plan_scene(self, scene: Query) -> Plan:
         """Algorithm 1 for observed scenes `scene.state: [B]`."""
@@ -65,32 +64,24 @@ class CavinPlanner(SearchingPlanner):
         s_t, focus = scene.state, self.added("focus", Focus(), scene)
 
         # Lines 5 and 6: sample N sequences of effect codes c_{1:K}, predict their subgoals and interpolate.
-        space = EffectSpace(self.model, scene.reward.reads_features)
-        effects = self.search_by_reward(space, scene._replace(state=focus.of(s_t)))
+        effect_space = EffectSpace(self.model, scene.reward.reads_features)
+        effects = self.search_by_reward(effect_space, scene._replace(state=focus.of(s_t)))
 
         # Line 7: choose c* and its subgoals, with the highest cumulative reward.
         i = best_of(effects.returns, "returns of effect plans")
-        plan_motions = partial(self.plan_motions, scene, focus)
-        plan = plan_motions(effects, i)
-        for addition in self.additions:
-            plan = addition.revise(plan, scene=scene, effects=effects, chosen=i, plan_motions=plan_motions)
-        return plan
-
-    def plan_motions(self, scene: Query, focus: Focus, effects: Candidates, i: Tensor) -> Plan:
-        """Lines 8 to 11 for the effect plans `i: [B]` int64 among `effects: [B, N]`."""
-        chosen, T, N = effects.take(i.unsqueeze(-1)), self.segment_length, self.motion_samples
-        K = scene.segments if self.motion_horizon == "full_horizon" else 1
-        c_star, subgoals = chosen.codes[:, 0], focus.among(scene.state, chosen.states.map(lambda field: field[:, 0]))
+        chosen = effects.take(i.unsqueeze(-1))
+        c_star, subgoals = chosen.codes[:, 0], focus.among(s_t, chosen.states.map(lambda field: field[:, 0]))
         effect = ChosenEffect(subgoals, chosen.progress.segments[:, 0], chosen.progress.succeeded[:, 0])
 
         # Lines 8 and 9: sample N sequences of motion codes z_{1:K}, predict their actions and states with c*.
+        T, N, K = self.segment_length, self.motion_samples, scene.segments if self.whole_horizon else 1
         distance = self.added("subgoal_distance", SubgoalDistance(self.feature_weight), scene, K)
         tracking_cost = self.added("wrap_objective", TrackingCost(subgoals, effect.segments, distance), scene, effect)
         space = MotionSpace(self.model, c_star, focus, self.decimals, scene.reward.reads_features)
         motions = self.search(space, tracking_cost, scene, optimizer=self.motion_optimizer, segments=K, samples=N)
 
         # Line 10: choose z* and its actions a*, which lead to the states closest to the subgoals.
-        choice = Choice(scene, self.model, motions, lambda: motions.at(0, actions_of), effect, distance)
+        choice = Choice(scene, motions, lambda: motions.at(0, actions_of))
         j = best_of(self.added("rank", motions.returns, choice), "distances of motion plans to the subgoals")
         best = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = best.codes[:, 0], best.actions[:, 0], best.path[:, 0]

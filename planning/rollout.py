@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -357,18 +357,6 @@ class Candidates:
         )
         segments = (*self.segments, SegmentRecord(noise, rollout, self.score_state))
         return Candidates(self.problem, self.plans, self.score_state, segments, (*self.ancestors, None))
-
-    def rolled_out(self) -> Candidates:
-        """The same candidates and indices, each rolled out to its end, for callers that read more than the best one.
-
-        Those that were not reparameterised are returned as they are.
-        """
-        if any(segment.noise is None for segment in self.segments):
-            return self
-        # Not compiled: it happens seldom, and would be another function to compile.
-        problem = replace(self.problem, early_stopping=False, backend=eager)
-        problem.evidence.extend(self.problem.evidence)  # of the search that found them
-        return problem.evaluate(self.noise)
 
     def take(self, indices: Tensor) -> Candidates:
         """The candidates `indices: [B, m]` int64; a repeated index gives copies."""

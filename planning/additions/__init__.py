@@ -6,12 +6,10 @@ from collections.abc import Sequence
 
 from cavin_pyro.planning.additions.addition import HOOKS, Addition, Choice, ChosenEffect
 from cavin_pyro.planning.additions.early_stopping import EarlyStopping
-from cavin_pyro.planning.additions.effect_retries import EffectRetries
 from cavin_pyro.planning.additions.failure_avoidance import FailureAvoidance
 from cavin_pyro.planning.additions.first_push import FirstPush
 from cavin_pyro.planning.additions.guidance import Guidance
 from cavin_pyro.planning.additions.nearest_objects import NearestObjects
-from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts
 from cavin_pyro.planning.additions.touchdown import Touchdown
 
 __all__ = [
@@ -21,12 +19,10 @@ __all__ = [
     "Choice",
     "ChosenEffect",
     "EarlyStopping",
-    "EffectRetries",
     "FailureAvoidance",
     "FirstPush",
     "Guidance",
     "NearestObjects",
-    "PerturbedRollouts",
     "Touchdown",
     "make_additions",
 ]
@@ -38,8 +34,6 @@ ADDITIONS: dict[str, type[Addition]] = {  # in the order in which they act
     "guidance": Guidance,
     "failure_avoidance": FailureAvoidance,
     "touchdown": Touchdown,
-    "perturbed_rollouts": PerturbedRollouts,
-    "effect_retries": EffectRetries,
 }
 
 OURS = tuple(name for name in ADDITIONS if name != "guidance")  # those of `planner=cavin`

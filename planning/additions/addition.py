@@ -1,15 +1,15 @@
-"""The interface of additions to Algorithm 1: five hooks and a flag, all of which change nothing by default."""
+"""The interface of additions to Algorithm 1: four hooks and three flags, all of which change nothing by default."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.focus import Focus
-from cavin_pyro.planning.protocol import Plan, Query, SearchObjective
+from cavin_pyro.planning.protocol import Query, SearchObjective
 from cavin_pyro.planning.returns import SubgoalDistance
 from cavin_pyro.planning.rollout import Candidates
 
@@ -26,12 +26,8 @@ class Choice(NamedTuple):
     """Candidates whose first actions are known: motions at line 10, or the plans of a baseline."""
 
     scene: Query
-    model: Any  # `cavin_pyro.planning.protocol.TransitionModel`
     candidates: Candidates  # [B, N]
     first_actions: Callable[[], Tensor]  # [B, N, T, A], of the first segment
-    effect: ChosenEffect | None = None  # which motions follow; None for the plans of a baseline
-    distance: SubgoalDistance = SubgoalDistance()  # of motions to its subgoals
-    subgoals: State | None = None  # [B, N], the first subgoal of each plan of a baseline
 
 
 class Addition:
@@ -60,16 +56,5 @@ class Addition:
         """Scores `[B, N]`, of which the highest is chosen; -inf leaves a candidate out (line 10)."""
         return scores
 
-    def revise(
-        self, plan: Plan, *, scene: Query, effects: Candidates, chosen: Tensor, plan_motions: Callable[..., Plan]
-    ) -> Plan:
-        """The plan that is executed (line 11).
 
-        Args:
-            effects: `[B, N]`, of which `chosen: [B]` int64 are the plan's. plan_motions: lines 8 to 11 for other ones,
-                `plan_motions(effects, chosen)`; it advances the generators.
-        """
-        return plan
-
-
-HOOKS = ("focus", "wrap_objective", "subgoal_distance", "rank", "revise")
+HOOKS = ("focus", "wrap_objective", "subgoal_distance", "rank")

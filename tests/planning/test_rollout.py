@@ -86,14 +86,6 @@ def test_a_search_stops_early_when_no_candidate_can_be_better(toy: SimpleNamespa
     torch.testing.assert_close(places_of[1, :, 2:], places_of[1, :, 1:2].expand(-1, 2))
 
 
-def test_candidates_of_a_search_that_stopped_early_can_be_rolled_out_in_full(toy: SimpleNamespace) -> None:
-    noise = places((0, 1))
-    all_plans = search(toy, dense=False).evaluate(noise, replacement=True)
-    rolled_out = search(toy, dense=False).evaluate(noise, replacement=True, early_stopping=True).rolled_out()
-    assert torch.equal(rolled_out.returns[:, 1:], all_plans.returns[:, 1:])  # all but the copies
-    assert torch.equal(rolled_out.codes[:, 1:], all_plans.codes[:, 1:])
-
-
 def test_what_an_environment_finds_does_not_depend_on_when_others_stop_early(toy: SimpleNamespace) -> None:
     noise = places((0, 2))
     both = search(toy, dense=False).evaluate(noise, replacement=True, early_stopping=True)
