@@ -36,15 +36,12 @@ from cavin_pyro.planning.searching import SearchingPlanner, summary
 class ActionSearch(SearchingPlanner):
     """The common part of CVAE-MPC and MPC, everything but the source of actions.
 
-    stride_limits: per step; None in the paper. For the other options see
-    `SearchingPlanner`.
-
-    Samples, horizon, returns, termination and replacement, segment by segment, are Algorithm 1's.
+    For the options see `SearchingPlanner`. Samples, horizon, returns, termination and replacement, segment by segment,
+    are Algorithm 1's.
     """
 
     space: ClassVar[type]  # a `SearchSpace` that generates the actions of a segment and predicts their states with f
     has_codes: ClassVar[bool] = False  # the space searches motion codes
-    strides = "steps"
 
     def plan_scene(self, scene: Query) -> Plan:
         """Plan for observed scenes `scene.state: [B]`. There are no effect codes and no subgoals."""

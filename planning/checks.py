@@ -38,14 +38,6 @@ def check_horizon(horizon: int, segment_length: int) -> None:
         )
 
 
-def check_limits(name: str, limits: Sequence[float]) -> tuple[float, float]:
-    """The limits as a tuple. Raises ValueError unless they are two distances, in order and not negative."""
-    numbers = isinstance(limits, list | tuple) and all(isinstance(limit, int | float) for limit in limits)
-    if not numbers or len(limits) != 2 or not 0 <= limits[0] < limits[1]:
-        raise ValueError(f"{name} must be two distances, low then high, not {limits}")
-    return limits[0], limits[1]
-
-
 def check_scenes(state: State, generators: Sequence[torch.Generator], steps_left: int | None = None) -> None:
     """Raise ValueError unless `state` is a batch `[B]`, each finite and with an object and a generator of its own."""
     centers = state.centers

@@ -5,7 +5,6 @@ Paper, section 3.2; Algorithm 1, lines 6, 7 and 10. Pure functions of tensors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,10 +13,9 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.checks import NoFiniteCandidateError
-from cavin_pyro.planning.protocol import Reward, SegmentRollout, StepOutcome
+from cavin_pyro.planning.protocol import Reward, SegmentRollout
 
 REWARD_AT = ("path", "subgoals")
-STRIDE_PENALTY = -100.0  # of a step, as for a violation (published code)
 END, FIRST_PUSH = "end", "first_push"  # where motions are compared with a subgoal
 
 
@@ -82,14 +80,6 @@ def advance(progress: Progress, reward: Reward, start: Tensor, centers: Tensor, 
     return Progress(progress.returns + gained, succeeded, failed, progress.segments + progress.active)
 
 
-class LimitedStep(NamedTuple):
-    """The `StepOutcome` of steps with `StrideLimits`, in any batch `[...]`."""
-
-    reward: Tensor
-    success: Tensor
-    failure: Tensor
-
-
 @dataclass(frozen=True)
 class CumulativeReward:
     """Scores plans by the reward of all their steps, up to the one that ends a plan.
@@ -118,50 +108,6 @@ class CumulativeReward:
         most = score_state.returns + self.reward.maximum_return
         possible = torch.where(score_state.active, most, -torch.inf).amax(-1)
         return ended > possible
-
-
-@dataclass(frozen=True)
-class StrideLimits(Reward):
-    """A reward function that ends plans whose strides are implausible (published code; not in the paper).
-
-    A stride fails if every object moves less than `shortest`, or any farther than `longest`; its reward is then -100.
-    `of`: `segments`, from subgoal to subgoal, or `steps`. `positions`: P, how many numbers are a centre.
-    """
-
-    reward: Reward
-    limits: Sequence[float]  # shortest and longest
-    of: str
-    positions: int
-
-    @property
-    def reads_features(self) -> bool:
-        """As without limits."""
-        return self.reward.reads_features
-
-    @property
-    def maximum_return(self) -> float:
-        """Upper bound on any return, as without limits, which only lower returns."""
-        return self.reward.maximum_return
-
-    def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
-        """Evaluate the steps `previous: [..., T, M, P]` to `centers: [..., T, M, P]` of whole segments."""
-        outcome = self.reward(previous, centers, mask)
-        if self.of == "steps":
-            outside = self._outside(previous, centers, mask)
-        else:
-            whole = self._outside(previous[..., 0, :, :], centers[..., -1, :, :], mask[..., -1, :])
-            outside = torch.zeros_like(outcome.failure)
-            outside[..., 0] = whole  # from its first step on: no reward counts in a segment that fails
-        outside = outside & ~outcome.failure
-        return LimitedStep(
-            torch.where(outside, STRIDE_PENALTY, outcome.reward), outcome.success & ~outside, outcome.failure | outside
-        )
-
-    def _outside(self, before: Tensor, after: Tensor, mask: Tensor) -> Tensor:
-        shortest, longest = self.limits
-        strides = (after - before)[..., : self.positions].norm(dim=-1)
-        short = ((strides < shortest) | ~mask).all(-1)
-        return short | ((strides > longest) & mask).any(-1)
 
 
 def squared_distance(states: State, goals: State, *, feature_weight: float = 0.0) -> Tensor:

@@ -20,7 +20,6 @@ from cavin_pyro.planning.checks import (
     NoFiniteCandidateError,
     OptimizerError,
     check_horizon,
-    check_limits,
     check_scenes,
 )
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
@@ -35,7 +34,7 @@ from cavin_pyro.planning.protocol import (
     TransitionModel,
     as_reward,
 )
-from cavin_pyro.planning.returns import REWARD_AT, CumulativeReward, StrideLimits
+from cavin_pyro.planning.returns import REWARD_AT, CumulativeReward
 from cavin_pyro.planning.rollout import Candidates, SearchProblem
 
 # Measured: a plan of 1,024 samples fills a processor's caches; sixteen plans in one pass take 1.6 times as long per
@@ -60,9 +59,6 @@ class SearchingPlanner(ABC):
         `cavin_pyro.planning.optimizers.Optimizer`.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment (published
         implementation).
-    stride_limits: two distances; a segment that moves every object less than the first, or any object more
-        than the second, ends the plan like a violation (0.1 and 0.3 from subgoal to subgoal in the published
-        implementation); None in the paper.
     decimals: to which actions are rounded before f predicts them, so that what is executed is what was scored; None
         keeps them as they are, within [-1, 1].
     additions: to Algorithm 1, by name or objects, see `cavin_pyro.planning.additions`; none in the paper.
@@ -72,7 +68,6 @@ class SearchingPlanner(ABC):
     """
 
     requires: ClassVar[ModelRequirements]  # of the planner on its model
-    strides: ClassVar[str] = "segments"  # unit of `stride_limits`: "segments" or "steps"
     hooks: ClassVar[tuple[str, ...]] = ("wrap_objective", "rank")  # of `Addition`, which the planner calls
 
     def __init__(
@@ -84,7 +79,6 @@ class SearchingPlanner(ABC):
         shrinking_horizon: bool = False,
         optimizer: str | Optimizer = "shooting",
         reward_at: str = "path",
-        stride_limits: Sequence[float] | None = None,
         decimals: int | None = None,
         additions: Sequence[str | Addition] = (),
         compile: bool | str = False,
@@ -93,7 +87,6 @@ class SearchingPlanner(ABC):
         check_number("samples", samples, 1, whole=True)
         check_horizon(horizon, model.segment_length)
         check_choice("reward_at", reward_at, REWARD_AT)
-        self.stride_limits = None if stride_limits is None else check_limits("stride_limits", stride_limits)
         self.optimizer = make_optimizer(optimizer, samples=samples)
         self.additions = make_additions(additions, self.hooks)
         self.backend = make_backend(compile, model.fixed_shapes if isinstance(model, FixedShapes) else nullcontext)
@@ -187,10 +180,7 @@ class SearchingPlanner(ABC):
 
     def search_by_reward(self, space: SearchSpace, scene: Query) -> Candidates:
         """Candidates `[B, N]` of K segments, searched by cumulative reward."""
-        reward, limits = scene.reward, self.stride_limits
-        if limits is not None:
-            reward = StrideLimits(reward, limits, self.strides, scene.state.centers.shape[-1])
-        objective = self.added("wrap_objective", CumulativeReward(reward, self.reward_at), scene, None)
+        objective = self.added("wrap_objective", CumulativeReward(scene.reward, self.reward_at), scene, None)
         return self.search(space, objective, scene, early_stopping=self.early_stopping)
 
     def added(self, hook: str, value: Value, *arguments: Any) -> Value:

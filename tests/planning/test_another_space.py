@@ -78,7 +78,7 @@ def test_a_model_learns_and_plans(kind: Any, model: str, guide: str, objects: in
         unused = [name for name, one in program.named_parameters() if one.grad is None]
         assert not unused or (objects == 1 and all("relation" in name or "difference" in name for name in unused))
     assert loss.isfinite()
-    planner = kind(programs[0].requires_grad_(False), samples=8, horizon=6, stride_limits=[0.0, 5.0])
+    planner = kind(programs[0].requires_grad_(False), samples=8, horizon=6)
     plan = planner.plan(states.step(0), reward=Last(features), generators=generators(0, 1, 2, 3))
     assert plan.actions.shape == (4, 3, 3) and plan.actions.abs().amax() <= 1
     assert plan.predicted_centers.shape[-2:] == (objects, 2)

@@ -83,17 +83,6 @@ def test_reward_at_subgoals_does_not_see_what_happens_on_the_way(toy: SimpleName
     assert line(plan.subgoals.centers) == [-0.25, 1.25]
 
 
-def test_subgoals_outside_the_stride_limits_end_plans_as_violations_do(toy: SimpleNamespace) -> None:
-    # Plan 0 hardly moves, plan 2 jumps onto the goal: both are replaced by copies of plan 1, and die once more.
-    effects = [[0.0625, 0.5, 1.5], [0.0625, 0.25, 1.5]]
-    options: dict = {"stride_limits": [0.1, 1.0]}
-    plan = replay(toy, effects, MOTIONS, **options)
-    assert plan.candidate_returns.tolist() == [[-2.0 - 100.0, -4.0, -2.0 - 100.0]]
-    assert replay(toy, effects, MOTIONS).expected_return.tolist() == [99.0 - 1.0]  # without limits: at once
-    plan = replay(toy, effects, MOTIONS, reward_at="subgoals", **options)
-    assert plan.candidate_returns.tolist() == [[-1.0 - 100.0, -2.0, -1.0 - 100.0]]
-
-
 def test_first_segment_compares_the_first_segment_only(toy: SimpleNamespace) -> None:
     plan = replay(toy, EFFECTS, MOTIONS[:1], motion_horizon="first_segment")
     assert plan.motion_codes[0, :, 0].tolist() == [0.0]

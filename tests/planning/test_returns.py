@@ -1,4 +1,4 @@
-"""Returns, where rewards are taken, stride limits, and the choice among candidates."""
+"""Returns, where rewards are taken, and the choice among candidates."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
-from cavin_pyro.planning import CavinPlanner, RewardFunction, StepOutcome, returns
+from cavin_pyro.planning import RewardFunction, StepOutcome, returns
 from cavin_pyro.planning.protocol import as_reward
-from cavin_pyro.planning.returns import StrideLimits
 
 POSITIONS = st.floats(-2.0, 2.0, width=32)
 
@@ -90,41 +88,6 @@ def test_a_plan_that_leaves_the_numbers_fails_whatever_the_reward_says(toy: Simp
         assert lost.returns == -torch.inf
         assert lost.failed
         assert not lost.succeeded
-
-
-def way(*x: float, objects: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-    """States before and after T steps of objects of which the first goes along x and the others stay."""
-    centers = torch.zeros(len(x), objects, 3)
-    centers[:, 0, 0] = torch.tensor(x)
-    return centers[:-1], centers[1:], torch.ones(len(x) - 1, objects, dtype=torch.bool)
-
-
-@pytest.mark.parametrize(
-    ("x", "failures"),
-    [
-        ((0.0, 0.1, 0.2, 0.3), [False, False, False]),
-        ((0.0, 0.01, 0.02, 0.03), [True, False, False]),  # all objects less than 0.1 m
-        ((0.0, 0.2, 0.4, 0.6), [True, False, False]),  # an object more than 0.5 m
-        ((0.0, 0.4, 0.8, 0.2), [False, False, False]),  # only the ends of the segment matter
-    ],
-)
-def test_strides_of_segments(toy: SimpleNamespace, x: tuple[float, ...], failures: list[bool]) -> None:
-    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.1, 0.5], of="segments", positions=3)
-    outcome = limited(*way(*x))
-    assert outcome.failure.tolist() == failures
-    assert (outcome.reward[outcome.failure] == -100.0).all()
-    assert torch.equal(outcome.reward[1:], toy.Hill((0.0, 0.0))(*way(*x)).reward[1:])
-
-
-def test_strides_of_pushes(toy: SimpleNamespace) -> None:
-    limited = StrideLimits(toy.Hill((0.0, 0.0)), [0.01, 0.15], of="steps", positions=3)
-    assert limited(*way(0.0, 0.005, 0.105, 0.305)).failure.tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize("limits", [[0.3], [0.3, 0.1], [-0.1, 0.3], 3, ["a", "b"]])
-def test_bad_limits_are_one_clear_line(toy: SimpleNamespace, limits: object) -> None:
-    with pytest.raises(ValueError, match="^stride_limits must be two distances, low then high, not "):
-        CavinPlanner(toy.PointMass(), stride_limits=limits)  # type: ignore[arg-type]
 
 
 NAN, INF = torch.nan, torch.inf

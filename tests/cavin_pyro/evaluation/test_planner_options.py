@@ -106,7 +106,6 @@ def test_every_planner_plans_with_every_optimizer(
     ("planner", "option"),
     [
         ("cavin", "planner.reward_at=subgoals"),
-        ("cavin", "planner.stride_limits=[0.1,0.3]"),
         ("cavin", "planner.optimizer.replacement=false"),
         ("cavin", "planner.motion_optimizer=cem"),
         ("cavin", "planner.drop=[early_stopping]"),
@@ -116,7 +115,6 @@ def test_every_planner_plans_with_every_optimizer(
             "matmul_precision=bfloat16",
             marks=pytest.mark.skipif(not multiplies_in_bfloat16(), reason="the processor has no bfloat16"),
         ),
-        ("mpc", "planner.stride_limits=[0.01,0.15]"),
     ],
 )
 def test_options_take_effect(planner: str, option: str) -> None:
