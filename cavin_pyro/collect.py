@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 from cavin_pyro.config.application import DictConfig, command
@@ -11,12 +10,13 @@ from cavin_pyro.config.application import DictConfig, command
 
 @command("collect")
 def main(config: DictConfig) -> None:
-    """Collect pushes by the heuristic policy into a dataset folder, with their statistics.
+    """Collect pushes by the heuristic policy into a dataset folder.
 
     In another world than the tabletop, episodes of its own policy. Resumes an interrupted run.
     """
     from cavin_pyro.config.errors import UserError
     from cavin_pyro.data.collection import collect, repair
+    from cavin_pyro.data.dataset import iterate_shards
     from cavin_pyro.storage.files import output_folder
 
     collection = _collection(config)
@@ -24,7 +24,8 @@ def main(config: DictConfig) -> None:
         if config.repair:
             print(f"{repair(collection, folder, workers=config.workers)} files collected again")
         metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
-        if lost := metadata["episodes"] - _summarized(folder, metadata):
+        whole = sum(len(arrays["episode"]) for _, arrays in iterate_shards(folder, (), skip_corrupt=True))
+        if lost := metadata["episodes"] - whole:
             raise UserError(
                 f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "
                 "run the same command with repair=true, which collects them again"
@@ -57,19 +58,6 @@ def _collection(config: DictConfig) -> Any:
         world.policy(default_rng())
     section: Any = OmegaConf.to_container(config.world)
     return WorldCollection(section, **own)
-
-
-def _summarized(folder: Path, metadata: dict[str, Any]) -> int:
-    """Write statistics of a dataset of the tabletop; returns how many episodes could be read."""
-    from cavin_pyro.data.dataset import iterate_shards
-    from cavin_pyro.data.summary import summarize_data
-    from cavin_pyro.storage.files import write_json
-
-    if "world" in metadata["configuration"]:
-        return sum(len(arrays["episode"]) for _, arrays in iterate_shards(folder, (), skip_corrupt=True))
-    figures = summarize_data(folder)
-    write_json(folder / "statistics.json", figures)
-    return int(figures["episodes"])
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from cavin_pyro.storage.run_directory import write_config
 
 ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
-RESULTS = {"collect": "statistics.json", "pretrain": "metrics.json", "train": "training.png"}  # written last
+RESULTS = {"pretrain": "metrics.json", "train": "training.png"}  # written last; collect itself knows a whole dataset
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def checkpoint_of(cell: Cell, home: Path, models: str | None) -> Path:
 
 def run_stages(stages: Sequence[Stage], workers: int) -> None:
     """Run what is unfinished in their order, `workers` at a time; a UserError: one has failed."""
-    unfinished = [stage for stage in stages if not (stage.folder / RESULTS[stage.command]).exists()]
+    unfinished = [stage for stage in stages if not (stage.folder / RESULTS.get(stage.command, "")).is_file()]
     with (
         closing(run_jobs(run_stage, unfinished, workers)) as finished,
         progress_bar(stages[-1].command, total=len(unfinished), unit="run") as bar,

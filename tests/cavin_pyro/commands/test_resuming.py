@@ -32,7 +32,7 @@ COMMANDS = {
     "collect": Resuming(
         "transitions=16 steps=2 episodes_per_shard=2 seed=5 workers=1",
         *("episodes-00001.h5", 0),
-        ("episodes-*.h5", "metadata.json", "statistics.json"),
+        ("episodes-*.h5", "metadata.json"),
         "episodes-00000.h5",
     ),
     "pretrain": Resuming(
