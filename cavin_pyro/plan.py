@@ -7,11 +7,10 @@ from cavin_pyro.config.application import DictConfig, Figures, command
 
 @command("plan")
 def main(config: DictConfig) -> Figures:
-    """Run one closed-loop episode from segmented depth images, and write its table, pictures and video."""
+    """Run one closed-loop episode from segmented depth images, and write its table, picture and video."""
     import copy
 
     from cavin_pyro.config.device import choose_device
-    from cavin_pyro.envs.tabletop.pushing import PushingEnv
     from cavin_pyro.evaluation.factory import make_runner
     from cavin_pyro.evaluation.statistics import counted, plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
@@ -21,19 +20,19 @@ def main(config: DictConfig) -> Figures:
 
     config.device = choose_device(config.device).type
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "video", "planner.compile"))
+        check_same_run(folder, config, ignore=("output", "video", "video_format", "planner.compile"))
+        video = config.video_format if config.video else None
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
-        row = render_episode(runner, folder, seed=config.seed, video=config.video)
+        row = render_episode(runner, folder, seed=config.seed, video=video)
         runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
-        steps = ("push", "pushes") if isinstance(runner.env, PushingEnv) else ("step", "steps")
-        pushes = counted(row["steps"], *steps)
+        steps = counted(row["steps"], *runner.env.step_names)
         idle = f", {row['ineffective']} of which moved nothing" if row["ineffective"] else ""
-        print(f"{runner.env.name}: {row['outcome']} after {pushes}{idle}, return {row['return']:.1f}")
+        print(f"{runner.env.name}: {row['outcome']} after {steps}{idle}, return {row['return']:.1f}")
         if said := plan_summary([row], config):
             print(said)
-        for name in episode_files(video=config.video):
+        for name in episode_files(video):
             if (folder / name).exists():
                 print(f"  {folder / name}")
         return {name: row[name] for name in ("outcome", "steps", "return")}

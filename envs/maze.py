@@ -21,6 +21,7 @@ from cavin_pyro.models.state import State
 REPEAT = 10  # steps of the simulator, 0.01 s each, in one step of the environment
 REACHED = 0.45  # metres from the goal, as published
 PIXELS = 50  # of a metre in pictures
+FORCE = 0.6  # metres in pictures, of the largest force
 
 Cell = tuple[int, int]
 Ways = dict[tuple[Cell, Cell], list[Cell]]
@@ -126,6 +127,20 @@ class Maze(World):
         """See `World`."""
         maze = self._simulator.maze
         return PIXELS * (np.asarray(centers) * (1, -1) + (maze.x_map_center, maze.y_map_center))
+
+    @property
+    def names(self) -> list[str]:
+        """See `World`."""
+        return ["ball"]
+
+    @property
+    def landmarks(self) -> dict[str, NDArray[np.floating]]:
+        """See `World`."""
+        return {"goal": self.place}
+
+    def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
+        """See `World`: the force on the ball."""
+        return np.stack([centers[:, 0], centers[:, 0] + FORCE * actions], axis=1)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw walls, goal and ball in mode rgb_array; the simulator's own pictures need OpenGL."""

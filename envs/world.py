@@ -61,6 +61,7 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     goal        of the current episode
     policy      that collects; by default random actions, each for a while
     pixels      where positions lie in the picture of `render`, for drawings; None: they are drawn on axes
+    names, landmarks, arrows    what drawings call objects and places, and how they show actions
 
     A caller may set `render_mode`, and `on_frame`, which a world may call during a step, to film it. A world that
     `sees_clouds` needs a checkpoint's `geometry` for its states.
@@ -71,6 +72,7 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     objects: int
     maximum_steps: int
     on_frame: Callable[[], None] | None = None
+    step_names: ClassVar[tuple[str, str]] = ("step", "steps")
     sees_clouds = False
     geometry: Geometry | None = None
 
@@ -109,6 +111,20 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64] | None:
         """Columns and rows `[..., 2]` of positions `[..., P]` in the picture of `render`."""
+        return None
+
+    @property
+    def names(self) -> list[str]:
+        """What drawings call the objects; "" for a tool, whose paths are not drawn."""
+        return [f"object {number}" for number in range(self.objects)]
+
+    @property
+    def landmarks(self) -> dict[str, NDArray[np.floating]]:
+        """Names that drawings write, such as that of the goal, and the position `[P]` of each."""
+        return {}
+
+    def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating] | None:
+        """Starts and ends `[T, 2, P]` by which drawings show actions `[T, A]`, each done at `centers: [T, M, P]`."""
         return None
 
 

@@ -257,6 +257,7 @@ class PlanConfig(EpisodeConfig):
 
     output: str | None = option(None, "folder for the results; by default one in runs/")
     video: bool = option(True, "write a video of the episode")
+    video_format: str = option("mp4", "of the video; gif and webp move on web pages", choices=("mp4", "gif", "webp"))
 
 
 @dataclass

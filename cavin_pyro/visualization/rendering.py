@@ -1,23 +1,22 @@
-"""Episode rendering: progress on the screen, a table of steps, pictures of the plans, and a video."""
+"""Episode rendering: progress on the screen, a table of steps, a picture of the plans, and a video."""
 
 from __future__ import annotations
 
 import csv
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
+from cavin_pyro.envs.world import World
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.visualization.plan import draw_plan
-from cavin_pyro.visualization.video import episode_video
-from cavin_pyro.visualization.world import render_world
+from cavin_pyro.visualization.drawing import draw_episode
+from cavin_pyro.visualization.video import Film
 
 SAID = {  # of a push, for people
     "success": "goal reached",
@@ -33,10 +32,10 @@ PLAN_COLUMNS = (
 
 
 class EpisodeProgress(EpisodeCallback):
-    """Prints each push: number, what happened, reward, the time of the plan that it began, and what is left."""
+    """Prints each step: number, what happened, reward, the time of the plan that it began, and what is left."""
 
-    def __init__(self, maximum_steps: int) -> None:
-        self.maximum_steps = maximum_steps  # pushes after which the episode ends
+    def __init__(self, world: World) -> None:
+        self._maximum, self._step = world.maximum_steps, world.step_names[0]
         self._began: float | None = None
         self._planned: PlanRecord | None = None  # a plan whose first push is not made yet
 
@@ -48,7 +47,7 @@ class EpisodeProgress(EpisodeCallback):
 
     def on_transition(self, transition: Transition) -> None:
         assert self._began is not None
-        left, rest = self.maximum_steps - transition.step, "the last"
+        left, rest = self._maximum - transition.step, "the last"
         if left and not (transition.success or transition.violation or transition.fall):
             seconds = left * (time.perf_counter() - self._began) / transition.step
             rest = f"at most {left} left, " + (f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min")
@@ -56,30 +55,31 @@ class EpisodeProgress(EpisodeCallback):
         if record is not None:
             planned = f"planned in {record.milliseconds / 1e3:.2f} s{record.prospect}"
         what = next((text for flag, text in SAID.items() if getattr(transition, flag)), "moved")
-        line = f"push {transition.step:>2}: {what:<16} reward {transition.reward:6.2f}   {planned}   {rest}"
+        line = f"{self._step} {transition.step:>2}: {what:<16} reward {transition.reward:6.2f}   {planned}   {rest}"
         print(line, flush=True)
         self._planned = None
 
 
-def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: bool) -> dict[str, Any]:
-    """Run one episode, print its pushes and write `episode_files` about it; returns its results' row."""
+def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: str | None) -> dict[str, Any]:
+    """Run one episode, print its steps and write `episode_files` about it; returns its results' row.
+
+    Args:
+        video: format of the film, `mp4`, `gif` or `webp`; none is written of a world without pictures.
+    """
     env = runner.env
-    if not isinstance(env, PushingEnv):
-        return render_world(runner, folder, seed=seed, video=video)
-    with ExitStack() as stack:
-        callbacks: list[EpisodeCallback] = [EpisodeProgress(env.maximum_steps)]
-        if video:
-            callbacks.append(stack.enter_context(episode_video(folder / "episode.mp4", env, env.task)))
-        episode = runner.rollout(seed, photograph=True, callbacks=callbacks)
-    write_steps(folder / "steps.csv", episode)
-    draw_plan(folder / "plan.png", episode, env.task, env.scene.camera)
-    draw_plan(folder / "plan-above.png", episode, env.task, None)
+    film = Film(env) if video and env.render_mode is not None else None
+    episode = runner.rollout(seed, photograph=True, callbacks=[EpisodeProgress(env), *([film] if film else [])])
+    if isinstance(env, PushingEnv):
+        write_steps(folder / "steps.csv", episode)
+    draw_episode(folder / "plan.png", episode, env)
+    if film:
+        film.write(folder / f"episode.{video}", episode)
     return episode_row(episode)
 
 
-def episode_files(*, video: bool) -> list[str]:
+def episode_files(video: str | None) -> list[str]:
     """Names of the files that `render_episode` writes."""
-    return ["steps.csv", "plan.png", "plan-above.png"] + ["episode.mp4"] * video
+    return ["steps.csv", "plan.png", *([f"episode.{video}"] if video else [])]
 
 
 def write_steps(path: Path, episode: Episode) -> None:

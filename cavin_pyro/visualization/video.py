@@ -1,30 +1,43 @@
-"""A video of an episode, with the current plan drawn over the frames."""
+"""A film of an episode, with the current plan drawn over its pictures: MP4, or GIF or WebP for web pages."""
 
 from __future__ import annotations
 
 import errno
+import sys
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import imageio.v2 as imageio
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
-from cavin_pyro.envs.tabletop.pushing import VIDEO_SIZE, ObservationDict, PushingEnv
-from cavin_pyro.envs.tabletop.tasks import Task
+from cavin_pyro.envs.world import World
 from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord
 from cavin_pyro.storage.files import atomic_write
-from cavin_pyro.visualization.plan import draw_overlay, return_scale
-from cavin_pyro.visualization.training import DOTS_PER_INCH
+from cavin_pyro.visualization.drawing import (
+    FONT,
+    LEGEND,
+    REACHED,
+    draw_paths,
+    draw_plan,
+    draw_target,
+    empty_rows,
+    ending,
+    legend,
+    title,
+    trail,
+)
 
 FRAMES_PER_SECOND = 10
-PAUSE = 0.5  # seconds for which a new plan is shown before its execution
-CAPTION_HEIGHT = 22  # pixels
+PAUSE = 6  # frames for which a new plan is shown before its execution
+LAST = 15  # frames for which the end is shown
+HEADER, FOOTER = 34, 30  # pixels above and below the picture, for title and legend
+WIDTH = 6.6  # inches in which the legend fits
 FORMAT: dict[str, Any] = {
     "format": "FFMPEG",
     "fps": FRAMES_PER_SECOND,
@@ -36,80 +49,108 @@ FORMAT: dict[str, Any] = {
 }
 
 
-@contextmanager
-def episode_video(path: Path, env: PushingEnv, task: Task) -> Iterator[EpisodeVideo]:
-    """Yield a video of an episode; the H.264 file, which browsers play, takes its place at the end, atomically."""
-    with atomic_write(path) as temporary:
-        writer = imageio.get_writer(temporary, mode="I", **FORMAT)
-        try:
-            yield EpisodeVideo(writer, env, task)
-        except OSError as error:  # from imageio, and without a number
-            if error.errno is not None:
-                raise
-            raise OSError(errno.EIO, "ffmpeg stopped, is the disk full?", str(path)) from error
-        finally:
-            writer.close()
+class Shot(NamedTuple):
+    """A compressed picture, the plan under which it was taken, the steps before it, and how many frames it stays."""
+
+    picture: bytes
+    plan: int
+    steps: int
+    frames: int
 
 
-class EpisodeVideo(EpisodeCallback):
-    """Appends photographs of an episode with an overlay to an open writer of frames; made by `episode_video`."""
+class Film(EpisodeCallback):
+    """Keeps a world's pictures of an episode; `write` draws over them when it is known how the episode ends.
 
-    def __init__(self, writer: Any, env: PushingEnv, task: Task) -> None:
-        self._writer, self._scene, self._task = writer, env.scene, task
-        self.camera = env.scene.camera.resized(*VIDEO_SIZE)
-        self._record: PlanRecord | None = None
-        self._reached: list[NDArray[np.float32]] = []
-        self._overlay: Image.Image | None = None
-        self._font = ImageFont.load_default(14)
+    Attributes:
+        empty: rows above that no picture uses, which are left out.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._shots: list[Shot] = []
+        self._plans, self._steps = 0, -1  # the first observation is before the first step
+        self.empty = sys.maxsize
 
     def on_plan(self, record: PlanRecord) -> None:
-        """Draw this plan over the frames that follow, and show its photograph, if any, for half a second."""
-        self._record, self._reached, self._overlay = record, [], None
-        if record.photograph is not None:
-            self._add(record.photograph, "planned", repeat=round(PAUSE * FRAMES_PER_SECOND))
+        self._plans += 1
+        self._keep(PAUSE)
 
-    def on_observation(self, observation: ObservationDict) -> None:
-        """Draw the observed centres after a push over the frames that follow."""
-        if self._record is not None:
-            self._reached.append(observation["centers"])
-            self._overlay = None
+    def on_observation(self, observation: Any) -> None:
+        self._steps += 1
+        if self._steps:
+            self._keep(2)
 
     def on_frame(self) -> None:
-        self._add(self._scene.photograph(self.camera), "pushing")
+        self._keep(1)
 
     def on_end(self, episode: Episode) -> None:
-        """Show the outcome for a second."""
-        self._add(self._scene.photograph(self.camera), episode.outcome, repeat=FRAMES_PER_SECOND)
+        self._keep(LAST)
 
-    def _add(self, frame: NDArray[np.uint8], phase: str, *, repeat: int = 1) -> None:
-        """Append a photograph [H, W, 3] with overlay and caption."""
-        image = Image.fromarray(np.ascontiguousarray(frame))
-        if self._overlay is None:
-            self._overlay = self._draw_overlay(*image.size)
-        image.paste(self._overlay, mask=self._overlay)
-        draw = ImageDraw.Draw(image)
-        draw.rectangle((0, 0, image.width, CAPTION_HEIGHT), fill="white")
-        draw.text((8, 3), self._caption(phase), fill="black", font=self._font)
-        for _ in range(repeat):
-            self._writer.append_data(np.asarray(image))
+    def _keep(self, frames: int) -> None:
+        picture = np.ascontiguousarray(self._world.render())
+        self._size, self.empty = picture.shape, min(self.empty, empty_rows(picture))
+        self._shots.append(Shot(zlib.compress(picture.tobytes(), 1), self._plans - 1, self._steps, frames))
 
-    def _caption(self, phase: str) -> str:
-        if self._record is None:
-            return f"{self._task.name} · {phase}"
-        first = self._record.step + 1
-        last = self._record.step + self._record.plan.actions.shape[1]
-        numbers = f"push {first}" if first == last else f"pushes {first} to {last}"
-        return f"{self._task.name} · {numbers} · {phase}"
+    def write(self, path: Path, episode: Episode) -> None:
+        """Write the file, whose ending says its format; it takes its place at the end, atomically."""
+        with atomic_write(path) as temporary:
+            if path.suffix == ".mp4":
+                _write_mp4(temporary, self._frames(episode))
+            else:
+                pictures, times = zip(*self._frames(episode), strict=True)
+                first, *rest = map(Image.fromarray, pictures)
+                duration = [1000 * frames // FRAMES_PER_SECOND for frames in times]  # milliseconds
+                first.save(
+                    temporary, save_all=True, append_images=rest, duration=duration, loop=0, quality=80, method=4
+                )
 
-    def _draw_overlay(self, width: int, height: int) -> Image.Image:
-        """Everything that stays the same until the next push, as a transparent image."""
-        figure = Figure(figsize=(width / DOTS_PER_INCH, height / DOTS_PER_INCH), dpi=DOTS_PER_INCH, facecolor="none")
+    def _frames(self, episode: Episode) -> Iterator[tuple[NDArray[np.uint8], int]]:
+        """Each frame [H, W, 3], and for how many frames it stays."""
+        known = None
+        for shot in self._shots:
+            ended = shot is self._shots[-1]
+            if known != (known := (shot.plan, shot.steps, ended)):
+                overlay = self._overlay(episode, episode.plan_records[shot.plan], shot.steps, ended=ended)
+            picture = np.frombuffer(zlib.decompress(shot.picture), np.uint8).reshape(self._size)[self.empty :]
+            image = Image.new("RGB", overlay.size, "white")
+            image.paste(Image.fromarray(picture), (0, HEADER))
+            image.paste(overlay, mask=overlay)
+            yield np.asarray(image), shot.frames
+
+    def _overlay(self, episode: Episode, record: PlanRecord, steps: int, *, ended: bool) -> Image.Image:
+        """Everything that stays the same until the next step, as a transparent image."""
+        rows, columns, _ = self._size
+        shown = rows - self.empty
+        height, width = shown + HEADER + FOOTER, columns
+        height, width = height + height % 2, width + width % 2  # as yuv420p wants
+        figure = Figure(figsize=(WIDTH, WIDTH * height / width), dpi=width / WIDTH, facecolor="none")
         canvas = FigureCanvasAgg(figure)
-        panel = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(height, 0))
+        box = (0.0, 1 - (HEADER + shown) / height, columns / width, shown / height)
+        panel = figure.add_axes(box, xlim=(0, columns), ylim=(rows, self.empty))
         panel.set_axis_off()
-        if self._record is not None:
-            scale = return_scale(self._record.plan.candidate_returns[0].numpy())
-            reached = np.array(self._reached, dtype=np.float32).reshape(-1, *self._record.centers.shape)
-            draw_overlay(panel, self._record, self._task, self.camera.resized(width, height), scale, reached)
+        if not ended:
+            draw_plan(panel, self._world, record)
+        centers = trail(episode, steps)
+        draw_target(panel, self._world, centers[-1] if steps else record.centers)
+        draw_paths(panel, self._world, episode.plan_records[0], centers, REACHED)
+        said = ending(self._world, episode) if ended else title(self._world, record, len(episode.transitions))
+        figure.text(0.5, 1 - HEADER / 2 / height, said, ha="center", va="center", fontsize=FONT + 1)
+        handles = legend(self._world, episode.plan_records)
+        figure.legend(handles=handles, loc="lower center", ncols=len(handles), **LEGEND)
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba()))
+
+
+def _write_mp4(path: Path, frames: Iterator[tuple[NDArray[np.uint8], int]]) -> None:
+    """H.264, which browsers play."""
+    writer = imageio.get_writer(path, mode="I", **FORMAT)
+    try:
+        for frame, times in frames:
+            for _ in range(times):
+                writer.append_data(frame)
+    except OSError as error:  # from imageio, and without a number
+        if error.errno is not None:
+            raise
+        raise OSError(errno.EIO, "ffmpeg stopped, is the disk full?", str(path)) from error
+    finally:
+        writer.close()

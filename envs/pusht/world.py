@@ -236,6 +236,20 @@ class PushT(World):
         """See `World`."""
         return np.asarray(centers, dtype=np.float64) * (PICTURE / SIZE)
 
+    @property
+    def names(self) -> list[str]:
+        """See `World`."""
+        return ["T", ""]
+
+    @property
+    def landmarks(self) -> dict[str, NDArray[np.floating]]:
+        """See `World`."""
+        return {"goal": self.pose[2:4]}
+
+    def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
+        """See `World`: from the disc to its target."""
+        return np.stack([centers[:, 1], centers[:, 1] + REACH * actions], axis=1)
+
     def coverage(self) -> float:
         """The part of the goal's area that the block covers, from 0 to 1."""
         block = self._simulator.block

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from cavin_pyro.envs.tabletop.workspace import (
     SPACE,
     TILE_SIDE,
     object_slots,
+    push_endpoints,
     tile_center,
 )
 from cavin_pyro.envs.world import Geometry, World
@@ -40,7 +42,13 @@ from cavin_pyro.models.state import State
 EPISODE_STEPS = 60
 TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may start, on each axis
 OBSTACLE_JITTER = TILE_SIDE / 2  # metres; obstacles start anywhere on their tiles
-VIDEO_SIZE = (512, 424)  # pixels
+SPECTATOR = Camera(  # opposite the robot, for pictures
+    width=800,
+    height=450,
+    position=(1.5, 0.0, 1.25),
+    rotation=(1.03989, 0.0, 2.96450),
+    intrinsics_offset=(225.0, 225.0, 0.0, 30.0),
+)
 
 ObservationDict = dict[str, NDArray[Any]]
 
@@ -80,6 +88,7 @@ class PushingEnv(Uncopied, World):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     space = SPACE
+    step_names = ("push", "pushes")
     features = 64  # of `geometry`, which makes them of the clouds
     sees_clouds = True
 
@@ -208,10 +217,29 @@ class PushingEnv(Uncopied, World):
         return _as_dict(observation), sum(terms.values()), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a colour image of the table [424, 512, 3] in mode rgb_array."""
-        if self.render_mode != "rgb_array":
-            return None
-        return self.scene.photograph(self.scene.camera.resized(*VIDEO_SIZE))
+        """Return a colour image of the table [450, 800, 3] in mode rgb_array, as one sees it who faces the robot."""
+        return self.scene.photograph(SPECTATOR) if self.render_mode == "rgb_array" else None
+
+    def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
+        """See `World`."""
+        return SPECTATOR.project(centers)
+
+    @property
+    def names(self) -> list[str]:
+        """See `World`: "can" of ycb/tomato_soup_can."""
+        return [re.split("[_/]", one.name)[-1].removesuffix("s") for one in self.scene.objects]
+
+    @property
+    def landmarks(self) -> dict[str, NDArray[np.floating]]:
+        """See `World`: at the lower edge of a single tile, of several tiles beside the one nearest to the spectator."""
+        groups = self.task.tile_groups()
+        places = {one.name: (*max(one.tiles), *((0.4, 0) if len(one.tiles) == 1 else (0, 1.1))) for one in groups}
+        return {name: np.array([*tile_center((i + k, j + l)), 0.0]) for name, (i, j, k, l) in places.items()}
+
+    def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
+        """See `World`: the tool's paths on the table."""
+        ends = np.stack(push_endpoints(actions), axis=1)
+        return np.concatenate([ends, np.zeros_like(ends[..., :1])], axis=-1)
 
     @property
     def name(self) -> str:

@@ -43,7 +43,7 @@ LEFT = {  # files that each command leaves
     "features": {"config.yaml", "metrics.csv", "metrics.json", "pointnet.safetensors"},
     "run": {"config.yaml", "metrics.csv", "metrics.json", "checkpoint.safetensors", "training.png"},
     "report": {"config.yaml", "report.html"},
-    "episode": {"config.yaml", "results.json", "steps.csv", "plan.png", "plan-above.png", "episode.mp4"},
+    "episode": {"config.yaml", "results.json", "steps.csv", "plan.png", "episode.mp4"},
     "evaluation": {"config.yaml", "results.json", "results.txt", "episodes.jsonl"},
 }
 

@@ -23,7 +23,7 @@ from cavin_pyro.planning import CavinPlanner
 from cavin_pyro.planning.additions import FirstPush
 from cavin_pyro.planning.optimizers import OPTIMIZERS
 from cavin_pyro.storage.checkpoint import save
-from cavin_pyro.visualization.plan import draw_plan
+from cavin_pyro.visualization.drawing import draw_episode
 
 rollout = partial(cavin_pyro.rollout, pushes_per_plan=None)  # executes all T pushes of a plan
 FITTING = {
@@ -98,7 +98,7 @@ def test_every_planner_plans_with_every_optimizer(
     assert plan.actions.shape == (1, 3, 4)
     assert plan.actions.isfinite().all()
     assert plan.candidate_centers.shape[2:] == (2, 2, 3)
-    draw_plan(tmp_path / "plan.png", episode, parts.env.task, parts.env.scene.camera)
+    draw_episode(tmp_path / "plan.png", episode, parts.env)
     parts.env.close()
 
 

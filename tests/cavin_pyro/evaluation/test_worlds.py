@@ -18,7 +18,7 @@ from cavin_pyro.evaluation.rollout import rollout
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.planning import CavinPlanner, RandomPlanner
 from cavin_pyro.storage.checkpoint import save
-from cavin_pyro.visualization.world import render_world
+from cavin_pyro.visualization.rendering import render_episode
 from tests.cavin_pyro.data.point import Point
 
 TARGET = "env._target_=tests.cavin_pyro.data.point.Point"
@@ -79,7 +79,7 @@ def test_an_episode_is_drawn_over_the_worlds_picture_or_on_axes(tmp_path: Path, 
     env = world()
     env.render_mode = "rgb_array" if world is Drawn else None
     runner = EpisodeRunner(env, CavinPlanner(model(), samples=8, horizon=6), 3)
-    row = render_world(runner, tmp_path, seed=1, video=True)
+    row = render_episode(runner, tmp_path, seed=1, video="mp4")
     assert row["outcome"] in ("success", "timeout")
     assert matplotlib.image.imread(tmp_path / "plan.png").std() > 0.01
     assert (tmp_path / "episode.mp4").exists() == (world is Drawn)

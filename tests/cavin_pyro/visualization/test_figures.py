@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -11,29 +11,27 @@ import torch
 from matplotlib import colors
 from numpy.typing import NDArray
 
-from cavin_pyro.envs.tabletop.layouts import load_task
-from cavin_pyro.envs.tabletop.scene import COLORS
-from cavin_pyro.envs.tabletop.sensors.camera import Camera
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.evaluation.rollout import Episode, PlanRecord, Transition
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import Plan, RandomPlanner
 from cavin_pyro.planning.protocol import Evidence
-from cavin_pyro.visualization import plan as figures_plan
+from cavin_pyro.visualization import drawing
 from cavin_pyro.visualization import training as figures
-from cavin_pyro.visualization.overlay import (
-    PREDICTION_COLOR,
-    SUBGOAL_COLOR,
-    candidate_subgoals,
-    predicted_paths,
-    subgoal_chains,
-)
-from cavin_pyro.visualization.plan import FAILURE_COLOR, SUCCESS_COLOR, Map, draw_plan
+from cavin_pyro.visualization.drawing import PREDICTED, SUBGOALS, candidate_subgoals, draw_episode, object_paths
 from cavin_pyro.visualization.rendering import write_steps
 from cavin_pyro.visualization.training import draw_training
 
-CAMERA = Camera().resized(512, 424)
 OBJECTS, ROOM, K, T, N = 3, 5, 4, 3, 40  # the plan knows of 3 objects, the observation has room for 5
 TARGET = (0.50, 0.10)  # metres
+
+
+@pytest.fixture(scope="module", params=["clearing", "crossing"])
+def world(request: pytest.FixtureRequest) -> Iterator[PushingEnv]:
+    env = PushingEnv(task=request.param, objects=OBJECTS)
+    env.reset(seed=0)
+    yield env
+    env.close()
 
 
 def seen_centers() -> NDArray[np.float32]:
@@ -72,7 +70,7 @@ def made_up_plan(segments: int = 2) -> Plan:
 
 
 def record(plan: Plan, *, step: int = 0, photograph: bool = True) -> PlanRecord:
-    picture = np.full((424, 512, 3), 200, dtype=np.uint8) if photograph else None
+    picture = np.full((450, 800, 3), 200, dtype=np.uint8) if photograph else None
     return PlanRecord(step, seen_centers(), np.arange(ROOM) < OBJECTS, plan, 20.0, picture)
 
 
@@ -85,24 +83,32 @@ def pixels_like(image: NDArray[np.uint8], color: str) -> int:
     return int((distance.max(axis=-1) < 12).sum())
 
 
-@pytest.mark.parametrize("task", ["clearing", "crossing"])
-def test_a_plans_figure_shows_subgoals_and_predictions(task: str, tmp_path: Path) -> None:
-    layout = load_task(task, 0)
-    draw_plan(tmp_path / "plan.png", episode(made_up_plan(), made_up_plan()), layout, CAMERA)
+def test_a_picture_shows_subgoals_and_predictions(world: PushingEnv, tmp_path: Path) -> None:
+    draw_episode(tmp_path / "plan.png", episode(made_up_plan(), made_up_plan()), world)
     image = imageio.imread(tmp_path / "plan.png")
-    assert image.shape[:2] == pytest.approx((120 * (0.9 + 2.95), 120 * 3 * 4.4), abs=1)
+    assert image.shape[1] == pytest.approx(120 * 2 * drawing.PANEL_WIDTH, abs=1)
     assert (image[0, 0, :3] == 255).all()
-    assert pixels_like(image, SUBGOAL_COLOR) > 100
-    assert pixels_like(image, PREDICTION_COLOR) > 10
+    assert pixels_like(image, SUBGOALS["color"]) > 100
+    assert pixels_like(image, PREDICTED["color"]) > 10
 
 
-def test_the_legend_names_what_is_drawn_and_nothing_else() -> None:
-    layout = load_task("crossing", 0)
-    full = [entry.get_label() for entry in figures_plan.legend(layout, [record(made_up_plan())], candidates=True)]
-    bare = [entry.get_label() for entry in figures_plan.legend(layout, [record(random_plan())], candidates=False)]
-    assert full[:5] == ["bridge", "goal", "target", "observed", "candidates"]
-    assert full[5:] == ["target's subgoals", "obstacles' subgoals", "predicted", "reached", "push"]
-    assert bare == ["bridge", "goal", "target", "observed", "reached", "push"]
+def test_the_legend_names_what_is_drawn_and_nothing_else(world: PushingEnv) -> None:
+    full = [entry.get_label() for entry in drawing.legend(world, [record(made_up_plan())])]
+    bare = [entry.get_label() for entry in drawing.legend(world, [record(random_plan())])]
+    target = ["target"] * (world.name == "crossing")
+    assert full == [*target, "candidates", "subgoals", "predicted", "reached", "push"]
+    assert bare == [*target, "reached", "push"]
+
+
+def test_a_title_tells_the_step_and_what_f_moves_farthest(world: PushingEnv) -> None:
+    assert drawing.title(world, record(random_plan(), step=2), 6) == "push 3 of 6"
+    assert f"push 1 of 6: the {world.names[0]} " in drawing.title(world, record(made_up_plan()), 6)
+
+
+def test_a_picture_leaves_out_the_white_above_all_else() -> None:
+    picture = np.full((5, 4, 3), 255, np.uint8)
+    picture[3:] = 0
+    assert drawing.empty_rows(picture) == 3
 
 
 def push(step: int, *, along_x: float = 0.0) -> Transition:
@@ -113,74 +119,57 @@ def push(step: int, *, along_x: float = 0.0) -> Transition:
     return Transition(step, np.zeros(4, np.float32), -1.0, **flags, centers=centers, subgoal_distance=0.0)
 
 
-@pytest.mark.parametrize(
-    ("outcome", "title", "color"),
-    [
-        ("success", "end, after 1 push: success", SUCCESS_COLOR),
-        ("timeout", "end, after 1 push: failure (timeout)", FAILURE_COLOR),
-    ],
-)
+@pytest.mark.parametrize("outcome", ["success", "timeout"])
 def test_the_last_panel_shows_the_end_and_says_how_it_went(
-    outcome: str, title: str, color: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    outcome: str, world: PushingEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn = []
-    monkeypatch.setattr(figures_plan, "save_figure", lambda path, figure: drawn.append(figure))
+    monkeypatch.setattr(drawing, "save_figure", lambda path, figure: drawn.append(figure))
     ended = Episode(7, outcome, [record(made_up_plan())], [push(1, along_x=0.1)])
-    ended.photograph = np.full((424, 512, 3), 50, dtype=np.uint8)
-    draw_plan(tmp_path / "plan.png", ended, load_task("insertion", 0), CAMERA)
+    ended.photograph = np.full((450, 800, 3), 50, dtype=np.uint8)
+    draw_episode(tmp_path / "plan.png", ended, world)
     *_, end = [panel for panel in drawn[0].axes if panel.get_title()]
-    assert (end.get_title(), end.title.get_color()) == (title, color)
+    assert outcome in end.get_title()
     assert (end.images[0].get_array() == 50).all()
 
 
-def test_a_map_is_true_to_scale_and_turned_as_the_cameras_image(tmp_path: Path) -> None:
-    origin, ahead, left = Map().project(np.array([[0.5, 0.1, 0.0], [0.6, 0.1, 0.3], [0.5, 0.2, 0.0]]))
-    np.testing.assert_allclose(ahead - origin, [0.0, -36.55], atol=1e-9)  # up, whatever its height
-    np.testing.assert_allclose(left - origin, [-36.55, 0.0], atol=1e-9)
-    seen = record(made_up_plan(), photograph=False)
-    draw_plan(tmp_path / "plan.png", Episode(0, "fall", [seen]), load_task("crossing", 0), None)
-    clouds = seen_centers()[:, None] + 0.02 * np.random.default_rng(0).standard_normal((ROOM, 256, 3))
-    seen = replace(seen, observation={"clouds": clouds.astype(np.float32)})
-    draw_plan(tmp_path / "clouds.png", Episode(0, "fall", [seen]), load_task("crossing", 0), None)
-    bare, full = (imageio.imread(tmp_path / name) for name in ("plan.png", "clouds.png"))
-    assert pixels_like(full, colors.to_hex(COLORS[1])) > pixels_like(bare, colors.to_hex(COLORS[1])) + 20
+def test_a_camera_opposite_the_robot_takes_the_pictures(world: PushingEnv) -> None:
+    near, far, left = world.pixels(np.array([[0.8, 0.0, 0.0], [0.4, 0.0, 0.0], [0.4, 0.1, 0.0]]))
+    assert near[1] > far[1] + 100 and abs(near[0] - far[0]) < 1e-2
+    assert left[0] > far[0] + 40  # the table's left is on the right
 
 
 @pytest.mark.parametrize("segments", [1, K])
-def test_chains_end_where_the_plan_does_and_leave_out_what_hardly_moves(segments: int) -> None:
+def test_paths_leave_out_what_hardly_moves(segments: int, world: PushingEnv) -> None:
     seen = record(made_up_plan(segments))
-    ((target, chain),) = subgoal_chains(seen, CAMERA).items()
-    (path,) = predicted_paths(seen, CAMERA).values()
+    ((target, path),) = object_paths(world, seen, seen.plan.subgoals.centers[0].numpy()[:segments]).items()
     assert target == 0
-    assert len(chain) == 1 + segments
-    assert len(path) == 1 + segments * T
-    np.testing.assert_allclose(chain[0], CAMERA.project(seen.centers[0]))
-    np.testing.assert_allclose(chain[-1], CAMERA.project(seen.centers[0] + [0.05 * segments, 0.0, 0.0]), atol=1e-3)
-    np.testing.assert_allclose(path[-1], chain[-1], atol=1e-3)
+    np.testing.assert_allclose(path[0], seen.centers[0])
+    np.testing.assert_allclose(path[-1], seen.centers[0] + [0.05 * segments, 0.0, 0.0], atol=1e-6)
 
 
-def test_predictions_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+def test_predictions_that_are_not_finite_are_left_out(world: PushingEnv, tmp_path: Path) -> None:
     plan = made_up_plan()
     plan.predicted_centers[:] = torch.nan
     plan.subgoals.centers[:] = torch.inf
     plan.candidate_centers[:, :20] = torch.nan
     plan.candidate_returns[:, 20:30] = -torch.inf
     seen = record(plan)
-    assert predicted_paths(seen, CAMERA) == subgoal_chains(seen, CAMERA) == {}
-    dots, returns = candidate_subgoals(seen, load_task("insertion", 0), CAMERA, count=1000)
+    assert object_paths(world, seen, plan.predicted_centers[0].numpy()) == {}
+    dots, returns = candidate_subgoals(seen, [0], count=1000)
     assert len(dots) == len(returns) == 10 * K
     assert np.isfinite(dots).all()
-    draw_plan(tmp_path / "plan.png", Episode(0, "fall", [seen]), load_task("insertion", 0), CAMERA)
+    draw_episode(tmp_path / "plan.png", Episode(0, "fall", [seen]), world)
 
 
-@pytest.mark.parametrize(("task", "objects"), [("clearing", OBJECTS), ("insertion", 1), ("crossing", 1)])
-def test_candidates_are_of_the_target_or_in_clearing_of_all_objects(task: str, objects: int) -> None:
-    seen, layout = record(made_up_plan()), load_task(task, 0)
-    every, returns = candidate_subgoals(seen, layout, CAMERA, count=10_000)
-    assert every.shape == (N * K * objects, 2)
+@pytest.mark.parametrize("objects", [[0], [0, 1, 2]])
+def test_candidates_are_of_the_objects_that_the_goal_is_about(objects: list[int]) -> None:
+    seen = record(made_up_plan())
+    every, returns = candidate_subgoals(seen, objects, count=10_000)
+    assert every.shape == (N * K * len(objects), 3)
     assert (np.diff(returns) >= 0).all()
-    few, _ = candidate_subgoals(seen, layout, CAMERA, count=50)
-    assert few.shape == (50, 2)
+    few, _ = candidate_subgoals(seen, objects, count=50)
+    assert few.shape == (50, 3)
 
 
 def test_training_curves_are_drawn_from_numbers_and_from_strings_of_a_csv_file(tmp_path: Path) -> None:
