@@ -37,6 +37,7 @@ FRAMES_PER_SECOND = 10
 PAUSE = 6  # frames for which a new plan is shown before its execution
 LAST = 15  # frames for which the end is shown
 HEADER, FOOTER = 34, 30  # pixels above and below the picture, for title and legend
+SMALLEST = 400  # pixels of a frame's width
 WIDTH = 6.6  # inches in which the legend fits
 FORMAT: dict[str, Any] = {
     "format": "FFMPEG",
@@ -104,6 +105,13 @@ class Film(EpisodeCallback):
                     temporary, save_all=True, append_images=rest, duration=duration, loop=0, quality=80, method=4
                 )
 
+    @property
+    def _shown(self) -> tuple[int, int]:
+        """Columns and rows of the picture in a frame: a small one is enlarged."""
+        rows, columns, _ = self._size
+        factor = -(-SMALLEST // columns)
+        return factor * columns, factor * (rows - self.empty)
+
     def _frames(self, episode: Episode) -> Iterator[tuple[NDArray[np.uint8], int]]:
         """Each frame [H, W, 3], and for how many frames it stays."""
         known = None
@@ -113,20 +121,18 @@ class Film(EpisodeCallback):
                 overlay = self._overlay(episode, episode.plan_records[shot.plan], shot.steps, ended=ended)
             picture = np.frombuffer(zlib.decompress(shot.picture), np.uint8).reshape(self._size)[self.empty :]
             image = Image.new("RGB", overlay.size, "white")
-            image.paste(Image.fromarray(picture), (0, HEADER))
+            image.paste(Image.fromarray(picture).resize(self._shown, Image.Resampling.NEAREST), (0, HEADER))
             image.paste(overlay, mask=overlay)
             yield np.asarray(image), shot.frames
 
     def _overlay(self, episode: Episode, record: PlanRecord, steps: int, *, ended: bool) -> Image.Image:
         """Everything that stays the same until the next step, as a transparent image."""
-        rows, columns, _ = self._size
-        shown = rows - self.empty
-        height, width = shown + HEADER + FOOTER, columns
-        height, width = height + height % 2, width + width % 2  # as yuv420p wants
+        columns, rows = self._shown
+        width, height = columns + columns % 2, rows + HEADER + FOOTER + rows % 2  # even, as yuv420p wants
         figure = Figure(figsize=(WIDTH, WIDTH * height / width), dpi=width / WIDTH, facecolor="none")
         canvas = FigureCanvasAgg(figure)
-        box = (0.0, 1 - (HEADER + shown) / height, columns / width, shown / height)
-        panel = figure.add_axes(box, xlim=(0, columns), ylim=(rows, self.empty))
+        box = (0.0, 1 - (HEADER + rows) / height, columns / width, rows / height)
+        panel = figure.add_axes(box, xlim=(0, self._size[1]), ylim=(self._size[0], self.empty))
         panel.set_axis_off()
         if not ended:
             draw_plan(panel, self._world, record)

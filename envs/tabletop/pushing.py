@@ -44,10 +44,10 @@ TARGET_JITTER = 0.05  # metres; how far from its tile's centre the target may st
 OBSTACLE_JITTER = TILE_SIDE / 2  # metres; obstacles start anywhere on their tiles
 SPECTATOR = Camera(  # opposite the robot, for pictures
     width=800,
-    height=450,
+    height=400,
     position=(1.5, 0.0, 1.25),
     rotation=(1.03989, 0.0, 2.96450),
-    intrinsics_offset=(225.0, 225.0, 0.0, 30.0),
+    intrinsics_offset=(225.0, 225.0, 0.0, 14.0),
 )
 
 ObservationDict = dict[str, NDArray[Any]]
@@ -217,7 +217,7 @@ class PushingEnv(Uncopied, World):
         return _as_dict(observation), sum(terms.values()), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a colour image of the table [450, 800, 3] in mode rgb_array, as one sees it who faces the robot."""
+        """Return a colour image of the table [400, 800, 3] in mode rgb_array, as one sees it who faces the robot."""
         return self.scene.photograph(SPECTATOR) if self.render_mode == "rgb_array" else None
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -234,7 +234,7 @@ class PushingEnv(Uncopied, World):
         """See `World`: at the lower edge of a single tile, of several tiles beside the one nearest to the spectator."""
         groups = self.task.tile_groups()
         places = {one.name: (*max(one.tiles), *((0.4, 0) if len(one.tiles) == 1 else (0, 1.1))) for one in groups}
-        return {name: np.array([*tile_center((i + k, j + l)), 0.0]) for name, (i, j, k, l) in places.items()}
+        return {name: np.array([*tile_center((i + di, j + dj)), 0.0]) for name, (i, j, di, dj) in places.items()}
 
     def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
         """See `World`: the tool's paths on the table."""

@@ -70,7 +70,7 @@ def made_up_plan(segments: int = 2) -> Plan:
 
 
 def record(plan: Plan, *, step: int = 0, photograph: bool = True) -> PlanRecord:
-    picture = np.full((450, 800, 3), 200, dtype=np.uint8) if photograph else None
+    picture = np.full((400, 800, 3), 200, dtype=np.uint8) if photograph else None
     return PlanRecord(step, seen_centers(), np.arange(ROOM) < OBJECTS, plan, 20.0, picture)
 
 
@@ -126,7 +126,7 @@ def test_the_last_panel_shows_the_end_and_says_how_it_went(
     drawn = []
     monkeypatch.setattr(drawing, "save_figure", lambda path, figure: drawn.append(figure))
     ended = Episode(7, outcome, [record(made_up_plan())], [push(1, along_x=0.1)])
-    ended.photograph = np.full((450, 800, 3), 50, dtype=np.uint8)
+    ended.photograph = np.full((400, 800, 3), 50, dtype=np.uint8)
     draw_episode(tmp_path / "plan.png", ended, world)
     *_, end = [panel for panel in drawn[0].axes if panel.get_title()]
     assert outcome in end.get_title()
