@@ -11,7 +11,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
-ORDER = ("plan", "evaluate", "collect", "data", "pretrain", "train", "check", "reproduce", "assets")
+ORDER = ("plan", "imagine", "evaluate", "collect", "data", "pretrain", "train", "check", "reproduce", "assets")
 
 
 def main() -> None:

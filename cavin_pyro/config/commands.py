@@ -227,10 +227,10 @@ class GeneratedConfig:
 
 
 @dataclass
-class EpisodeConfig(DeviceOptions):
-    """Options of commands that run episodes of one task."""
+class SceneConfig:
+    """Options of commands that begin episodes of one task."""
 
-    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop task=" + ENV["task"])
+    defaults: list[Any] = preset_defaults("env/ranges=paper world=tabletop task=" + ENV["task"])
     layout: int | str = option(ENV["layout"], "number, random (per episode), generated (generated.*), or a YAML file")
     reward: str = option(ENV["reward"], "reward of the task", choices=("dense", "sparse"))
     criterion: str = option(ENV["criterion"], CRITERION, choices=f"{ENVS}.tasks.reward.CRITERIA")
@@ -238,17 +238,35 @@ class EpisodeConfig(DeviceOptions):
     maximum_steps: int = option(ENV["maximum_steps"], "pushes per episode, at most", minimum=1)
     task: Any = None
     tiles: TilesConfig = field(default_factory=TilesConfig)
-    planner: Any = None
-    pushes_per_plan: int | None = option(1, "executed pushes per plan; null: all T (Algorithm 1, line 11)", minimum=1)
-    push_decimals: int | None = option(ACTION_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
     margin: float = option(ENV["margin"], MARGIN, unit="metres", minimum=0, maximum=TILE_SIDE / 2)
-    matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
-    checkpoint: str = option("${oc.select:planner.default_checkpoint,cavin}", f"{CHECKPOINT}; by default the planner's")
+    checkpoint: str = option("contact", CHECKPOINT)
     trust: list[str] = option([], TRUST)
     generated: GeneratedConfig = field(default_factory=GeneratedConfig)
     world: Any = None
     env: WorldConfig = field(default_factory=WorldConfig)
+    seed: int = seed_option("seed of the scene, and of what is sampled in it")
+
+
+@dataclass
+class EpisodeConfig(SceneConfig, DeviceOptions):
+    """Options of commands that run episodes of one task."""
+
+    defaults: list[Any] = preset_defaults("planner=cavin env/ranges=paper world=tabletop task=" + ENV["task"])
+    planner: Any = None
+    pushes_per_plan: int | None = option(1, "executed pushes per plan; null: all T (Algorithm 1, line 11)", minimum=1)
+    push_decimals: int | None = option(ACTION_DECIMALS, "decimals of executed pushes; null: all", minimum=1, maximum=6)
+    matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
+    checkpoint: str = option("${oc.select:planner.default_checkpoint,cavin}", f"{CHECKPOINT}; by default the planner's")
     seed: int = seed_option("seed of the scene and of the planner")
+
+
+@dataclass
+class ImagineConfig(SceneConfig):
+    """Options of `python -m cavin_pyro.imagine`."""
+
+    output: str | None = option(None, "folder for the results; by default one in runs/")
+    effects: int = option(8, "effect codes c ~ p(c | s) of the scene", minimum=1, maximum=100)
+    motions: int = option(4, "motion codes z ~ p(z | s, c) of each effect", minimum=1, maximum=100)
 
 
 @dataclass
@@ -304,6 +322,7 @@ COMMANDS: dict[str, type] = {
     "train": TrainConfig,
     "check": CheckConfig,
     "plan": PlanConfig,
+    "imagine": ImagineConfig,
     "evaluate": EvaluateConfig,
     "reproduce": ReproduceConfig,
 }

@@ -34,7 +34,7 @@ OUTPUT = {  # the folder of a run for which the user names none
     "reproduce": "runs/reproduce/{scale}",
 }
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
-SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video"}
+SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video", "video_format"}
 SAME_RUN |= {"episodes", "compare"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
 VALUE = re.compile(r"""'(\\.|[^'\\])*'|"(\\.|[^"\\])*"|[^\s,:'"(){}\[\]=]([^,:'"(){}\[\]]*[^\s,:'"(){}\[\]])?""")

@@ -28,6 +28,7 @@ EXAMPLES = {
         "-m planner=cavin,paper",
         "planner.optimizer=cem env.segmentation=clusters",
     ),
+    "imagine": ("checkpoint=contact seed=1", "checkpoint=cavin task=clearing", "env=pusht checkpoint=pusht"),
     "evaluate": ("task=crossing objects=3", "planner=paper compare=runs/mine", "-m task=clearing,insertion,crossing"),
     "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }

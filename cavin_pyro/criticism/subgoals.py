@@ -166,18 +166,33 @@ def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, obj
     return scene.sample([clutter_area(generator)] * objects, ranges, generator)
 
 
+def execute(world: World, actions: Floats, *, to_the_end: bool = False) -> tuple[Floats, bool]:
+    """Carry out actions [T, A] from the present state of a world.
+
+    Args:
+        to_the_end: go on where the episode ends.
+
+    Returns:
+        Positions [n, M, P] after each action, with n less than T if the episode ended on the way; whether it ended.
+    """
+    path, over = [], False
+    for action in actions:
+        observation, _, ended, *_ = world.step(np.clip(action, -1.0, 1.0))
+        path.append(world.positions(observation)[0])
+        over = over or ended
+        if over and not to_the_end:
+            break
+    return np.stack(path), over
+
+
 def _rollout_in_world(context: CheckContext, world: World, number: int, motion: str, samples: int) -> SubgoalRollout:
     """In an episode of another world than the tabletop; places of padding are zeros."""
     seed = [context.seed, number]
     observation, _ = world.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]))
     before, mask = world.positions(observation)
     plan = plan_segment(context.model, world.state(observation).expand_plans(1), motion, seed, samples)
-    ended = False
-    for action in plan.actions:
-        observation, _, ended, *_ = world.step(np.clip(action, -1.0, 1.0))
-        if ended:
-            break
-    reached, real = world.positions(observation)[0], mask[:, None]
+    path, ended = execute(world, plan.actions)
+    reached, real = path[-1], mask[:, None]
     subgoal = None if plan.subgoal is None else plan.subgoal * real
     return SubgoalRollout(
         motion,

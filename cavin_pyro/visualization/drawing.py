@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -44,6 +44,16 @@ TARGET: Style = {"color": "black", "linestyle": "--", "linewidth": 1.6}
 ACTION: Style = {"marker": r"$\rightarrow$", "markersize": 13, "color": "black", "linestyle": ""}
 
 
+class Observed(Protocol):
+    """Centres [M, P] of the observed objects in the mask [M], where paths begin."""
+
+    @property
+    def centers(self) -> NDArray[np.float32]: ...
+
+    @property
+    def mask(self) -> NDArray[np.bool_]: ...
+
+
 def draw_plan(panel: Axes, world: World, record: PlanRecord) -> None:
     """Draw candidates, the chosen subgoals, f's predictions and actions over a panel's picture."""
     plan, steps = record.plan, record.plan.actions.shape[1]
@@ -62,13 +72,13 @@ def draw_plan(panel: Axes, world: World, record: PlanRecord) -> None:
     _draw_actions(panel, world, world.arrows(plan.actions[0].numpy(), before))
 
 
-def draw_paths(panel: Axes, world: World, record: PlanRecord, centers: Floats, style: Style) -> None:
+def draw_paths(panel: Axes, world: World, record: Observed, centers: Floats, style: Style) -> None:
     """Draw the path of each named object that moves, from where it was observed through `centers: [n, M, P]`."""
     for path in object_paths(world, record, centers).values():
         panel.plot(*project(world, path).T, **style, markevery=slice(1, None), path_effects=_HALO, zorder=4)
 
 
-def object_paths(world: World, record: PlanRecord, centers: Floats) -> dict[int, Floats]:
+def object_paths(world: World, record: Observed, centers: Floats) -> dict[int, Floats]:
     """Paths [1 + n, P] of the named objects that move along `centers: [n, M, P]` by more than their scale.
 
     A plan may have fewer objects than the observation; the others are padding.

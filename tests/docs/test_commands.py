@@ -26,6 +26,7 @@ SMALL = {  # options that make each command a matter of a second
     "train": "model.width=8 trainer.steps=2 trainer.validate_every=1 trainer.batch_size=4 trainer.validation_windows=8 "
     "windows.minimum_move=0.001 windows.validation_fraction=0.4",
     "plan": f"{EPISODES} video=false",
+    "imagine": "effects=1 motions=1",
     "evaluate": f"{EPISODES} episodes=2 workers=1",
     "check": "windows=2 sections=[elbo]",
     "reproduce": "",

@@ -37,6 +37,7 @@ LINES = {
     "windows.validation_fraction=0.3",
     "check": "checkpoint=run/checkpoint.safetensors data=pushes windows=5 sections=[elbo] output=report",
     "plan": f"{EPISODE} layout=bridge.yaml reward=dense seed=7 output=episode",
+    "imagine": "checkpoint=run/checkpoint.safetensors objects=2 effects=2 motions=1 seed=7 output=imagined",
     "evaluate": f"{EPISODE} layout=bridge.yaml episodes=2 workers=1 seed=6 output=evaluation",
 }
 LEFT = {  # files that each command leaves
@@ -44,6 +45,7 @@ LEFT = {  # files that each command leaves
     "run": {"config.yaml", "metrics.csv", "metrics.json", "checkpoint.safetensors", "training.png"},
     "report": {"config.yaml", "report.html"},
     "episode": {"config.yaml", "results.json", "steps.csv", "plan.png", "episode.mp4"},
+    "imagined": {"config.yaml", "imagine.csv", "imagine.png"},
     "evaluation": {"config.yaml", "results.json", "results.txt", "episodes.jsonl"},
 }
 
