@@ -33,7 +33,8 @@ SEGMENTS = 3  # of which subgoals are shown, at most
 FONT = 10.0  # points, the only size
 RING = 0.35  # times the farthest step of an object: the radius of the ring around the target
 
-LEGEND: Style = {"fontsize": FONT, "frameon": False, "handlelength": 1.6, "handletextpad": 0.5, "columnspacing": 1.2}
+LEGEND: Style = {"fontsize": FONT, "frameon": False, "borderaxespad": 0.1}
+LEGEND |= {"handlelength": 1.6, "handletextpad": 0.5, "columnspacing": 1.2}
 _HALO = [withStroke(linewidth=2.8, foreground="white", alpha=0.85)]
 # Distinguishable by colour-blind people (Okabe and Ito), and by shape.
 CANDIDATE: Style = {"marker": "o", "markersize": 3.5, "color": "#5B3A8E", "linestyle": "", "markeredgewidth": 0}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -48,6 +50,11 @@ def values_of(generated: poutine.Trace) -> dict[str, Tensor]:
     """Of every sampled site, and those of f for all pushes at once."""
     values = {name: generated.nodes[name]["value"] for name in generated.stochastic_nodes}
     return values | {name: torch.stack([values[f"{name}_{push}"] for push in (1, 2, 3)], 1) for name in TRANSITIONS}
+
+
+def test_the_readme_shows_the_sites_of_the_program_in_their_order() -> None:
+    page = (Path(__file__).resolve().parents[2] / "README.md").read_text()
+    assert re.findall(r'pyro\.sample\("(\w+)"', page) == list(SITES[CascadedModel])
 
 
 @every_model
