@@ -107,6 +107,7 @@ FARTHER = [
 LEFT_OUT = {  # an addition, and the options without it
     "nothing": (),
     "one push per plan": ("pushes_per_plan=null",),
+    "perturbed rollouts": ("planner.drop=[perturbed_rollouts]",),
     "failure avoidance": ("planner.drop=[failure_avoidance]",),
     "margin": ("margin=0",),
     "touchdown": ("planner.drop=[touchdown]",),

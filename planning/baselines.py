@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
@@ -50,7 +49,7 @@ class ActionSearch(SearchingPlanner):
         # A sum is finite only if all of its terms are.
         finite = torch.isfinite(candidates.actions.sum((-2, -1)))
         scores = torch.where(finite, candidates.returns, -torch.inf)
-        choice = Choice(scene, candidates, lambda: candidates.at(0, actions_of))
+        choice = Choice(scene, self.model, candidates, lambda: candidates.at(0, actions_of))
         best = best_of(self.added("rank", scores, choice), "returns of action sequences")
         chosen = candidates.take(best.unsqueeze(-1))
         actions, path, codes = chosen.actions[:, 0], chosen.path[:, 0], chosen.codes[:, 0]
@@ -160,8 +159,17 @@ class SectarPlanner(SearchingPlanner):
         # Lines 5 to 7: choose the codes c* and their subgoals.
         space, here = EffectSpace(self.model, scene.reward.reads_features), scene.state.expand_plans(1)
         effects = self.search_by_reward(space, scene)
-        codes = partial(effects.at, 0, lambda segment: segment.rollout.code)
-        choice = Choice(scene, effects, lambda: self._actions(here, codes()))
+        choice = Choice(
+            scene,
+            self.model,
+            effects,
+            lambda: self._actions(here, effects.at(0, lambda segment: segment.rollout.code)),
+            subgoals=State(
+                effects.at(0, lambda segment: segment.rollout.states.centers),
+                effects.at(0, lambda segment: segment.rollout.states.features),
+                effects.plans.mask,
+            ),
+        )
         best = best_of(self.added("rank", effects.returns, choice), "returns of effect plans")
         chosen = effects.take(best.unsqueeze(-1))
         effect_codes = chosen.codes[:, 0]

@@ -81,7 +81,7 @@ class CavinPlanner(SearchingPlanner):
         motions = self.search(space, tracking_cost, scene, optimizer=self.motion_optimizer, segments=K, samples=N)
 
         # Line 10: choose z* and its actions a*, which lead to the states closest to the subgoals.
-        choice = Choice(scene, motions, lambda: motions.at(0, actions_of))
+        choice = Choice(scene, self.model, motions, lambda: motions.at(0, actions_of), effect, distance)
         j = best_of(self.added("rank", motions.returns, choice), "distances of motion plans to the subgoals")
         best = motions.take(j.unsqueeze(-1))
         z_star, a_star, path = best.codes[:, 0], best.actions[:, 0], best.path[:, 0]

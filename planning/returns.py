@@ -132,6 +132,10 @@ class SubgoalDistance(NamedTuple):
     feature_weight: float = 0.0
     at: str = END
 
+    def steps(self, segment_length: int) -> int:
+        """After how many of a segment's T actions centres are compared."""
+        return segment_length if self.at == END else 1
+
     def __call__(self, end: State, path: Tensor, subgoal: State) -> Tensor:
         """`[...]`, from the last state `end: [...]` and the centres `path: [..., T, M, P]`.
 
@@ -150,6 +154,7 @@ class TrackingState(NamedTuple):
     """The tracking cost of motion candidates so far; fields `[B, n]`."""
 
     cost: Tensor  # summed over the segments
+    executed_cost: Tensor  # of the first segment, which is executed
     finite: Tensor  # bool: all actions are finite
 
     @property
@@ -180,16 +185,17 @@ class TrackingCost(NamedTuple):
 
     def start(self, plans: State) -> TrackingState:
         nothing = plans.centers.new_zeros(plans.batch_shape)
-        return TrackingState(nothing, torch.ones_like(nothing, dtype=torch.bool))
+        return TrackingState(nothing, nothing, torch.ones_like(nothing, dtype=torch.bool))
 
     def advance(self, state: TrackingState, segment: int, before: State, rollout: SegmentRollout) -> TrackingState:
         counts = (segment < self.segments).unsqueeze(-1)  # [B, 1]
         subgoal = self.subgoals.map(lambda field: select_segment(field, segment))  # [B, 1, M, .]
         distance = self.distance(rollout.states, rollout.path, subgoal)
         cost = state.cost + torch.where(counts, distance, 0.0)
+        executed = torch.as_tensor(segment == 0, device=counts.device)
         assert rollout.actions is not None
         finite = state.finite & (torch.isfinite(rollout.actions).all(-1).all(-1) | ~counts)
-        return TrackingState(cost, finite)
+        return TrackingState(cost, torch.where(executed, cost, state.executed_cost), finite)
 
     def early_stopped(self, state: TrackingState) -> Tensor:
         """`[B]` bool: none, because no sequence ends before the others."""

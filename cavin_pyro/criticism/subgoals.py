@@ -332,7 +332,7 @@ def _verdict(left: Interval | None, name: str, scenes: int) -> Verdict:
     if scenes < FEWEST:
         return Verdict(FEW, f"Only {scenes} scenes: a conclusion needs at least {FEWEST}. ({rule})", "More scenes.")
     level = grade(left.low, left.high, good=NEAR, bad=FAR)
-    advice = "If f predicted less to be left, f is too optimistic: train it on more perturbed pushes."
+    advice = "If f predicted less to be left, f is too optimistic: use perturbed rollouts or more perturbed data."
     return Verdict(level, rule, advice if level != GOOD else "")
 
 

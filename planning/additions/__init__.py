@@ -10,6 +10,7 @@ from cavin_pyro.planning.additions.failure_avoidance import FailureAvoidance
 from cavin_pyro.planning.additions.first_push import FirstPush
 from cavin_pyro.planning.additions.guidance import Guidance
 from cavin_pyro.planning.additions.nearest_objects import NearestObjects
+from cavin_pyro.planning.additions.perturbed_rollouts import PerturbedRollouts
 from cavin_pyro.planning.additions.touchdown import Touchdown
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "FirstPush",
     "Guidance",
     "NearestObjects",
+    "PerturbedRollouts",
     "Touchdown",
     "make_additions",
 ]
@@ -34,6 +36,7 @@ ADDITIONS: dict[str, type[Addition]] = {  # in the order in which they act
     "guidance": Guidance,
     "failure_avoidance": FailureAvoidance,
     "touchdown": Touchdown,
+    "perturbed_rollouts": PerturbedRollouts,
 }
 
 OURS = tuple(name for name in ADDITIONS if name != "guidance")  # those of `planner=cavin`

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor
 
@@ -26,8 +26,12 @@ class Choice(NamedTuple):
     """Candidates whose first actions are known: motions at line 10, or the plans of a baseline."""
 
     scene: Query
+    model: Any  # `cavin_pyro.planning.protocol.TransitionModel`
     candidates: Candidates  # [B, N]
     first_actions: Callable[[], Tensor]  # [B, N, T, A], of the first segment
+    effect: ChosenEffect | None = None  # which motions follow; None for the plans of a baseline
+    distance: SubgoalDistance = SubgoalDistance()  # of motions to its subgoals
+    subgoals: State | None = None  # [B, N], the first subgoal of each plan of a baseline
 
 
 class Addition:

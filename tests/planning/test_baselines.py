@@ -24,12 +24,13 @@ from cavin_pyro.planning import (
     Reward,
     SectarPlanner,
 )
+from cavin_pyro.planning.additions import PerturbedRollouts
 from cavin_pyro.planning.optimizers import Shooting
 from tests.planning.conftest import line
 
 EFFECTS = [[-0.75, 0.5, -2.0], [0.5, 0.25, 1.0]]
 RETURNS = [-2.0 - 1.0 + 99.0, -4.0, -2.0 + 99.0]
-PRESET = "early_stopping", "touchdown"  # additions of their presets
+PRESET = "early_stopping", PerturbedRollouts(256, rounds=3, reduction_factor=4)  # additions of their presets
 
 
 def replay(toy: SimpleNamespace, kind: type, model: Any, **options: Any) -> Plan:
@@ -57,7 +58,7 @@ def test_sectar_executes_nothing_that_is_not_finite(toy: SimpleNamespace) -> Non
             return torch.full((*effect_code.shape[:2], 2, 4), torch.nan)
 
     with pytest.raises(ValueError, match="^environment 0: the actions of the chosen effect are not finite"):
-        replay(toy, SectarPlanner, Broken(EFFECTS, []))
+        replay(toy, SectarPlanner, Broken(EFFECTS, []), additions=[PerturbedRollouts()])
 
 
 def test_cvae_mpc_agrees_with_the_replay_by_hand(toy: SimpleNamespace) -> None:
@@ -117,6 +118,9 @@ def test_mpc_replaces_the_dead_and_repeats_with_its_seed(toy: SimpleNamespace) -
     assert len(firsts.unique(dim=0)) < 64
 
 
+ALL = PerturbedRollouts(candidates=64, rollouts=4)
+
+
 def planner_of(toy: SimpleNamespace, kind: type, *additions: object, horizon: int = 6) -> Any:
     model = {SectarPlanner: toy.Single, CvaeMpcPlanner: toy.Flat}.get(kind, toy.PointMass)
     return kind(model(), samples=64, horizon=horizon, additions=additions)
@@ -145,15 +149,63 @@ def test_a_plan_with_additions_does_not_depend_on_its_neighbours(kind: type, toy
     torch.testing.assert_close(both.planned_actions[1], alone.planned_actions[0])
 
 
-def test_pushes_that_are_not_finite_never_win(toy: SimpleNamespace) -> None:
-    planner, reward = planner_of(toy, CvaeMpcPlanner), toy.GoalDisc((0.2, 0.0), radius=0.15)
+@each_kind
+def test_the_first_segment_stays_farther_from_forbidden_places(kind: type, toy: SimpleNamespace) -> None:
+    # Where a push starts moves objects as its motion does, and starts are perturbed by 0.2, 2 cm.
+    reward, state = toy.GoalDisc((0.2, 0.0), radius=0.1, forbidden_below=-0.01), toy.scenes([[(0.0, 0.0)]] * 8)
+    perturbed = PerturbedRollouts(candidates=64, rollouts=8, start_noise=0.2)
+    noise = 0.2 * torch.randn(500, 8, 3, 2, generator=toy.generators(0)[0])
+    shares = []
+    for additions in ([], [perturbed]):
+        planner = planner_of(toy, kind, *additions)
+        planner.model.next_state = lambda state, action: toy.move(state, 0.1 * (action[..., 2:] + action[..., :2]))
+        pushes = planner.plan(state, reward=reward, generators=toy.generators(*range(8))).actions
+        starts = (pushes[..., :2] + noise).clamp(-1.0, 1.0)
+        path = 0.1 * (starts + pushes[..., 2:]).cumsum(-2)
+        shares.append((path[..., 1] < -0.01).any(-1).float().mean())
+    assert shares[1] < 0.8 * shares[0]
+
+
+@each_kind
+def test_where_nothing_fails_the_highest_return_wins(kind: type, toy: SimpleNamespace) -> None:
+    # Not the pushes that do least: they never fail, and come closest to their own subgoals.
+    state, reward = toy.scenes([[(0.0, 0.0)]] * 8), toy.GoalDisc((0.25, 0.0), radius=0.15)
+    reward.maximum_return = torch.inf  # no rollout stops early
+    plan = planner_of(toy, kind, *PRESET, horizon=15).plan(state, reward=reward, generators=toy.generators(*range(8)))
+    assert plan.expected_success.all() and len(plan.candidate_returns.unique()) > 4
+    assert torch.equal(plan.expected_return, plan.candidate_returns.amax(-1))
+
+
+def test_sectar_prefers_effects_that_its_pushes_reach(toy: SimpleNamespace) -> None:
+    class Imprecise(toy.Single):  # type: ignore[misc]
+        """Effects with a positive second code end 5 cm farther than their pushes."""
+
+        def subgoal(self, state: State, effect_code: Tensor) -> State:
+            reached = super().subgoal(state, effect_code)
+            error = 0.05 * (effect_code[..., 1] > 0)[..., None, None] * torch.tensor([0.0, 1.0, 0.0])
+            return reached._replace(centers=reached.centers + error)
+
+    reward, state = toy.GoalDisc((0.1, 0.0), radius=0.2), toy.scenes([[(-0.15, 0.0)]] * 8)
+    signs = []
+    for additions in ([], [ALL]):
+        planner = SectarPlanner(Imprecise(), samples=64, horizon=6, additions=additions)
+        plan = planner.plan(state, reward=reward, generators=toy.generators(*range(8)))
+        signs.append((plan.effect_codes[:, 0, 1] > 0).sum())
+    assert signs[0] > 0 and signs[1] == 0
+
+
+@pytest.mark.parametrize("kind", [CvaeMpcPlanner, SectarPlanner])
+def test_pushes_that_are_not_finite_never_win(kind: type, toy: SimpleNamespace) -> None:
+    planner, reward = planner_of(toy, kind, ALL), toy.GoalDisc((0.2, 0.0), radius=0.15)
     whole, model = planner.model.actions, planner.model
 
-    def broken(state: State, *, motion_code: Tensor) -> Tensor:
-        pushes = whole(state, motion_code=motion_code)
-        return pushes.masked_fill((motion_code[..., 1] > 0)[..., None, None], torch.nan)
+    def broken(state: State, *codes: Tensor, **named: Tensor) -> Tensor:
+        code = codes[0] if codes else named["motion_code"]
+        return whole(state, *codes, **named).masked_fill((code[..., 1] > 0)[..., None, None], torch.nan)
 
     model.actions, model.next_state = broken, lambda state, action: toy.move(state, 0.1 * action[..., 2:].nan_to_num())
+    if kind is SectarPlanner:
+        planner._actions = broken
     plan = planner.plan(toy.scenes([[(0.0, 0.0)]] * 4), reward=reward, generators=toy.generators(*range(4)))
     assert plan.actions.isfinite().all()
 

@@ -111,7 +111,7 @@ class Tracked:
 
     def advance(self, state: Any, segment: int, before: State, rollout: SegmentRollout) -> Any:
         nothing = torch.zeros(rollout.states.batch_shape)
-        return TrackingState(nothing, nothing == 0)
+        return TrackingState(nothing, nothing, nothing == 0)
 
 
 def test_motions_that_fall_behind_their_subgoal_cost_more_and_those_beyond_it_do_not(toy: SimpleNamespace) -> None:
@@ -124,6 +124,7 @@ def test_motions_that_fall_behind_their_subgoal_cost_more_and_those_beyond_it_do
     cost = GuidedTracking(Tracked(), disc.distance_to_goal(), subgoals, segments, guided)  # type: ignore[arg-type]
     after = cost.advance(cost.start(reached), 0, reached, rollout)
     torch.testing.assert_close(after.cost, torch.tensor([[0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3]))
+    assert not after.executed_cost.any()
 
 
 def test_what_cannot_guide_is_refused_in_one_line(toy: SimpleNamespace) -> None:

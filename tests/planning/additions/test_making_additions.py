@@ -8,7 +8,7 @@ import pytest
 from torch import Tensor
 
 from cavin_pyro.planning import Addition, CavinPlanner, MpcPlanner
-from cavin_pyro.planning.additions import ADDITIONS, Choice, Touchdown
+from cavin_pyro.planning.additions import ADDITIONS, Choice, PerturbedRollouts, Touchdown
 from cavin_pyro.planning.returns import prefer
 from cavin_pyro.planning.searching import SearchingPlanner
 
@@ -30,7 +30,7 @@ class Gentler(Addition):
 
 @pytest.mark.parametrize("own", [Gentle(), Gentler()])
 @pytest.mark.parametrize("kind", [CavinPlanner, MpcPlanner])
-@pytest.mark.parametrize("ours", [[], ["touchdown"]])
+@pytest.mark.parametrize("ours", [[], ["perturbed_rollouts"]])
 def test_a_users_own_addition_changes_plans(
     toy: SimpleNamespace, own: Addition, kind: type[SearchingPlanner], ours: list
 ) -> None:
@@ -69,6 +69,7 @@ def test_what_is_no_addition_of_a_planner_is_refused(toy: SimpleNamespace, addit
     ("kind", "options", "message"),
     [
         (Touchdown, {"distance": -0.1}, "distance must be a number of at least 0"),
+        (PerturbedRollouts, {"failure_cost": float("nan")}, "failure_cost must be a number of at least 0"),
     ],
 )
 def test_bad_options_of_additions_are_one_clear_line(kind: type[Addition], options: dict, message: str) -> None:

@@ -55,7 +55,7 @@ def planners(toy: SimpleNamespace, *additions: Touchdown) -> list[CavinPlanner |
             pushes[..., :2] = motion_code[..., None, :2].tanh()
             return pushes
 
-    options: dict = {"samples": 128, "horizon": 6, "additions": list(additions)}
+    options: dict = {"samples": 128, "horizon": 6, "additions": [*additions, "perturbed_rollouts"]}
     return [CavinPlanner(Scattered(), **options), MpcPlanner(Scattered(), **options)]
 
 
