@@ -28,11 +28,15 @@ from cavin_pyro.visualization.drawing import (
     SUBGOALS,
     draw_ground,
     draw_paths,
+    empty_rows,
     finish,
+    named,
     panels_of,
+    project,
 )
 
 Floats = NDArray[np.float32]
+MARGIN = 0.12  # of a picture's width, around all that is drawn
 CODES = ("effect_code", "motion_code")
 
 
@@ -105,19 +109,37 @@ def draw_imagination(
         `Imagined.errors`, a row per effect and a column per motion; in centimetres on the table.
     """
     imagined = imagine(model, world, seed=seed, effects=effects, motions=motions)
-    figure, panels = panels_of(effects, imagined.picture)
+    (left, top), (right, bottom) = _box(imagined, world)
+    size = None if imagined.picture is None else np.zeros((bottom - top, right - left, 3), np.uint8)
+    figure, panels = panels_of(effects, size)
     factor, unit = (100, " (cm)") if world.space == SPACE else (1, "")
     errors = factor * imagined.errors
     for number, panel in enumerate(panels[:effects]):
         draw_ground(panel, imagined.picture)
+        if size is not None:
+            panel.set(xlim=(left, right), ylim=(bottom, top))
         draw_paths(panel, world, imagined, imagined.subgoals[number][None], SUBGOALS)
         for motion in range(motions):
             draw_paths(panel, world, imagined, imagined.predicted[number, motion, -1:], PREDICTED)
             draw_paths(panel, world, imagined, imagined.reached[number, motion, -1:], REACHED)
         off = ", ".join(f"{error:.1f}" for error in errors[number])
-        panel.set_title(f"effect {number + 1}: f is off by {off}{unit}", fontsize=FONT)
+        panel.set_title(f"effect {number + 1}: f is off by {off} {unit.strip(' ()')}", fontsize=FONT)
     styles = {"subgoal h(s, c)": SUBGOALS, "predicted by f": PREDICTED, "reached in physics": REACHED}
     finish(path, figure, [Line2D([], [], label=label, **style) for label, style in styles.items()])
     columns = [f"motion {number}" for number in range(1, motions + 1)]
     rows = pd.RangeIndex(1, effects + 1, name=f"predicted to reached{unit}, effect")
     return pd.DataFrame(errors, rows, columns)
+
+
+def _box(imagined: Imagined, world: World) -> NDArray[np.intp]:
+    """The part of the picture in which something is drawn: its corners, columns and rows [2, 2]."""
+    if imagined.picture is None:
+        return np.zeros((2, 2), np.intp)
+    objects = [index for index in named(world) if index < len(imagined.mask) and imagined.mask[index]]
+    ends = [part[..., -1, :, :].reshape(-1, *imagined.centers.shape) for part in (imagined.predicted, imagined.reached)]
+    drawn = np.concatenate([imagined.centers[None], imagined.subgoals, *ends])[:, objects]
+    pixels, size = project(world, drawn).reshape(-1, 2), imagined.picture.shape[1::-1]
+    margin = MARGIN * size[0]
+    corners = np.stack([pixels.min(axis=0) - margin, pixels.max(axis=0) + margin])
+    corners[0, 1] = max(corners[0, 1], min(empty_rows(imagined.picture), corners[0, 1] + 0.9 * margin))
+    return np.clip(corners, 0, size).astype(np.intp)

@@ -29,6 +29,7 @@ Style = dict[str, Any]
 PANELS = 3  # plans shown, besides the end
 PANEL_WIDTH = 4.15  # inches; two fill a page's column
 CANDIDATES = 150  # dots per plan
+LONG = 30  # steps of a path, above which marks would cover it
 SEGMENTS = 3  # of which subgoals are shown, at most
 FONT = 10.0  # points, the only size
 RING = 0.35  # times the farthest step of an object: the radius of the ring around the target
@@ -75,6 +76,7 @@ def draw_plan(panel: Axes, world: World, record: PlanRecord) -> None:
 
 def draw_paths(panel: Axes, world: World, record: Observed, centers: Floats, style: Style) -> None:
     """Draw the path of each named object that moves, from where it was observed through `centers: [n, M, P]`."""
+    style = {**style, "marker": ""} if len(centers) > LONG else style
     for path in object_paths(world, record, centers).values():
         panel.plot(*project(world, path).T, **style, markevery=slice(1, None), path_effects=_HALO, zorder=4)
 
