@@ -150,7 +150,6 @@ WORLDS = [
     Row("random actions", "maze", None, ("env=maze", "planner=random")),
     *pusht("cascade, 2,048 samples", *CASCADE, "planner.samples=2048"),
     *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
-    *pusht("flat: actions, 16,384 samples", *FLAT, "planner.samples=16384"),
     *pusht("cascade, whole horizon", *CASCADE, "planner.shrinking_horizon=false"),
     *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
     *pusht("cascade, shooting", *SEARCH, "planner.optimizer=shooting", CASCADE[-1]),
