@@ -39,7 +39,7 @@ def test_gymnasiums_checks_pass_and_a_seed_determines_an_episode(world: str, con
     try:
         check_env(env, skip_render_check=True)  # what it warns of is an error here
         picture = env.render()
-        assert picture is not None and picture.shape == (424, 512, 3)
+        assert picture is not None and picture.shape == (400, 800, 3)
         runs = []
         for _ in range(2):
             seen = [env.reset(seed=3)[0]]
