@@ -69,12 +69,12 @@ class Space:
         for name in ("length", "step_range", "feature_scale", "action_limits", "action_scales"):
             given = getattr(self, name)
             for value in given if isinstance(given, tuple) else [given]:
-                check_number(f"{name} of a space", value, positive=True)
+                check_number(f"{name} of a space", value, 1e-30, 1e30)  # torch counts in float32
         for name, usual in (("subgoal_range", 3.0 * self.step_range), ("center_scale", self.length / 50)):
             check_number(f"{name} of a space", getattr(self, name))
             object.__setattr__(self, name, getattr(self, name) or usual)
         for value in self.origin:
-            check_number("origin of a space", value, -1e30, 1e30)  # torch counts in float32
+            check_number("origin of a space", value, -1e30, 1e30)
         for value in self.action_sizes:
             check_number("action_sizes of a space", value, 1, whole=True)
         check_number("unit_features of a space", self.unit_features or 0, whole=True)

@@ -213,6 +213,10 @@ def _composed(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, st
         section = one.key_or_group.rpartition(".")[0]
         if re.match(r"hydra\.(?!(launcher|sweeper|searchpath)\b)", one.key_or_group):
             raise UserError(f"{one.input_line}: Hydra's folders and logs are not used here; choose output=DIR")
+        if isinstance(one.value(), list) and one.value() and presets(one.key_or_group):  # Hydra would take the last
+            raise UserError(
+                f"{one.input_line}: {one.key_or_group} takes one choice, not a list; several values need -m"
+            )
         if one.is_delete():
             raise UserError(f"{one.input_line}: an option cannot be removed; give it a value, {one.key_or_group}=value")
         if one.is_add() or one.is_force_add():  # arguments of a part, which its class checks

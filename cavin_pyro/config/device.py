@@ -22,8 +22,10 @@ KEPT = 256 * 2**20  # bytes; enough for a plan of 8,192 samples
 def choose_device(name: str) -> torch.device:
     """The device that `auto`, `cpu` or `cuda` names; `auto` says on standard error what it took.
 
-    `cuda` where torch can use no GPU is a `UserError`, which says why.
+    Another name, and `cuda` where torch can use no GPU, are a `UserError`, which says why.
     """
+    if name not in ("auto", "cpu", "cuda"):
+        raise UserError(f"unknown device {name!r}: choose from auto, cpu, cuda")
     if name == "cpu":
         return torch.device(name)
     missing = _missing()

@@ -143,7 +143,7 @@ def shown(value: Any) -> Any:
     """A value in the user's notation."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
-    return f"{value:g}" if isinstance(value, float) else value if value != "" else "''"
+    return f"{value:.10g}" if isinstance(value, float) else value if value != "" else "''"
 
 
 def configured(schema: type[T], values: Mapping[str, Any], section: str) -> T:

@@ -88,8 +88,8 @@ def test_projection_scales_the_first_numbers_and_leaves_the_free_ones() -> None:
     "changed, said",
     [
         ({"action_sizes": (2, 1)}, "limits and scales for each of its 2 action parts"),
-        ({"length": 0.0}, "^length of a space must be a number above 0, not 0.0$"),
-        ({"feature_scale": math.nan}, "number above 0, not nan"),
+        ({"length": 0.0}, "^length of a space must be a number of at least 1e-30 and at most 1e.30, not 0.0$"),
+        ({"feature_scale": math.nan}, "at most 1e.30, not nan"),
         ({"action_sizes": (True,)}, "whole number of at least 1, not True"),
         ({"frequencies": 10**9}, "whole number of at least 0 and at most 24, not 1000000000"),
         ({"origin": "ab"}, "^origin of a space must be a number of at least -1e.30 and at most 1e.30, not 'a'$"),

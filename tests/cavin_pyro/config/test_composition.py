@@ -91,6 +91,8 @@ def test_a_composition_leaves_nothing_behind(command: str) -> None:
 
 
 BAD = [  # overrides of `plan` unless another command is named, and what the line must say
+    ("task=[crossing,clearing]", "task=[crossing,clearing]: task takes one choice, not a list"),
+    ("margin=0.07500001", "not 0.07500001"),
     ("task=juggling", "unknown task 'juggling': choose from clearing, "),
     ("planner.optimizer=best", "unknown planner/optimizer 'best': choose from cem, "),
     ("planner.optimizer=my_lab.Mine", "a class of your own is planner.optimizer._target_=my_lab.Mine"),
