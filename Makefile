@@ -33,7 +33,7 @@ demo: $(installed)
 
 test: $(installed_for_tests)
 	$(MAKE) --no-print-directory --jobs 2 --output-sync $(checks)
-	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 1
 
 soak: $(installed_for_tests)
 	OMP_NUM_THREADS=1 $(bin)/python -m pytest -n 2 --dist worksteal -m soak

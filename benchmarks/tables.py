@@ -1,9 +1,9 @@
 """Write the tables of docs/results.md and README.md from docs/results: `python benchmarks/tables.py`.
 
 A table stands between `<!-- table: NAME -->` and `<!-- end -->`. Each follows from one file of docs/results with a row
-per episode (or per measured time, or predicted object), and says how many episodes it has, their seeds, and the commit
-that ran them. Rates have Wilson's intervals at 95 %; two planners in the same scenes are compared by the exact McNemar
-test. `--check` writes nothing and fails if a page would change.
+per episode (or per measured time, or predicted object), which also names the commit that ran it. Rates have Wilson's
+intervals at 95 %; two planners in the same scenes are compared by the exact McNemar test. `--check` writes nothing and
+fails if a page would change.
 """
 
 from __future__ import annotations
@@ -105,16 +105,15 @@ def readme() -> str:
 
 
 def success(name: str = "success") -> str:
-    """One line per row and rules: success, pushes and failures of each task, with their seeds and commit."""
+    """One line per row and rules: success, pushes and failures of each task, with their seeds."""
     rows = read(name)
     tasks = list(groups(rows, "task"))
     lines = []
     for (row, rules), found in groups(rows, "row", "rules").items():
         by_task = groups(found, "task")
         counts = ", ".join(sorted({str(len(of_task)) for of_task in by_task.values()}))
-        commits = ", ".join(sorted({one["commit"] for one in found}))
-        lines.append([row, rules, counts, *(_ends(by_task.get(task, [])) for task in tasks), seeds(found), commits])
-    return markdown(["row", "rules", "episodes", *(task for (task,) in tasks), "seeds", "commit"], lines)
+        lines.append([row, rules, counts, *(_ends(by_task.get(task, [])) for task in tasks), seeds(found)])
+    return markdown(["row", "rules", "episodes", *(task for (task,) in tasks), "seeds"], lines)
 
 
 def _ends(rows: Sequence[Row]) -> str:
@@ -150,7 +149,7 @@ def additions() -> str:
         lines.append(line)
     head = [text for task, objects in cells for text in (f"{task}, {objects}", "violations and falls, pushes")]
     table = markdown(["left out", "scenes", *head], lines)
-    return f"{table}\nSeeds {seeds(rows)}, commit {', '.join(sorted({row['commit'] for row in rows}))}.\n"
+    return f"{table}\nSeeds {seeds(rows)}.\n"
 
 
 def reproduction() -> str:

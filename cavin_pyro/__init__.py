@@ -8,9 +8,11 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # typing's takes a while to import, in which an interruption would be a traceback
 if TYPE_CHECKING:
+    from typing import Any
+
     from cavin_pyro.evaluation.comparison import compare
     from cavin_pyro.evaluation.evaluation import evaluate
     from cavin_pyro.evaluation.factory import make_env, make_planner

@@ -12,7 +12,7 @@ from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.cavin import EffectSpace
-from cavin_pyro.planning.checks import NoFiniteCandidateError, check_scenes
+from cavin_pyro.planning.checks import NoFiniteCandidateError, UnsuitedError, check_scenes
 from cavin_pyro.planning.protocol import (
     ActionModel,
     EffectActionModel,
@@ -284,7 +284,10 @@ class PolicyPlanner:
         """`[B, T, A]`, here of one scene; ValueError: several, or another action than `[1, A]`."""
         if len(generators) > 1:
             raise ValueError(f"a policy acts in one scene at a time, not in {len(generators)}")
-        actions = self.policy(state.map(lambda field: field[0]), as_reward(reward), observed)
+        try:
+            actions = self.policy(state.map(lambda field: field[0]), as_reward(reward), observed)
+        except ValueError as error:
+            raise UnsuitedError(str(error)) from error
         if actions.shape != (1, self.action_dimension):
             raise ValueError(f"a policy must give an action [1, {self.action_dimension}], not {list(actions.shape)}")
         return actions[None]

@@ -26,6 +26,10 @@ class OptimizerError(ValueError):
     """An optimizer breaks the interface `cavin_pyro.planning.optimizers.Optimizer`; the message names its class."""
 
 
+class UnsuitedError(ValueError):
+    """A planner or an addition asks for what this world does not have."""
+
+
 def check_horizon(horizon: int, segment_length: int) -> None:
     """Raise ValueError, naming the nearest valid ones, unless H is a positive multiple of T (section 3.2)."""
     check_number("horizon", horizon, 1, whole=True)

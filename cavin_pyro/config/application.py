@@ -51,6 +51,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             # Hide deprecations of third parties from users; in tests they are errors.
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             logging.getLogger("hydra").addHandler(logging.NullHandler())  # what it logs of a wrong class, our line says
+            os.environ["MPLBACKEND"] = "agg"  # whatever the shell has: figures are drawn into files
             # Torch, not imported yet, reads it. Several threads wait for one another after each of many small products:
             # where another program uses a core, plans would take fifty times as long, and training would stand still.
             os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -38,6 +38,7 @@ SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video", "
 SAME_RUN |= {"episodes", "compare"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
 VALUE = re.compile(r"""'(\\.|[^'\\])*'|"(\\.|[^"\\])*"|[^\s,:'"(){}\[\]=]([^,:'"(){}\[\]]*[^\s,:'"(){}\[\]])?""")
+PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "compare", "export", "models", "table", "env.assets")
 OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")
 
 
@@ -74,10 +75,10 @@ def composed(name: str, overrides: Sequence[str], config_dir: str | None = None)
         with hydra.initialize(version_base="1.3", config_path=None):
             try:
                 return _composed(name, words)
-            except UserError:
-                raise
             except Exception as error:
-                raise UserError(_explained(name, words, error)) from error
+                said = str(error) if isinstance(error, UserError) else _explained(name, words, error)
+                own = "env" if any(word.startswith(("env=", "env.")) for word in overrides) else "world"  # as typed
+                raise UserError(re.sub(r"\bworld(?=\.)|(?<= under )world\b", own, said)) from error
     finally:
         GlobalHydra.instance().hydra = running
 
@@ -175,12 +176,17 @@ def rewritten(overrides: Sequence[str], *, plans: bool = False) -> list[str]:
 
 
 def _quoted(word: str) -> str:
-    """An override whose values with letters outside of ASCII, which Hydra's grammar lacks, are in quotes."""
+    """An override in Hydra's grammar: what it lacks, such as letters outside of ASCII, is put into quotes."""
     key, sign, value = word.partition("=")
     for one in reversed([*VALUE.finditer(value)]):
         if not one[0].isascii() and one[0][0] not in "'\"":
             quoted = QuotedString(one[0], Quote.single).with_quotes()
             value = value[: one.start()] + quoted + value[one.end() :]
+    if key in PATHS:
+        try:
+            OverridesParser.create().parse_override(key + sign + value)
+        except HydraException:
+            value = QuotedString(value, Quote.single).with_quotes()
     return key + sign + value
 
 
@@ -284,8 +290,15 @@ def _unknown(name: str, key: str, known: DictConfig) -> str:
     while section and not OmegaConf.is_dict(OmegaConf.select(known, section)):
         section = section.rpartition(".")[0]
     names = sorted({*map(str, OmegaConf.select(known, section) if section else known)} - {last, "hydra"})
-    close = difflib.get_close_matches(last, names, n=1, cutoff=0.7)
-    others = [one for one in COMMANDS if one != name and key in {option.name for option in options(COMMANDS[one])}]
+    there = section == key.rpartition(".")[0]
+    close = difflib.get_close_matches(last, names, n=1, cutoff=0.7) if there else []
+    first = key.partition(".")[0]  # of sections that presets fill
+    others = [
+        one
+        for one, schema in COMMANDS.items()
+        if one != name
+        and (key in {option.name for option in options(schema)} or (not there and hasattr(schema, first)))
+    ]
     return (
         f"unknown option {key!r}: "
         + (f"it is an option of {', '.join(others)}; " if others else "")

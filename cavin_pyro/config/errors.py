@@ -42,7 +42,7 @@ def user_input(*sections: str, where: str = "") -> Iterator[None]:
             raise UserError(f"{where}: {error}") from error
         error.sections = error.sections or sections
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # the user's modules may end the program
         kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "
         refused = UserError(f"{where and f'{where}: '}{kind}{one_line(error)}{kind and '; --traceback shows where'}")
         refused.sections = sections

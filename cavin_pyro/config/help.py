@@ -105,7 +105,7 @@ def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tupl
     """The options of a part and of the parts in it, with what its class says of each; without one, the meaning."""
     try:
         found = section.get("_target_") and get_object(section["_target_"])
-    except Exception:  # a user's module may raise anything; building the part says it in one line
+    except (Exception, SystemExit):  # a user's module may raise anything; building the part says it in one line
         found = None
     meanings, kind = _meanings(found, section), "function" if inspect.isfunction(found) else "class"
     for name, value in section.items():

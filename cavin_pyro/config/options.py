@@ -193,7 +193,7 @@ def constructor_options(target: str) -> dict[str, inspect.Parameter]:
     """
     try:
         found = get_object(target)
-    except Exception:  # a user's module may raise anything; building the part says it in one line
+    except (Exception, SystemExit):  # a user's module may raise anything; building the part says it in one line
         return {}
     constructors = [found]
     if inspect.isclass(found):

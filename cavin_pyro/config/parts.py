@@ -41,7 +41,7 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
         return instantiate(config, _partial_=True, _convert_="all")(*arguments, **keywords)
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         cause = (isinstance(error, InstantiationException) and error.__cause__) or error
         said = "" if isinstance(cause, ValueError) else f"{config['_target_']} cannot be built: "
         raise UserError(said + one_line(cause)) from error
@@ -123,7 +123,7 @@ def class_of(config: Config) -> Any:
     """The class of a part, None if there is no such class."""
     try:
         return get_class(config["_target_"])
-    except Exception:  # a user's module may raise anything; `construct` says it in one line
+    except (Exception, SystemExit):  # a user's module may raise anything; `construct` says it in one line
         return None
 
 

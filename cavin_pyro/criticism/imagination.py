@@ -19,7 +19,7 @@ from cavin_pyro.criticism.subgoals import execute
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.envs.world import World
 from cavin_pyro.models.model import Model
-from cavin_pyro.planning.rollout import predict_states
+from cavin_pyro.planning import rollout
 from cavin_pyro.planning.sampling import sample_codes
 from cavin_pyro.visualization.drawing import (
     FONT,
@@ -82,8 +82,8 @@ def imagine(model: Model, world: World, *, seed: int = 0, effects: int = 8, moti
     subgoals = model.subgoal(state.expand_plans(effects), code).centers[0].numpy()
     here, code = state.expand_plans(effects * motions), code.repeat_interleave(motions, dim=1)
     motion_code = sample_codes(model.motion_prior, [here, code], None, generators)
-    actions = model.actions(here, effect_code=code, motion_code=motion_code)
-    predicted = predict_states(model, here, actions)[1][0].numpy()
+    actions = rollout.project(model.actions(here, effect_code=code, motion_code=motion_code), None)  # as executed
+    predicted = rollout.predict_states(model, here, actions)[1][0].numpy()
     reached = []
     for plan in actions[0].numpy():
         world.reset(seed=seed)

@@ -166,6 +166,8 @@ def _check_agreement(arrays: Arrays, metadata: Mapping[str, Any]) -> None:
         raise ValueError(f"array length: {arrays['length'].max()} pushes in an episode of {pushes}")
     if {"target", "mask"} <= set(arrays) and arrays["target"].max() >= (slots := arrays["mask"].shape[1]):
         raise ValueError(f"array target: object {arrays['target'].max()} of {slots}")
+    if "mask" in arrays and not arrays["mask"].any(axis=-1).all():
+        raise ValueError("array mask: an episode without an object")
     for name, least in (("shape", 0), ("scale", 1e-6)):
         if {name, "mask"} <= set(arrays) and (arrays[name][arrays["mask"]] < least).any():
             raise ValueError(f"array {name}: {arrays[name][arrays['mask']].min()} of an object that is there")

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
-import os
-import tempfile
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,6 +19,7 @@ from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.data.episodes import checked, checked_actions, checked_episode, checked_mask, packed
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
+from cavin_pyro.data.finding import WindowFinder
 from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
@@ -172,9 +168,14 @@ class WindowTable:
             together = packed(episodes, range(len(episodes)), longest)
         config = WindowConfig(negative_fraction=negative_fraction)
         states, slots = len(episodes) * (longest + 1), together["mask"].shape[1]
-        found = _Finder(config, segment_length, seed, "of these episodes", slots, states, None, space)
+        found = WindowFinder(config, segment_length, seed, "of these episodes", slots, states, None, space)
         found.add(together, held)
-        return found.table()
+        return cls(**found.found())
+
+    @property
+    def objects(self) -> int:
+        """The most objects of any state."""
+        return int(self._objects.max())
 
     def move(self, device: torch.device, room: int) -> bool:
         """Give batches on a device; also keep states and pushes there if they take at most `room` bytes.
@@ -264,12 +265,14 @@ def load_windows(
     excluded = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")
     where = " and ".join(map(str, folders))
     states = sum(metadata["episodes"] * (metadata["configuration"]["steps"] + 1) for metadata in every)
-    found = _Finder(config, segment_length, seed, where, max(map(dataset.slots_of, every)), states, storage, space)
+    found = WindowFinder(config, segment_length, seed, where, max(map(dataset.slots_of, every)), states, storage, space)
     names = NEEDED if space is None else tuple(dataset.WORLD_ARRAYS)
     with progress_bar("reading", total=sum(metadata["shards"] for metadata in every), unit="file") as bar:
-        for folder, numbers in zip(folders, excluded, strict=True):
+        for folder, numbers, metadata in zip(folders, excluded, every, strict=True):
+            made = 0
             for number, arrays in dataset.iterate_shards(folder, names, skip_corrupt=skip_corrupt):
                 bar.update()
+                made += int(arrays["length"].sum())
                 if geometry is None:
                     found.add(arrays)
                     continue
@@ -282,7 +285,12 @@ def load_windows(
                     continue
                 kept = ~held_out(arrays, numbers).any(axis=-1)
                 found.add({name: array[kept] for name, array in arrays.items()})
-    return found.table()
+            if made != metadata["transitions"] and not skip_corrupt:
+                said = f"{made} transitions, and its metadata say {metadata['transitions']}"
+                raise UserError(
+                    f"{folder} has {said}: collect it again, or train on what is there with skip_corrupt=true"
+                )
+    return WindowTable(**found.found())
 
 
 def shared_space(folders: Sequence[Path]) -> Space | None:
@@ -313,135 +321,3 @@ def _held_out(numbers: Tensor, steps: int, fraction: float, seed: int) -> Tensor
     count = min(max(1, round(fraction * len(distinct))), len(distinct) - 1)
     order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
     return torch.isin(numbers, distinct[order[:count]])
-
-
-class _Finder:
-    """Finds the windows in one shard after another, and holds no more of them than where they start."""
-
-    def __init__(
-        self,
-        config: WindowConfig,
-        segment_length: int,
-        seed: int,
-        where: str,
-        slots: int,
-        states: int,
-        storage: Path | None,
-        space: Space | None = None,
-    ) -> None:
-        """`slots`: M, that of the dataset with the most objects. `states`: how many there are at most.
-
-        `space`: of the world; None of the tabletop.
-        """
-        self._config, self._length, self._seed, self._where = config, segment_length, seed, where
-        self._space = space
-        self._slots, self._states, self._storage = slots, states, storage
-        self._turns = np.random.default_rng(seed)
-        self._stored: Arrays = {}  # positions in time, episode after episode
-        self._windows: dict[str, list[NDArray[Any]]] = {
-            name: [] for name in ("starts", "sequence_mask", "episodes", "held_out")
-        }
-        self._episodes = self._filled = 0
-
-    def add(self, episodes: Arrays, held_out: NDArray[np.bool_] | None = None) -> None:
-        """Add the episodes of a shard; `held_out`: which are for validation, `[E]`, by default by their number.
-
-        Raises:
-            UserError: they are too short, or not shaped as the metadata say.
-        """
-        T, config, positions = self._length, self._config, episodes["centers"].shape[1]
-        if positions <= T:
-            raise UserError(
-                f"dataset {self._where} has {positions - 1} pushes per episode, too few for windows of "
-                f"T={T}: collect with steps of at least that many"
-            )
-        episodes = dataset.padded(episodes, self._slots)
-        mask, length = episodes["mask"], episodes["length"]
-        made = np.arange(positions - 1)[None] < length[:, None]
-        if self._space is None:
-            visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
-            counts = made & _transitions_that_count(episodes, visible, config.maximum_step)
-            moved = _moves(episodes["centers"], mask, T)
-            flawed = episodes["unsafe"] | episodes["fallen"]
-            informative = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
-            informative &= visible[:, :-T] & visible[:, T:]
-            informative &= (moved > config.minimum_move) & (moved < config.maximum_move)
-        else:
-            counts = made
-            informative = _moves(episodes["centers"], mask, T) > self._space.center_scale
-            informative |= _moves(episodes["features"], mask, T) > self._space.feature_scale
-        exists = np.arange(positions - T)[None] + T <= length[:, None]
-
-        # The split depends on the episode's number alone, so more data does not change it.
-        if held_out is None:
-            numbers = [[self._seed, int(number)] for number in episodes["episode"]]
-            shares = np.array([np.random.default_rng(number).random() for number in numbers])
-            held_out = shares < config.validation_fraction
-        validation = np.broadcast_to(held_out[:, None], exists.shape)
-        chosen = exists & (informative | (self._turns.random(exists.shape) < config.negative_fraction))
-
-        episode, start = np.nonzero(chosen)
-        found = {"starts": self._filled + episode * positions + start, "sequence_mask": informative[chosen]}
-        for name, values in {**found, "episodes": self._episodes + episode, "held_out": validation[chosen]}.items():
-            self._windows[name].append(values)
-        self._episodes += len(mask)
-        self._store(
-            centers=episodes["centers"],
-            features=episodes["features"],
-            mask=np.repeat(mask[:, None], positions, axis=1),
-            actions=np.pad(episodes["actions"], ((0, 0), (0, 1), (0, 0))),
-            counts=np.pad(counts, ((0, 0), (0, 1))),
-        )
-
-    def _store(self, **arrays: NDArray[Any]) -> None:
-        """Append arrays [E, S+1, ...]."""
-        filled = self._filled + arrays["mask"].shape[0] * arrays["mask"].shape[1]
-        if filled > self._states:
-            raise UserError(f"dataset {self._where} has more episodes than its metadata tell: collect it again")
-        for name, array in arrays.items():
-            rows = array.reshape(-1, *array.shape[2:])
-            if name not in self._stored:
-                self._stored[name] = _mapped(self._storage, (self._states, *rows.shape[1:]), rows.dtype)
-            self._stored[name][self._filled : filled] = rows
-        self._filled = filled
-
-    def table(self) -> WindowTable:
-        """All windows that were found.
-
-        Raises:
-            UserError: there is none to train on, or none to validate with.
-        """
-        if not self._stored:
-            raise UserError(f"dataset {self._where} has no usable shard: collect it again, with the same options")
-        stored = {name: torch.from_numpy(array[: self._filled]) for name, array in self._stored.items()}
-        states = State(stored["centers"], stored["features"], stored["mask"])
-        windows = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in self._windows.items()}
-        table = WindowTable(states, stored["actions"], stored["counts"], **windows, segment_length=self._length)
-        for name in ("training", "validation"):
-            if not table.sequence_mask[getattr(table, name)].any():
-                least = f"{self._config.minimum_move:g} m" if self._space is None else "the space's scales"
-                raise UserError(
-                    f"dataset {self._where} has no {name} window in which an object moved more than {least}: "
-                    "collect more transitions"
-                )
-        return table
-
-
-def _mapped(folder: Path | None, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """An array in a temporary file, which need not fit in memory; without a name, so that it goes with the process."""
-    with tempfile.TemporaryFile(dir=folder) as file:
-        # A full disk is an error here; of a mapped file it would be a signal that ends the process.
-        os.posix_fallocate(file.fileno(), 0, max(1, dtype.itemsize * math.prod(shape)))
-        return np.memmap(file, dtype, mode="r+", shape=shape)
-
-
-def _transitions_that_count(episodes: Arrays, visible: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:
-    """Which pushes [E, S] the dynamics f learns from, if they were made."""
-    small = _moves(episodes["centers"], episodes["mask"], 1) < maximum_step
-    return small & ~episodes["fallen"] & visible[:, :-1] & visible[:, 1:]
-
-
-def _moves(values: NDArray[np.float32], mask: NDArray[np.bool_], steps: int) -> NDArray[np.float32]:
-    """How far the object goes in some steps that goes farthest: `[E, S+1, M, ...]`, `[E, M]` -> `[E, S+1 - steps]`."""
-    distance = np.linalg.norm(values[:, steps:] - values[:, :-steps], axis=-1)
-    return np.where(mask[:, None], distance, 0.0).max(axis=-1)

@@ -12,10 +12,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import flat_options
+from cavin_pyro.evaluation.rollout import OUTCOMES
 from cavin_pyro.evaluation.rows import Row, violation
 from cavin_pyro.evaluation.statistics import mcnemar
+from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.storage.run_directory import stored_options
 
 # Options, or sections of them.
@@ -78,7 +80,12 @@ def _opened(evaluation: Evaluation) -> tuple[Sequence[Mapping[str, Any]], Row | 
     """The rows of an evaluation, and its options if it is a folder."""
     if isinstance(evaluation, str | Path):
         return _finished(Path(evaluation))
-    return (evaluation["per_episode"] if isinstance(evaluation, Mapping) else evaluation), None
+    with user_input(where="these rows are no evaluation"):
+        rows = evaluation["per_episode"] if isinstance(evaluation, Mapping) else evaluation
+        for row in rows:
+            check_choice("outcome", row["outcome"], OUTCOMES)
+            check_number("seed", row["seed"], whole=True)
+    return rows, None
 
 
 def _finished(folder: Path) -> tuple[list[Row], Row]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -13,11 +13,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning import Plan, Planner
-from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError
+from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError, UnsuitedError
 from cavin_pyro.planning.records import apply
 from cavin_pyro.planning.rollout import project
 
@@ -167,26 +169,28 @@ def rollout(
 
     Raises:
         UserError: no episode can begin from the seed, the planner found no plan with finite numbers, or an
-            optimizer of the user's own breaks the interface of optimizers.
+            optimizer, a world or a planner of the user's own raises an error.
         RuntimeError: the robot stands in the camera's view.
     """
-    if push_decimals is not None and not 1 <= push_decimals <= 6:
-        raise UserError(f"push_decimals must be None or between 1 and 6, not {push_decimals}")
+    with user_input():
+        check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
+        check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
-    with _refusals(seed):
+    with _refusals(seed, env):
         observation, _ = env.reset(seed=seed)
-    goal = env.goal(device)
+        goal = env.goal(device)
     for callback in callbacks:
         callback.on_observation(observation)
     ended = False
     while not ended:
         began = time.perf_counter()
-        state = env.state(observation).map(lambda field: field.unsqueeze(0).to(device))
-        shown = env.observed(observation)
+        with _refusals(seed, env):
+            state = env.state(observation).map(lambda field: field.unsqueeze(0).to(device))
+            shown = env.observed(observation)
         shown = shown and apply(shown, lambda field: field.to(device))
-        with _refusals(seed):
+        with _refusals(seed, planner):
             left = env.maximum_steps - len(episode.transitions)
             plan = planner.plan(state, reward=goal, generators=[generator], observed=shown, steps_left=left)
         plan = apply(plan, lambda field: field.cpu())
@@ -207,9 +211,10 @@ def rollout(
         if not 1 <= (len(actions) if pushes_per_plan is None else pushes_per_plan) <= len(actions):
             raise UserError(f"pushes_per_plan must be between 1 and {len(actions)}, not {pushes_per_plan}")
         for number, action in enumerate(actions[:pushes_per_plan]):
-            observation, earned, terminated, truncated, info = env.step(action)
+            with _refusals(seed, env):
+                observation, earned, terminated, truncated, info = env.step(action)
+                centers, _ = env.positions(observation)
             last = number == len(actions) - 1
-            centers, _ = env.positions(observation)
             ends = info if "violation" in info else {**info, "violation": terminated and not info["success"]}
             strict = {**ends, "reward": earned, **info.get("strict", {})}
             transition = Transition(
@@ -238,11 +243,13 @@ def rollout(
 
 
 @contextmanager
-def _refusals(seed: int) -> Iterator[None]:
-    """What is wrong with a scene or an optimizer, as a `UserError`."""
+def _refusals(seed: int, part: World | Planner) -> Iterator[None]:
+    """What is wrong with a scene or a search, and whatever a part of the user's own raises, as a `UserError`."""
+    ours = type(part).__module__.startswith("cavin_pyro.")
     try:
-        yield
-    except (OptimizerError, NoFiniteCandidateError) as error:
+        with nullcontext() if ours else user_input("env", "planner"):
+            yield
+    except (OptimizerError, NoFiniteCandidateError, UnsuitedError) as error:
         raise UserError(str(error)) from error
     except NoRoomError as error:
         raise UserError(f"seed={seed}: {error}") from error

@@ -17,12 +17,13 @@ from torch import Tensor, nn
 from cavin_pyro.config.commands import DEFAULT_CHECKPOINT, TrainerConfig, WindowConfig
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.options import configured, constructor_options, shown
+from cavin_pyro.config.options import MAXIMUM_SEED, configured, constructor_options, shown
 from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, describe
 from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
 from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
@@ -117,6 +118,8 @@ def fit(
     if unknown := sorted(set(trainer) - set(vars(options))):
         raise UserError(f"fit has no option {unknown[0]!r}: choose from {', '.join(vars(options))}")
     with user_input():
+        check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
+        _check_parts(model, guide, windows)
         objective = as_objective(Trace_ELBO(max_plate_nesting=1) if objective is None else objective)
         objective.check(model, guide)
     signs = _mirror_signs(options.reflect, geometry, guide)
@@ -162,6 +165,19 @@ def fit(
         row = next(row for row in run.rows if row["step"] == run.best_step)
         write_json(folder / "metrics.json", {**record, "steps": run.step, "best": row})
     return run
+
+
+def _check_parts(model: Model, guide: Guide, windows: WindowTable) -> None:
+    """Raise ValueError for a guide of another model, or windows of other sizes than the model's."""
+    if guide.model is not model:
+        raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
+    one = windows.batch(windows.training[:1])
+    given = [one.states.centers.shape[-1], one.states.features.shape[-1], one.actions.shape[-1]]
+    wanted = [model.space.positions, model.feature_dimension, model.space.actions]
+    if given != wanted or windows.objects > model.maximum_objects:
+        sizes = "positions, features and actions of {}, {} and {} numbers"
+        most = f"{windows.objects} objects, not up to {model.maximum_objects}"
+        raise ValueError(f"the windows have {sizes.format(*given)}, not {wanted}, and {most}: build the model for them")
 
 
 def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int, seed: int, where: str) -> None:

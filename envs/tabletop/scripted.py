@@ -28,7 +28,12 @@ class ScriptedPush:
     """
 
     def __call__(self, state: State, reward: TaskReward, observed: ObservedPoints) -> Tensor:
-        """The next normalised push `[1, 4]` in the scene `state: []`; `observed`: a batch of one."""
+        """The next normalised push `[1, 4]` in the scene `state: []`; `observed`: a batch of one.
+
+        Raises ValueError for another world's reward.
+        """
+        if not isinstance(reward, TaskReward):
+            raise ValueError("planner=scripted knows the ways of the tabletop alone: choose another planner here")
         remaining = reward.distance_to_goal()
         real = state.mask.nonzero()[:, 0]
         objects = len(real) if reward.about == "all" else 1

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions.addition import Addition, ChosenEffect
+from cavin_pyro.planning.checks import UnsuitedError
 from cavin_pyro.planning.protocol import (
     Query,
     RemainingDistance,
@@ -37,7 +38,7 @@ CONTINUES = 0.9  # after each segment; 1 values the last state alone
 class Guidance(Addition):
     """Prefers, among plans that miss the goal, those that leave the shortest way to it along allowed places.
 
-    Plans raise ValueError for a reward that does not know the remaining distance to the goal.
+    Plans raise UnsuitedError for a reward that does not know the remaining distance to the goal.
 
     actions_per_length: turns distances into returns, whose unit is an action; a push moves an object by about 0.05.
     """
@@ -47,7 +48,7 @@ class Guidance(Addition):
     def wrap_objective(self, objective: SearchObjective, scene: Query, effect: ChosenEffect | None) -> SearchObjective:
         distance = scene.reward.distance_to_goal()
         if distance is None:
-            raise ValueError("the addition guidance needs a reward with a `distance_to_goal`: leave it out")
+            raise UnsuitedError("the addition guidance needs a reward with a `distance_to_goal`: leave it out")
         if effect is None:
             return GuidedReturn(objective, distance, self.actions_per_length)
         return GuidedTracking(objective, distance, effect.subgoals, effect.segments, ~effect.succeeded)

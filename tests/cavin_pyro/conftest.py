@@ -62,7 +62,10 @@ def start_command(command: str, *overrides: str, folder: Path, quiet: bool = Fal
 def run_as_users(command: str, *overrides: str, folder: Path) -> Answer:
     """Run a command with an interpreter of its own, from the folder, and with the limits of this process."""
     with start_command(command, *overrides, folder=folder) as process:
-        output, errors = process.communicate(timeout=300)
+        try:
+            output, errors = process.communicate(timeout=300)
+        finally:
+            process.kill()
     return Answer(process.returncode, output, errors)
 
 

@@ -73,7 +73,7 @@ def test_a_wall_stops_the_ball_and_the_goal_ends_the_episode(env: Maze) -> None:
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [({"maximum_steps": 0}, "=0"), ({"cells": 30}, "=30"), ({"render_mode": "human"}, "='human'")],
+    [({"maximum_steps": 0}, "not 0$"), ({"cells": 30}, "not 30$"), ({"render_mode": "human"}, "'human'")],
 )
 def test_what_it_cannot_be_is_one_line(options: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):

@@ -43,6 +43,7 @@ def test_every_preset_is_composed_and_helps_with_whole_sentences(command: str, o
 def test_a_path_may_have_letters_outside_of_ascii() -> None:
     config = compose("train", "data=[a/ü=ü,b ü/c]", "output='ü\\'s'")
     assert (config.data, config.output) == (["a/ü=ü", "b ü/c"], "ü's")
+    assert [compose("plan", f"output={path}").output for path in ("a(b", "{x}", "a=b")] == ["a(b", "{x}", "a=b"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -93,6 +94,8 @@ def test_a_composition_leaves_nothing_behind(command: str) -> None:
 BAD = [  # overrides of `plan` unless another command is named, and what the line must say
     ("task=[crossing,clearing]", "task=[crossing,clearing]: task takes one choice, not a list"),
     ("margin=0.07500001", "not 0.07500001"),
+    ("train planner.samples=3", "unknown option 'planner.samples': it is an option of plan, evaluate; valid are"),
+    ("collect env=pusht env.camera=kinect2", "unknown option 'env.camera': "),
     ("task=juggling", "unknown task 'juggling': choose from clearing, "),
     ("planner.optimizer=best", "unknown planner/optimizer 'best': choose from cem, "),
     ("planner.optimizer=my_lab.Mine", "a class of your own is planner.optimizer._target_=my_lab.Mine"),

@@ -169,6 +169,14 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
     assert len(table.validation) and not set(table.episodes[table.validation]) & set(table.episodes[table.training])
     model = FlatModel(space=Point.space, feature_dimension=1, maximum_objects=1, width=8)
     cavin_pyro.fit(model, FlatGuide(model, width=8), table, steps=1, batch_size=4, output=tmp_path / "mine")
+    other = FlatModel(space=Point.space, feature_dimension=2, maximum_objects=1, width=8)
+    for programs, more, said in (
+        ((model, FlatGuide(other, width=8)), {}, "^the guide was built for another model"),
+        ((other, FlatGuide(other, width=8)), {}, r"of 2, 1 and 2 numbers, not \[2, 2, 2\]"),
+        ((model, FlatGuide(model, width=8)), {"seed": -1}, "^seed must be a whole number of at least 0"),
+    ):
+        with pytest.raises(UserError, match=said):
+            cavin_pyro.fit(*programs, table, steps=1, **more)
     again = cavin_pyro.load(tmp_path / "mine" / "checkpoint.safetensors")
     assert again.geometry is None and cavin_pyro.fit(again.model, again.guide, table, steps=1, batch_size=4).step == 1
     for wrong, said in (
@@ -177,6 +185,7 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
         ({"mask": [[False]] * 10}, "^episode 0: mask has a state without an object"),
         ({"mask": [[True]]}, "^give a Space, and as many .* not Space and 10, 10, 10, 1$"),
         ({"space": {}}, "^give a Space, .*, not dict and "),
+        ({"features": [2 * one for one in given["features"]]}, "has features that are not of length 1"),
         ({"segment_length": 1.5}, "^segment_length must be a whole number of at least 1, not 1.5$"),
     ):
         with pytest.raises(UserError, match=said):

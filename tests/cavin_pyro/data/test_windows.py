@@ -168,6 +168,13 @@ def test_datasets_without_a_window_are_refused(tmp_path: Path) -> None:
             load_windows([folder], PointNet(), WindowConfig(validation_fraction=fraction))
 
 
+def test_lengths_that_contradict_the_metadata_are_refused(tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "data", made_up_episodes())
+    write_metadata(folder, {**read_metadata(folder), "transitions": 7})
+    with pytest.raises(UserError, match=r"has \d+ transitions, and its metadata say 7: collect it again"):
+        load_windows([folder], PointNet(), EVERY)
+
+
 def test_intact_shards_of_a_damaged_dataset_are_used_with_skip_corrupt(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

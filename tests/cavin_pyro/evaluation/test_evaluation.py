@@ -155,7 +155,7 @@ def test_the_first_pushes_of_a_plan_are_made_and_then_the_next_plan(
     [
         ({"pushes_per_plan": 0}, "pushes_per_plan must be between 1 and 3, not 0"),
         ({"pushes_per_plan": 4}, "pushes_per_plan must be between 1 and 3, not 4"),
-        ({"push_decimals": -3}, "push_decimals must be None or between 1 and 6, not -3"),
+        ({"push_decimals": -3}, "push_decimals must be a whole number of at least 1 and at most 6, not -3"),
     ],
 )
 def test_as_many_pushes_and_decimals_of_a_plan_are_executed_as_there_are(

@@ -130,6 +130,9 @@ def test_scenes_are_counted_by_the_methods_that_solve_them() -> None:
     assert compare(ended([True] * 5), ended([False] * 5, first=3)[::-1]) == Comparison(0, 2, 0, 0, 0.5)
     with pytest.raises(UserError, match="no seed in common"):
         compare(ended([True] * 3), ended([True] * 3, first=3))
+    for wrong in ([{"seed": 0, "outcome": "sucess"}], [{"seed": 0}], {}):
+        with pytest.raises(UserError, match="^these rows are no evaluation: "):
+            compare(wrong, ended([True]))
 
 
 @given(st.integers(0, 20), st.integers(0, 20))

@@ -12,11 +12,12 @@ import torch
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.envs.tabletop.scripted import ScriptedPush
 from cavin_pyro.evaluation.evaluation import evaluate
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.evaluation.rollout import rollout
 from cavin_pyro.models.cascaded import CascadedModel
-from cavin_pyro.planning import CavinPlanner, RandomPlanner
+from cavin_pyro.planning import CavinPlanner, PolicyPlanner, RandomPlanner
 from cavin_pyro.storage.checkpoint import save
 from cavin_pyro.visualization.rendering import render_episode
 from tests.cavin_pyro.data.point import Point
@@ -62,6 +63,23 @@ def test_an_end_without_success_is_a_failure() -> None:
             return observation, reward, done, truncated, {"success": False}
 
     assert rollout(Trap(), Right(action_dimension=2), seed=0).outcome == "violation"
+
+
+def test_what_a_world_of_ones_own_raises_and_a_planner_that_does_not_suit_it_are_one_line() -> None:
+    class Broken(Point):
+        def step(self, action: np.ndarray) -> Any:
+            raise RuntimeError("the arm is stuck")
+
+    scripted = PolicyPlanner(ScriptedPush(), action_dimension=2)
+    guided = CavinPlanner(model(), samples=8, horizon=6, additions=["guidance"])
+    for world, planner, seed, said in (
+        (Broken(), Right(action_dimension=2), 0, "^RuntimeError: the arm is stuck; --traceback shows where$"),
+        (Point(), scripted, 0, "^planner=scripted knows the ways of the tabletop alone"),
+        (Point(), guided, 0, "^the addition guidance needs a reward"),
+        (Point(), Right(action_dimension=2), -1, "^seed must be a whole number of at least 0"),
+    ):
+        with pytest.raises(UserError, match=said):
+            rollout(world, planner, seed=seed)
 
 
 def test_the_cascade_plans_from_the_state_and_the_goal_of_a_world() -> None:
