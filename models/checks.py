@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -26,3 +26,11 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """Raise ValueError unless a value is one of the choices, which it names."""
     if value not in [*choices]:
         raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(map(str, choices))}")
+
+
+def check_kinds(given: Mapping[str, Any], kinds: Mapping[str, tuple[type, ...]]) -> None:
+    """Raise ValueError unless each value that `kinds` names is None or of one of its types."""
+    for name, allowed in kinds.items():
+        if not isinstance(given[name], (*allowed, type(None))):
+            wanted = " or ".join(one.__name__ for one in allowed)
+            raise ValueError(f"{name} must be of type {wanted}, not {given[name]!r}")

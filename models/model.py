@@ -12,6 +12,7 @@ from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from cavin_pyro.models.networks.dynamics import Dynamics, Outcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes
@@ -90,7 +91,7 @@ class Model(Program):
             dynamics: f; by default the paper's, `Dynamics`.
 
         Raises:
-            ValueError: scales that f must predict if it does not.
+            ValueError: a number out of range, or scales that f must predict if it does not.
         """
         super().__init__()
         self._encoding: tuple[Window, Tensor] | None = None
@@ -99,7 +100,10 @@ class Model(Program):
         self.feature_dimension = feature_dimension
         self.width = width
         self.maximum_objects = maximum_objects
+        for name in ("segment_length", "feature_dimension", "width", "maximum_objects"):
+            check_number(name, getattr(self, name), 1, whole=True)
         self.neighbours = maximum_objects - 1 if neighbours is None else neighbours
+        check_number("neighbours", self.neighbours, whole=True)
         self.scales = scales or LikelihoodScales(space)
         sizes = {"feature_dimension": feature_dimension, "width": width}
         self.encoder = StateEncoder(space, neighbours=self.neighbours, **sizes)
@@ -107,6 +111,8 @@ class Model(Program):
         self.dynamics.neighbours = self.neighbours
         if isinstance(self.scales, PredictedScales) and not self.dynamics.predicts_scales:
             raise ValueError("scales=predicted needs an f that predicts them: dynamics=contact")
+        if (space.unit_features or 0) > feature_dimension:
+            raise ValueError(f"a feature has {feature_dimension} numbers, and the space's unit_features are more")
 
     @property
     def action_dimension(self) -> int:

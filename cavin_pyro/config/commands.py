@@ -284,7 +284,6 @@ class EvaluateConfig(LaunchOptions, EpisodeConfig):
 
     output: str | None = option(None, FOLDER)
     episodes: int = option(200, "episodes, with seeds seed, seed + 1, ...", minimum=1)
-    compare: str | None = option(None, "folder of another evaluation of the same scenes, to compare episode by episode")
     shard: str = option("1/1", "i/n: the i-th of every n episodes, so that n machines share the work")
 
 

@@ -34,11 +34,10 @@ OUTPUT = {  # the folder of a run for which the user names none
     "reproduce": "runs/reproduce/{scale}",
 }
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
-SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video", "video_format"}
-SAME_RUN |= {"episodes", "compare"}
+SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video", "video_format", "episodes"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
 VALUE = re.compile(r"""'(\\.|[^'\\])*'|"(\\.|[^"\\])*"|[^\s,:'"(){}\[\]=]([^,:'"(){}\[\]]*[^\s,:'"(){}\[\]])?""")
-PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "compare", "export", "models", "table", "env.assets")
+PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "export", "models", "table", "env.assets")
 OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")
 
 

@@ -57,7 +57,7 @@ def lacks_memory(error: BaseException) -> bool:
 
 def one_line(error: BaseException) -> str:
     """What an exception says, in one line; its class if it says nothing."""
-    said = " ".join(str(error).split()) or type(error).__name__
+    said = " ".join(str(error).partition("Trace Shapes:")[0].split()) or type(error).__name__  # which Pyro appends
     more = f"these options need more memory than there is: choose smaller ones ({said[:160]})"
     return more if lacks_memory(error) else said
 

@@ -29,7 +29,7 @@ EXAMPLES = {
         "planner.optimizer=cem env.segmentation=clusters",
     ),
     "imagine": ("checkpoint=contact seed=1", "checkpoint=cavin task=clearing", "env=pusht checkpoint=pusht"),
-    "evaluate": ("task=crossing objects=3", "planner=paper compare=runs/mine", "-m task=clearing,insertion,crossing"),
+    "evaluate": ("task=crossing objects=3", "planner=paper", "-m task=clearing,insertion,crossing"),
     "reproduce": ("scale=smoke", "scale=medium planners=[paper]", "scale=paper shard=2/3"),
 }
 # --help lists the options that a user of the field changes, --help=all every one: those without a section, but

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
+from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.progress import progress_bar
 
 SEGMENT_LENGTH = 3  # T
@@ -110,6 +112,8 @@ class WindowTable:
         outlines = checked("features", features, torch.float32, (*places.shape[:3], None))
         transitions = checked("transition_mask", transition_mask, torch.bool, (W, T))
         sequences = checked("sequence_mask", sequence_mask, torch.bool, (W,))
+        if not (transitions.any() and sequences.any()):
+            raise UserError("transition_mask or sequence_mask is False everywhere: leave something to learn from")
         numbers = checked("episodes", range(W) if episodes is None else episodes, torch.int64, (W,))
         return cls(
             State(places, outlines, real).map(lambda field: field.flatten(0, 1)),
@@ -176,6 +180,12 @@ class WindowTable:
     def objects(self) -> int:
         """The most objects of any state."""
         return int(self._objects.max())
+
+    def content_record(self) -> dict[str, Any]:
+        """Size and digest of what is in it, by which a training knows its data again."""
+        tables = {**self._states._asdict(), "actions": self._actions, "transition_mask": self._transition_mask}
+        tables |= {"starts": self.starts, "sequence_mask": self.sequence_mask, "training": self.training}
+        return {"transitions": int(self._transition_mask.sum()), "fingerprint": tensors_digest(tables)}
 
     def move(self, device: torch.device, room: int) -> bool:
         """Give batches on a device; also keep states and pushes there if they take at most `room` bytes.
@@ -313,7 +323,7 @@ def shared_space(folders: Sequence[Path]) -> Space | None:
 
 def _held_out(numbers: Tensor, steps: int, fraction: float, seed: int) -> Tensor:
     """Which of the windows or episodes, by the number of their episode, are for validation: at least of one episode."""
-    check_number("validation_fraction", fraction, high=1, positive=True)
+    check_number("validation_fraction", fraction, high=0.99, positive=True)
     check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
     distinct = numbers.unique()
     if len(distinct) < 2 or steps == 0:

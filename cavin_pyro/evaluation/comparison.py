@@ -1,91 +1,104 @@
-"""Paired comparison of two evaluations on the same scenes."""
+"""Methods compared scene by scene: success, intervals and paired tests, in a table and as a page."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+import pandas as pd
 from omegaconf.errors import OmegaConfBaseException
+from statsmodels.stats.multitest import multipletests
 from yaml import YAMLError
 
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.config.options import flat_options
 from cavin_pyro.evaluation.rollout import OUTCOMES
 from cavin_pyro.evaluation.rows import Row, violation
-from cavin_pyro.evaluation.statistics import mcnemar
+from cavin_pyro.evaluation.statistics import hierarchical_interval, mcnemar, wilson
 from cavin_pyro.models.checks import check_choice, check_number
+from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.run_directory import stored_options
 
 # Options, or sections of them.
 SAME_SCENES = ("task", "layout", "tiles", "generated", "criterion", "objects", "maximum_steps", "env")
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Numbers of scenes that both methods solve, only the one, only the other, or neither, and a test.
-
-    p_value: of the exact two-sided McNemar test on the scenes that only one method solves.
-    """
-
-    both: int
-    one_alone: int
-    other_alone: int
-    neither: int
-    p_value: float
-
-    @property
-    def episodes(self) -> int:
-        """Scenes in the comparison."""
-        return self.both + self.one_alone + self.other_alone + self.neither
-
+READERS = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
+PAGE = """<!doctype html><meta charset="utf-8"><title>Comparison</title>
+<style>body {{ font: 16px sans-serif; margin: 2em }} td, th {{ padding: 0.3em 0.8em; text-align: right }}
+th:first-child {{ text-align: left }} tr:nth-child(even) {{ background: #f2f2f2 }}</style>
+<h1>Success, scene by scene</h1>{table}
+<p>Intervals are at 95 %: Wilson's over episodes; over trainings the bootstrap of trainings first and of their episodes
+then. p: exact McNemar test of the pairs of episodes that only the first method or only this one solves, and with Holm's
+correction. Detectable: the difference that so many pairs would show with a probability of 80 %.</p>"""
 
 Evaluation = str | Path | Mapping[str, Any] | Sequence[Mapping[str, Any]]
-"""The folder of a finished evaluation, what `evaluate` has returned, or its rows `per_episode`."""
+"""The folder of a finished evaluation, what `evaluate` has returned, its rows `per_episode`, or a table of episodes."""
 
 
-def compare(one: Evaluation, other: Evaluation) -> Comparison:
-    """Compare two evaluations scene by scene, where both have the seed.
+def compare(*evaluations: Evaluation, **methods: Sequence[Evaluation]) -> pd.DataFrame:
+    """Compare methods with the first, in the scenes that both have: a row per method.
 
-    cavin_pyro.compare("runs/evaluate/one", "runs/evaluate/other").p_value
+    table = cavin_pyro.compare("runs/one", "runs/other")
+    table = cavin_pyro.compare("runs/one", mine=["runs/seed-0", "runs/seed-1", "runs/seed-2"])  # three trainings
+
+    Args:
+        evaluations: one for each method. A table, FILE.csv or FILE.parquet of any program, has a row per episode with
+            `seed`, `success` and perhaps `steps`, `method` and `training`. methods: by name, evaluations that differ
+            in the training of their model.
+
+    Returns:
+        `episodes`, `trainings`, `success` and its `interval` in per cent, that `over trainings`, the share `solved at
+        the start`; `pairs`, `first alone`, `this alone`, `p`, `p, Holm`, and the `detectable` difference in points.
 
     Raises:
-        UserError: they have no seed in common, a folder holds no finished evaluation, or scenes of folders differ.
+        UserError: an evaluation that cannot be read or has a scene twice, other scenes, or none in common.
     """
-    (mine, here), (theirs, there) = _opened(one), _opened(other)
-    if here is not None and there is not None:
-        _check_same_scenes(here, there, other)
-    solved = {row["seed"]: row["outcome"] == "success" for row in theirs}
-    if len(solved) < len(theirs) or len({row["seed"] for row in mine}) < len(mine):
-        raise UserError("an evaluation has a seed twice: give each scene once")
-    pairs = [(row["outcome"] == "success", solved[row["seed"]]) for row in mine if row["seed"] in solved]
-    if not pairs:
-        raise UserError("the two evaluations have no seed in common: give both the same seed=")
-    counts = {kind: pairs.count(kind) for kind in ((True, True), (True, False), (False, True), (False, False))}
-    alone, others = counts[True, False], counts[False, True]
-    return Comparison(counts[True, True], alone, others, counts[False, False], mcnemar(alone, others))
+    given: list[tuple[str | None, Sequence[Evaluation]]] = [(None, [one]) for one in evaluations]
+    given += methods.items()
+    options: list[Row] = []
+    found = [
+        _rows(run, name or (Path(run).name if isinstance(run, str | Path) else f"method {number}"), training, options)
+        for number, (name, runs) in enumerate(given, 1)
+        for training, run in enumerate(runs)
+    ]
+    if not found:
+        raise UserError("there is nothing to compare: give at least one evaluation")
+    episodes = pd.concat(found, ignore_index=True)
+    if (twice := episodes.duplicated(["method", "training", "seed"])).any():
+        name, seed = episodes.loc[twice.idxmax(), ["method", "seed"]]
+        raise UserError(f"{name} has seed {seed} twice: give each scene once, or a column training")
+    groups = dict(iter(episodes.groupby("method", sort=False)))
+    (first, reference), *others = groups.items()
+    table = pd.DataFrame.from_dict({name: _rate(own) for name, own in groups.items()}, orient="index")
+    if others:
+        tests = {name: _test(reference, own, f"{name} and {first}") for name, own in others}
+        compared = pd.DataFrame.from_dict(tests, orient="index")
+        compared.insert(4, "p, Holm", multipletests(compared["p"], method="holm")[1])
+        table = table.join(compared)
+    return table
 
 
-def earlier_rows(folder: Path, config: DictConfig) -> list[Row]:
-    """The episodes of another evaluation, whose scenes and rules must be those of `config`, or a `UserError`."""
-    rows, theirs = _finished(folder)
-    _check_same_scenes(flat_options(OmegaConf.to_container(config, resolve=True)), theirs, folder)
-    return rows
-
-
-def _opened(evaluation: Evaluation) -> tuple[Sequence[Mapping[str, Any]], Row | None]:
-    """The rows of an evaluation, and its options if it is a folder."""
-    if isinstance(evaluation, str | Path):
-        return _finished(Path(evaluation))
-    with user_input(where="these rows are no evaluation"):
-        rows = evaluation["per_episode"] if isinstance(evaluation, Mapping) else evaluation
-        for row in rows:
-            check_choice("outcome", row["outcome"], OUTCOMES)
-            check_number("seed", row["seed"], whole=True)
-    return rows, None
+def _rows(run: Evaluation, name: str, training: int, options: list[Row]) -> pd.DataFrame:
+    """The episodes of an evaluation: method, training, seed, success (bool), steps; a folder's `options` grow."""
+    if isinstance(run, str | Path) and Path(run).suffix not in READERS:
+        rows, theirs = _finished(Path(run))
+        for mine in options[:1]:
+            _check_same_scenes(mine, theirs, run)
+        options.append(theirs)
+        found = pd.DataFrame(rows)
+    else:
+        with user_input(where=f"{run if isinstance(run, str | Path) else 'these rows'} is no evaluation"):
+            table: Any = run["per_episode"] if isinstance(run, Mapping) else run
+            found = READERS[Path(run).suffix](run) if isinstance(run, str | Path) else pd.DataFrame(table)
+            for seed in found["seed"]:
+                check_number("seed", seed, whole=True)
+            for outcome in found.get("outcome", ()):
+                check_choice("outcome", outcome, OUTCOMES)
+            for success in () if "outcome" in found else found["success"]:
+                check_choice("success", success, (True, False))
+    solved = found["outcome"] == "success" if "outcome" in found else found["success"].astype(bool)
+    labels = {key: value for key, value in (("method", name), ("training", training)) if key not in found}
+    return found.assign(success=solved, **labels)
 
 
 def _finished(folder: Path) -> tuple[list[Row], Row]:
@@ -95,26 +108,49 @@ def _finished(folder: Path) -> tuple[list[Row], Row]:
         theirs = stored_options(folder / "config.yaml")
     except OSError as error:
         name = Path(error.filename or folder).name
-        raise UserError(f"compare={folder} is no finished evaluation: {name}: {error.strerror}") from error
+        raise UserError(f"{folder} is no finished evaluation: {name}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, RecursionError, OmegaConfBaseException, YAMLError) as error:
-        raise UserError(f"compare={folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
+        raise UserError(f"{folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
     wrong = next(filter(None, map(violation, rows)), None) if isinstance(rows, list) else "no list of episodes"
     if wrong:
-        raise UserError(f"compare={folder} holds damaged results ({wrong}): evaluate it again")
+        raise UserError(f"{folder} holds damaged results ({wrong}): evaluate it again")
     return rows, theirs
 
 
 def _check_same_scenes(mine: Row, theirs: Row, folder: object) -> None:
     for name in sorted(set(mine) | set(theirs)):
         if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):
-            raise UserError(f"compare={folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes differ")
+            raise UserError(f"{folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes differ")
 
 
-def sentences(result: Comparison, other: Path) -> str:
-    """The comparison for people."""
-    share = [100 * (result.both + alone) / result.episodes for alone in (result.one_alone, result.other_alone)]
-    return (
-        f"success in the {result.episodes} scenes of both: {share[0]:.1f} % here, {share[1]:.1f} % in {other}\n"
-        f"both solve {result.both}, this one alone {result.one_alone}, the other alone {result.other_alone}, "
-        f"neither {result.neither}; exact McNemar test p = {result.p_value:.3g}"
-    )
+def _rate(own: pd.DataFrame) -> Row:
+    rate, trainings = wilson(int(own["success"].sum()), len(own)), own["training"].nunique()
+    low, high = hierarchical_interval(own["success"].to_numpy(), own["training"].to_numpy())
+    return {
+        "episodes": len(own),
+        "trainings": trainings,
+        "success": f"{100 * rate['rate']:.1f} %",
+        "interval": f"{100 * rate['low']:.1f} to {100 * rate['high']:.1f}",
+        "over trainings": f"{100 * low:.1f} to {100 * high:.1f}" if trainings > 1 else "",
+        "solved at the start": f"{100 * (own['steps'] == 0).mean():.1f} %" if "steps" in own else "",
+    }
+
+
+def _test(reference: pd.DataFrame, own: pd.DataFrame, names: str) -> Row:
+    """Pairs of episodes of the same scene, and of the same training where both methods have several."""
+    several = min(one["training"].nunique() for one in (reference, own)) > 1
+    pairs = reference.merge(own, on=["training", "seed"] if several else "seed", suffixes=("", "_other"))
+    if pairs.empty:
+        raise UserError(f"{names} have no seed in common: evaluate both with the same seed=")
+    alone = int((pairs["success"] & ~pairs["success_other"]).sum())
+    other = int((pairs["success_other"] & ~pairs["success"]).sum())
+    shown = 280 * (alone + other) ** 0.5 / len(pairs)  # 1.96 + 0.84 standard errors of the difference
+    counts = {"pairs": len(pairs), "first alone": alone, "this alone": other, "p": mcnemar(alone, other)}
+    return {**counts, "detectable": f"{shown:.1f}"}
+
+
+def write_page(path: Path, table: pd.DataFrame) -> None:
+    """Write what `compare` found as a page of HTML, atomically."""
+    html = table.to_html(border=0, na_rep="", float_format="{:.2g}".format)
+    with atomic_write(path) as temporary:
+        temporary.write_text(PAGE.format(table=html), encoding="utf-8")

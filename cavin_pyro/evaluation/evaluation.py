@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.options import MAXIMUM_SEED
-from cavin_pyro.evaluation.comparison import compare, earlier_rows, sentences
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner, planner_name
 from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
@@ -32,7 +30,7 @@ from cavin_pyro.storage.run_directory import check_same_run, write_config
 
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
-NOT_COMPARED = ("output", "episodes", "compare", "shard", "workers")  # may differ between runs of one evaluation
+NOT_COMPARED = ("output", "episodes", "shard", "workers")  # may differ between runs of one evaluation
 
 
 def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]:
@@ -59,7 +57,6 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
         runner = make_runner(copy.deepcopy(config))  # refuses bad input before anything is written
         runner.env.close()
         seeds_of(config)
-        others = earlier_rows(Path(config.compare), config) if config.compare else []
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
         results = summarize(run_missing(config, folder))
@@ -67,10 +64,6 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
         if not config.world.get("_target_"):
             scene += f", layout {config.layout}, {config.reward} reward, {config.objects} objects"
         lines = [table(results, f"{scene}, {planner_name(config)}"), plan_summary(results["per_episode"], config)]
-        if others:
-            comparison = compare(results["per_episode"], others)
-            results["comparison"] = {"against": config.compare, **asdict(comparison)}
-            lines.append(sentences(comparison, Path(config.compare)))
         write_json(folder / "results.json", {**results, "provenance": provenance()})
         with atomic_write(folder / "results.txt") as temporary:
             temporary.write_text("".join(f"{line}\n" for line in lines if line), encoding="utf-8")

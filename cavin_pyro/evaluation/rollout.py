@@ -175,6 +175,8 @@ def rollout(
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
+    if getattr(getattr(planner, "model", None), "space", env.space) != env.space:
+        raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None

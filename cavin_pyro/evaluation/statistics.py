@@ -11,6 +11,8 @@ from scipy.stats import binomtest
 
 from cavin_pyro.evaluation.rollout import OUTCOMES
 
+RESAMPLES = 10_000  # of a bootstrap
+
 Rate = dict[str, float]
 
 
@@ -28,6 +30,23 @@ def wilson(successes: int, trials: int) -> Rate:
 def mcnemar(one_alone: int, other_alone: int) -> float:
     """The exact p-value of McNemar's test: whether one of two succeeds in scenes where the other fails as often."""
     return float(binomtest(one_alone, one_alone + other_alone).pvalue) if one_alone + other_alone else 1.0
+
+
+def hierarchical_interval(success: np.ndarray, groups: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """95 % interval of a rate by the bootstrap over groups, and over the episodes in each of them.
+
+    Episodes of a group, sampled with replacement, succeed as often as a binomial variable says.
+
+    Args:
+        success: bool [N]. groups: [N], the training seed of each episode.
+    """
+    generator = np.random.default_rng(seed)
+    values = [success[groups == name] for name in np.unique(groups)]
+    counts, means = np.array([len(one) for one in values]), np.array([one.mean() for one in values])
+    chosen = generator.integers(len(values), size=(RESAMPLES, len(values)))
+    samples = (generator.binomial(counts[chosen], means[chosen]) / counts[chosen]).mean(1)
+    low, high = np.quantile(samples, (0.025, 0.975))
+    return float(low), float(high)
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
-from cavin_pyro.evaluation.statistics import mcnemar, wilson
+from cavin_pyro.evaluation.statistics import hierarchical_interval, mcnemar, wilson
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.table import CELL, CRITERIA
 
-RESAMPLES = 10_000
 TEST = ["criterion", "in_paper", "scenes", "reference_alone", "other_alone", "p"]
 REFERENCE = "cavin"  # which the others are compared with
 
@@ -42,23 +40,6 @@ def rates(table: pd.DataFrame) -> pd.DataFrame:
                 }
             )
     return pd.DataFrame(found)
-
-
-def hierarchical_interval(success: np.ndarray, groups: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of a rate by the bootstrap over groups, and over the episodes in each of them.
-
-    Episodes of a group, sampled with replacement, succeed as often as a binomial variable says.
-
-    Args:
-        success: bool [N]. groups: [N], the training seed of each episode.
-    """
-    generator = np.random.default_rng(seed)
-    values = [success[groups == name] for name in np.unique(groups)]
-    counts, means = np.array([len(one) for one in values]), np.array([one.mean() for one in values])
-    chosen = generator.integers(len(values), size=(RESAMPLES, len(values)))
-    samples = (generator.binomial(counts[chosen], means[chosen]) / counts[chosen]).mean(1)
-    low, high = np.quantile(samples, (0.025, 0.975))
-    return float(low), float(high)
 
 
 def paired_tests(table: pd.DataFrame) -> pd.DataFrame:

@@ -142,8 +142,7 @@ def fit(
         if output is not None:
             stored = OmegaConf.create(stored)
             check_same_run(folder, stored, ignore=free(options.schedule))
-            if "data" in record:
-                check_same_data(folder, record["data"])
+            check_same_data(folder, record.get("data") or [windows.content_record()])
 
         def keep(step: int, row: dict[str, float]) -> None:
             best.update({name: value.clone() for name, value in programs.state_dict().items()})

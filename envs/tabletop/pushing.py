@@ -36,7 +36,7 @@ from cavin_pyro.envs.tabletop.workspace import (
     tile_center,
 )
 from cavin_pyro.envs.world import Geometry, World
-from cavin_pyro.models.checks import check_choice, check_number
+from cavin_pyro.models.checks import check_choice, check_kinds, check_number
 from cavin_pyro.models.state import State
 
 EPISODE_STEPS = 60
@@ -49,6 +49,16 @@ SPECTATOR = Camera(  # opposite the robot, for pictures
     rotation=(1.03989, 0.0, 2.96450),
     intrinsics_offset=(225.0, 225.0, 0.0, 14.0),
 )
+KINDS: dict[str, Any] = {  # of arguments that choose parts
+    "tiles": (Mapping,),
+    "generated": (GeneratedLayouts,),
+    "ranges": (ObjectRanges, Mapping),
+    "object_set": (str, ObjectSet),
+    "assets": (str, Path),
+    "camera": (str, Camera, DepthSensor),
+    "segmentation": (str, Callable),
+    "robot": (str, Callable),
+}
 
 ObservationDict = dict[str, NDArray[Any]]
 
@@ -113,6 +123,7 @@ class PushingEnv(Uncopied, World):
         show_tiles: bool = True,
         robot: str | RobotFactory = "stick",
     ) -> None:
+        check_kinds(locals(), KINDS)
         check_number("objects", objects, 1, MAXIMUM_OBJECTS, whole=True)
         check_number("maximum_steps", maximum_steps, 1, whole=True)
         check_choice("render_mode", render_mode, (None, "rgb_array"))

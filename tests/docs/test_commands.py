@@ -67,8 +67,8 @@ def reason(line: Line) -> str | None:
 
 def small(line: Line) -> Case:
     """A command with the options that make it small."""
-    if line.command == "data":
-        return Case("data.__main__", line.options)
+    if line.command in ("data", "compare"):
+        return Case({"data": "data.__main__"}.get(line.command, line.command), line.options)
     assert line.command is not None, line
     more = SMALL[line.command].split()
     given = {option.partition("=")[0] for option in line.options}

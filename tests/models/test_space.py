@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cavin_pyro.models.dynamics_only import DynamicsModel
 from cavin_pyro.models.networks.dynamics import ActionGenerator, StateChange
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -100,3 +101,16 @@ def test_projection_scales_the_first_numbers_and_leaves_the_free_ones() -> None:
 def test_a_space_that_cannot_be_is_one_clear_line(changed: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         Space(**{**PLANE, "action_sizes": (2,), **changed})
+
+
+@pytest.mark.parametrize(
+    "changed, said",
+    [
+        ({"width": 8.0}, "^width must be a whole number of at least 1, not 8.0$"),
+        ({"neighbours": "4"}, "^neighbours must be a whole number of at least 0, not '4'$"),
+        ({"feature_dimension": 1}, "^a feature has 1 numbers, and the space's unit_features are more$"),
+    ],
+)
+def test_a_model_of_sizes_that_cannot_be_is_one_clear_line(changed: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        DynamicsModel(space=TURNING, **changed)

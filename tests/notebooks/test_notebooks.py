@@ -42,11 +42,16 @@ def code_cells(notebook: Any) -> list[Any]:
 
 
 @every_notebook
-def test_a_notebook_is_stored_without_outputs(path: Path) -> None:
+def test_a_notebook_is_stored_with_what_its_cells_show(path: Path) -> None:
     notebook = read(path)
     nbformat.validate(notebook)
     assert notebook.metadata.kernelspec.name == "python3"
-    assert all(cell.outputs == [] and cell.execution_count is None for cell in code_cells(notebook))
+    cells = code_cells(notebook)
+    assert [cell.execution_count for cell in cells] == [*range(1, len(cells) + 1)]
+    assert any("image/png" in output.get("data", ()) for output in cells[0].outputs)
+    assert not [
+        one for cell in cells for one in cell.outputs if one.output_type == "error" or one.get("name") == "stderr"
+    ]
 
 
 @every_notebook

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class ObjectAsset:
         return x, y, z
 
 
+@runtime_checkable
 class ObjectSet(Protocol):
     """Objects by name. A name is the object's own (`mug`), or has the set's as a prefix (`ycb/mug`)."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,7 @@ class Renderer(Protocol):
         ...
 
 
+@runtime_checkable
 class DepthSensor(Protocol):
     """A mounted depth camera; its pose may vary between episodes, and it may have noise."""
 

@@ -158,8 +158,9 @@ def test_the_planner_brings_its_checkpoint(overrides: str, name: str) -> None:
 def test_checkpoints_have_names() -> None:
     assert find_checkpoint("kinect").is_file()
     assert find_checkpoint("runs/a.safetensors") == Path("runs/a.safetensors")
-    with pytest.raises(UserError, match="^unknown checkpoint 'best': choose from cavin, "):
-        find_checkpoint("best")
+    for name, said in (("best", "^unknown checkpoint 'best': choose from cavin, "), (None, "not by None$")):
+        with pytest.raises(UserError, match=said):
+            find_checkpoint(name)
     for model, guide in CHECKPOINTS.values():
         compose("train", f"model={model}", f"guide={guide}")
 

@@ -244,7 +244,8 @@ def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
         ({"features": None}, "^features must be an array of numbers: "),
         ({"actions": [[[0.0]], [[0.0], [0.0]]]}, "^actions must be an array of numbers: "),
         ({"actions": np.zeros((6, 2, 0))}, r"must have \[any, any, any\], none of them 0$"),
-        ({"validation_fraction": "x"}, "^validation_fraction must be a number above 0 and at most 1, not 'x'$"),
+        ({"sequence_mask": np.zeros(6)}, "^transition_mask or sequence_mask is False everywhere"),
+        ({"validation_fraction": 1}, "^validation_fraction must be a number above 0 and at most 0.99, not 1$"),
     ],
 )
 def test_arrays_that_are_no_windows_are_refused_in_one_line(wrong: dict[str, Any], said: str) -> None:

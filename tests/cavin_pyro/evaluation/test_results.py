@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
-from math import comb
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from omegaconf import OmegaConf
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.comparison import Comparison, compare, earlier_rows, sentences
 from cavin_pyro.evaluation.rows import finished_episodes
 from cavin_pyro.evaluation.statistics import plan_summary, spread, summarize, table, wilson
 
@@ -114,39 +108,3 @@ def test_plans_without_a_candidate_that_reaches_the_goal_are_counted() -> None:
     said = plan_summary([{**plans(0.0, 0.0), "outcome": "timeout"}, plans(0.5)], config)
     assert "2 of 3 plans" in said and "1 of 2 episodes" in said and "planner.horizon=30" in said
     assert plan_summary([plans(None), {"outcome": "success"}], config) == ""
-
-
-def ended(successes: list[bool], first: int = 0) -> list[dict[str, Any]]:
-    return [
-        {"seed": seed, "outcome": "success" if success else "timeout"} for seed, success in enumerate(successes, first)
-    ]
-
-
-def test_scenes_are_counted_by_the_methods_that_solve_them() -> None:
-    one = ended([True, True, True, False, False, True])
-    result = compare(one, ended([True, False, False, True, False, True]))
-    assert (result.both, result.one_alone, result.other_alone, result.neither) == (2, 2, 1, 1)
-    assert sentences(result, Path("other")).startswith("success in the 6 scenes of both: 66.7 % here, 50.0 % in other")
-    assert compare(ended([True] * 5), ended([False] * 5, first=3)[::-1]) == Comparison(0, 2, 0, 0, 0.5)
-    with pytest.raises(UserError, match="no seed in common"):
-        compare(ended([True] * 3), ended([True] * 3, first=3))
-    for wrong in ([{"seed": 0, "outcome": "sucess"}], [{"seed": 0}], {}):
-        with pytest.raises(UserError, match="^these rows are no evaluation: "):
-            compare(wrong, ended([True]))
-
-
-@given(st.integers(0, 20), st.integers(0, 20))
-def test_the_test_is_the_binomial_one_of_the_scenes_that_only_one_solves(alone: int, others: int) -> None:
-    one = ended([True] * alone + [False] * others + [True, False])
-    other = ended([False] * alone + [True] * others + [True, False])
-    count = alone + others
-    lower = sum(comb(count, k) for k in range(min(alone, others) + 1)) / 2**count
-    assert math.isclose(compare(one, other).p_value, min(1.0, 2 * lower))
-
-
-def test_damaged_results_are_not_compared_with(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("seed: 3\n")
-    for rows in ({"a": 1}, [{**ROW, "outcome": "sucess"}], "text"):
-        (tmp_path / "results.json").write_text(json.dumps({"per_episode": rows}))
-        with pytest.raises(UserError, match=r"holds damaged results \(.*\): evaluate it again"):
-            earlier_rows(tmp_path, OmegaConf.create({}))

@@ -51,13 +51,9 @@ def test_evaluations_in_python_return_what_their_folders_hold_and_are_compared(t
     first = cavin_pyro.evaluate(**options, output=tmp_path / "a")
     assert json.loads((tmp_path / "a" / "results.json").read_text())["per_episode"] == first["per_episode"]
     assert first["episodes"] == 2 and (tmp_path / "a" / "results.txt").read_text().startswith("crossing, layout 0")
-    assert cavin_pyro.compare(first, tmp_path / "a").p_value == 1.0
-    more = cavin_pyro.evaluate(**{**options, "episodes": 3}, output=tmp_path / "c", compare=str(tmp_path / "a"))
-    counts = {"both": 0, "one_alone": 0, "other_alone": 0, "neither": 2, "p_value": 1.0}
-    assert more["comparison"] == {"against": str(tmp_path / "a"), **counts}
-    assert "neither 2; exact McNemar test p = 1" in (tmp_path / "c" / "results.txt").read_text()
-    with pytest.raises(UserError, match="compare=nowhere is no finished evaluation: results.json: No such file"):
-        cavin_pyro.evaluate(**options, output=tmp_path / "d", compare="nowhere")
+    assert cavin_pyro.compare(first, tmp_path / "a")["p"].iloc[1] == 1.0
+    with pytest.raises(UserError, match="nowhere is no finished evaluation: results.json: No such file"):
+        cavin_pyro.compare(first, "nowhere")
     cavin_pyro.evaluate(**options, output=tmp_path / "b", objects=1)
     with pytest.raises(UserError, match="has objects=1, not 3: its scenes differ"):
         cavin_pyro.compare(tmp_path / "a", tmp_path / "b")

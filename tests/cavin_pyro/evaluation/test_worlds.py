@@ -12,6 +12,7 @@ import torch
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.scripted import ScriptedPush
 from cavin_pyro.evaluation.evaluation import evaluate
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
@@ -76,6 +77,7 @@ def test_what_a_world_of_ones_own_raises_and_a_planner_that_does_not_suit_it_are
         (Broken(), Right(action_dimension=2), 0, "^RuntimeError: the arm is stuck; --traceback shows where$"),
         (Point(), scripted, 0, "^planner=scripted knows the ways of the tabletop alone"),
         (Point(), guided, 0, "^the addition guidance needs a reward"),
+        (PushingEnv(), CavinPlanner(model(), samples=8, horizon=6), 0, "^the planner's model is of a world with other"),
         (Point(), Right(action_dimension=2), -1, "^seed must be a whole number of at least 0"),
     ):
         with pytest.raises(UserError, match=said):

@@ -164,8 +164,8 @@ def test_the_world_is_symmetric_about_that_plane() -> None:
     assert (Camera().position[1], Camera().rotation) == (0.0, (0.0, 0.0, 0.0))
 
 
-def windows_by_hand() -> WindowTable:
-    generator = torch.Generator().manual_seed(0)
+def windows_by_hand(seed: int = 0) -> WindowTable:
+    generator = torch.Generator().manual_seed(seed)
     centers, features = torch.rand(20, 4, 2, 3, generator=generator), torch.randn(20, 4, 2, 64, generator=generator)
     actions = 2 * torch.rand(20, 3, 4, generator=generator) - 1
     features /= features.norm(dim=-1, keepdim=True)
@@ -189,6 +189,8 @@ def test_programs_fitted_in_python_have_the_best_weights_and_resume_as_a_checkpo
     assert torch.equal(model.dynamics.change.head.weight, best)
     with pytest.raises(UserError, match=r"holds a run with seed=0, not 1: "):
         fit(model, guide, windows_by_hand(), geometry=Outline(), seed=1, **options)
+    with pytest.raises(UserError, match=r"holds a run with other data"):
+        fit(model, guide, windows_by_hand(1), geometry=Outline(), **options)
     with pytest.raises(UserError, match=r"^fit has no option 'patients': choose from steps, .*, patience$"):
         fit(model, guide, windows_by_hand(), patients=2)
 

@@ -199,6 +199,8 @@ def test_the_same_seed_and_actions_give_the_same_episode(make: Make) -> None:
     [
         ({"objects": 11}, r"^objects must be a whole number of at least 1 and at most 10, not 11$"),
         ({"margin": "x"}, r"^margin must be a number of at least 0, not 'x'$"),
+        ({"tiles": 3}, r"^tiles must be of type Mapping, not 3$"),
+        ({"camera": 3}, r"^camera must be of type str or Camera or DepthSensor, not 3$"),
         ({"camera": "webcam"}, r"^unknown camera 'webcam': choose from ideal, kinect2$"),
         ({"object_set": "toys"}, r"^unknown object set 'toys': choose from builtin, ycb, mixed, random$"),
         ({"task": BRIDGE, "tiles": {"goal": [[2, 3]]}}, r"^a task object has its own layout"),

@@ -1,0 +1,102 @@
+"""Methods compared in one table: evaluations, rows in memory, and tables of other programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from math import comb
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.comparison import compare, write_page
+from cavin_pyro.evaluation.statistics import wilson
+
+COUNTS = ["pairs", "first alone", "this alone"]
+
+
+def ended(successes: list[bool], first: int = 0) -> list[dict[str, Any]]:
+    return [
+        {"seed": seed, "outcome": "success" if success else "timeout"} for seed, success in enumerate(successes, first)
+    ]
+
+
+def table(path: Path, **columns: Any) -> Path:
+    frame = pd.DataFrame(columns)
+    frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
+    return path
+
+
+def test_scenes_of_both_are_counted_by_the_methods_that_solve_them() -> None:
+    one = ended([True, True, True, False, False, True])
+    found = compare(one, ended([True, False, False, True, False, True]))
+    assert found.loc["method 2", COUNTS].tolist() == [6, 2, 1]
+    found = compare(ended([True] * 5), ended([False] * 5, first=3)[::-1])
+    assert found.loc["method 2", [*COUNTS, "p"]].tolist() == [2, 2, 0, 0.5]
+
+
+@given(st.integers(0, 20), st.integers(0, 20))
+def test_the_test_is_the_binomial_one_of_the_scenes_that_only_one_solves(alone: int, others: int) -> None:
+    one = ended([True] * alone + [False] * others + [True, False])
+    other = ended([False] * alone + [True] * others + [True, False])
+    count = alone + others
+    lower = sum(comb(count, k) for k in range(min(alone, others) + 1)) / 2**count
+    assert math.isclose(compare(one, other)["p"].iloc[1], min(1.0, 2 * lower))
+
+
+def test_tables_of_other_programs_have_intervals_and_a_page(tmp_path: Path) -> None:
+    one = table(tmp_path / "one.csv", seed=range(10), success=[1] * 8 + [0] * 2, steps=[0] + [3] * 9)
+    two = table(tmp_path / "two.parquet", seed=range(2, 12), success=[False] * 7 + [True] * 3)
+    found = compare(one, two)
+    low, high = (100 * wilson(8, 10)[name] for name in ("low", "high"))
+    columns = ["success", "interval", "solved at the start"]
+    assert found.loc["one.csv", columns].tolist() == ["80.0 %", f"{low:.1f} to {high:.1f}", "10.0 %"]
+    write_page(tmp_path / "page.html", found)
+    assert "<td>80.0 %</td>" in (tmp_path / "page.html").read_text()
+
+
+def test_trainings_that_differ_widen_the_interval_and_pair_one_by_one() -> None:
+    good, bad = ([ended([True] * rate + [False] * (10 - rate)) for rate in rates] for rates in ((10, 9, 5), (3, 3, 3)))
+    found = compare(good=good, bad=bad)
+    ends = [[*map(float, found.loc["good", name].split(" to "))] for name in ("over trainings", "interval")]
+    assert ends[0][1] - ends[0][0] > ends[1][1] - ends[1][0]
+    assert found.loc["bad", COUNTS].tolist() == [30, 15, 0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (ended([True], first=1) * 2, "^method 2 has seed 1 twice"),
+        (ended([True], first=7), "^method 2 and method 1 have no seed in common"),
+        ([{"seed": 1, "success": "yes"}], "^these rows is no evaluation: unknown success 'yes'"),
+        ([{"seed": 1, "outcome": "sucess"}], "^these rows is no evaluation: unknown outcome 'sucess'"),
+        ([{"seed": 1}], "^these rows is no evaluation: KeyError: 'success'"),
+        ({}, "^these rows is no evaluation: "),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line(rows: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        compare(ended([True], first=1), rows)
+
+
+def test_damaged_results_are_not_compared_with(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("seed: 3\n")
+    for rows in ({"a": 1}, ended([True]), "text"):
+        (tmp_path / "results.json").write_text(json.dumps({"per_episode": rows}))
+        with pytest.raises(UserError, match=r"holds damaged results \(.*\): evaluate it again"):
+            compare(tmp_path)
+
+
+def test_the_command_compares_and_refuses(shell: SimpleNamespace, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        table(tmp_path / f"{name}.csv", seed=[1, 2], success=[1, 0])
+    answer = shell.run_command("compare", "a.csv", "--method", "mine", "b.csv", folder=tmp_path)
+    assert answer.status == 0 and "mine" in answer.output and (tmp_path / "compare.html").exists()
+    answer = shell.run_command("compare", "a.csv", "nowhere", folder=tmp_path)
+    assert (answer.status, answer.errors.count("\n")) == (2, 1)
