@@ -122,13 +122,6 @@ def test_every_dependency_says_why_it_was_chosen() -> None:
     assert {one.name for one in named} <= reasons
 
 
-def test_every_folder_of_a_package_is_a_package() -> None:
-    """A wheel leaves out folders without `__init__.py`, which a checkout imports all the same."""
-    folders = {file.parent for file in modules(*PACKAGES)}
-    assert folders
-    assert not [place(folder) for folder in sorted(folders) if not (folder / "__init__.py").is_file()]
-
-
 def test_every_command_is_a_console_script_and_every_console_script_has_its_main() -> None:
     scripts = dict(target.split(":") for target in PROJECT["project"]["scripts"].values())
     home = ROOT / "cavin_pyro"

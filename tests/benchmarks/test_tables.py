@@ -29,6 +29,11 @@ def test_the_tables_are_those_that_the_command_writes(page: str, load: Callable[
     assert "<!-- table: " in text and load("tables").written(text) == text
 
 
+def test_the_cards_of_shipped_models_are_those_that_the_command_writes(tmp_path: Path) -> None:
+    ended = run_script(ROOT / "docs" / "model_cards.py", "--check", folder=tmp_path)
+    assert ended.status == 0, ended.errors
+
+
 def test_another_outcome_changes_the_table(
     load: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

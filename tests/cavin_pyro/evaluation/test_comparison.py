@@ -77,7 +77,6 @@ def test_trainings_that_differ_widen_the_interval_and_pair_one_by_one() -> None:
         ([{"seed": 1, "success": "yes"}], "^these rows is no evaluation: unknown success 'yes'"),
         ([{"seed": 1, "outcome": "sucess"}], "^these rows is no evaluation: unknown outcome 'sucess'"),
         ([{"seed": 1}], "^these rows is no evaluation: KeyError: 'success'"),
-        ({}, "^these rows is no evaluation: "),
     ],
 )
 def test_what_cannot_be_compared_is_one_line(rows: Any, said: str) -> None:
