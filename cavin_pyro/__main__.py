@@ -11,7 +11,19 @@ from cavin_pyro import __version__
 from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
-ORDER = ("plan", "imagine", "evaluate", "collect", "data", "pretrain", "train", "check", "reproduce", "assets")
+ORDER: tuple[str, ...] = (
+    "plan",
+    "imagine",
+    "evaluate",
+    "compare",
+    "collect",
+    "data",
+    "pretrain",
+    "train",
+    "check",
+    "reproduce",
+)
+ORDER += ("assets",)
 
 
 def main() -> None:

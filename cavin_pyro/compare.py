@@ -22,11 +22,14 @@ def _run() -> None:
     parser.add_argument("--method", nargs="+", action="append", default=[], metavar=("NAME", "RUN"), help=several)
     parser.add_argument("--output", type=Path, default=Path("compare.html"), metavar="FILE", help="the page")
     line = parser.parse_args()
-    if not line.runs and not line.method:
-        parser.error("give at least one RUN")
+    named = {name: runs for name, *runs in line.method}
+    if (not line.runs and not named) or len(named) < len(line.method):
+        parser.error("give at least one RUN, and each --method NAME once")
+    if line.output.suffix != ".html" or not line.output.parent.is_dir():
+        parser.error(f"--output {line.output} must be FILE.html, in a folder that is there")
     from cavin_pyro.evaluation.comparison import compare, write_page
 
-    table = compare(*line.runs, **{name: runs for name, *runs in line.method})
+    table = compare(*line.runs, **named)
     write_page(line.output, table)
     print(f"{table.to_string(na_rep='', float_format='{:.2g}'.format)}\n{line.output}")
 

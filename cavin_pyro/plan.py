@@ -11,6 +11,7 @@ def main(config: DictConfig) -> Figures:
     import copy
 
     from cavin_pyro.config.device import choose_device
+    from cavin_pyro.config.errors import user_input
     from cavin_pyro.evaluation.factory import make_runner
     from cavin_pyro.evaluation.statistics import counted, plan_summary
     from cavin_pyro.storage.files import output_folder, write_json
@@ -25,8 +26,9 @@ def main(config: DictConfig) -> Figures:
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)
         row = render_episode(runner, folder, seed=config.seed, video=video)
-        runner.env.close()
         write_json(folder / "results.json", {**row, "provenance": provenance()})
+        with user_input("env"):
+            runner.env.close()
         steps = counted(row["steps"], *runner.env.step_names)
         idle = f", {row['ineffective']} of which moved nothing" if row["ineffective"] else ""
         print(f"{runner.env.name}: {row['outcome']} after {steps}{idle}, return {row['return']:.1f}")

@@ -219,10 +219,6 @@ def test_no_file_names_a_path_of_somebodys_machine() -> None:
     assert not found
 
 
-def test_no_file_weighs_more_than_three_megabytes() -> None:
-    assert not [place(file) for file in repository_files() if file.stat().st_size > 3_000_000]
-
-
 def test_tests_mirror_the_folders_and_have_names_of_their_own() -> None:
     """pytest's importlib mode wants no `__init__.py` and files that cannot be mistaken for one another."""
     files = sorted((ROOT / "tests").rglob("*.py"))

@@ -33,7 +33,7 @@ else:
     DictConfig = Any
 
 RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "assets")  # docs/reliability.md
-_TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST}
+_TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENODEV}  # the last: to map a folder
 _DENIED = {errno.EACCES, errno.EPERM}
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG, *_DENIED, *_TAKEN}
 

@@ -35,14 +35,14 @@ def user_input(*sections: str, where: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except OSError:  # `guarded` says what a disk refuses
-        raise
     except UserError as error:
         if where:
             raise UserError(f"{where}: {error}") from error
         error.sections = error.sections or sections
         raise
     except (Exception, SystemExit) as error:  # the user's modules may end the program
+        if isinstance(error, OSError) and error.errno is not None:  # `guarded` says what a disk refuses
+            raise
         kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "
         refused = UserError(f"{where and f'{where}: '}{kind}{one_line(error)}{kind and '; --traceback shows where'}")
         refused.sections = sections

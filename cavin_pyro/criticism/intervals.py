@@ -203,5 +203,8 @@ def _figure(predictions: Mapping[str, Prediction], ranks: Mapping[str, Tensor]) 
     for predictor, panel in panels.items():
         panel.set(xlim=(0, 1), xlabel="PIT", ylabel="ECDF minus uniform")
         panel.set_title(PREDICTORS[predictor], fontsize=9)
-        panel.legend(fontsize=7, frameon=False)
+    named = {
+        name: line for panel in panels.values() for line, name in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), fontsize=10, frameon=False)
     return figure

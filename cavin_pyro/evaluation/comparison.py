@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from numbers import Number
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,12 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.evaluation.rollout import OUTCOMES
 from cavin_pyro.evaluation.rows import Row, violation
 from cavin_pyro.evaluation.statistics import hierarchical_interval, mcnemar, wilson
-from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.run_directory import stored_options
 
 # Options, or sections of them.
-SAME_SCENES = ("task", "layout", "tiles", "generated", "criterion", "objects", "maximum_steps", "env")
+SAME_SCENES = ("task", "layout", "tiles", "generated", "criterion", "objects", "maximum_steps", "env", "world")
+COLUMNS = ("method", "training", "seed", "success", "steps")
 READERS = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
 PAGE = """<!doctype html><meta charset="utf-8"><title>Comparison</title>
 <style>body {{ font: 16px sans-serif; margin: 2em }} td, th {{ padding: 0.3em 0.8em; text-align: right }}
@@ -48,21 +49,20 @@ def compare(*evaluations: Evaluation, **methods: Sequence[Evaluation]) -> pd.Dat
 
     Returns:
         `episodes`, `trainings`, `success` and its `interval` in per cent, that `over trainings`, the share `solved at
-        the start`; `pairs`, `first alone`, `this alone`, `p`, `p, Holm`, and the `detectable` difference in points.
+        the start`; `pairs`, `first alone`, `this alone`, `p`, `p, Holm`, and the `detectable` difference.
 
     Raises:
         UserError: an evaluation that cannot be read or has a scene twice, other scenes, or none in common.
     """
-    given: list[tuple[str | None, Sequence[Evaluation]]] = [(None, [one]) for one in evaluations]
-    given += methods.items()
-    options: list[Row] = []
-    found = [
-        _rows(run, name or (Path(run).name if isinstance(run, str | Path) else f"method {number}"), training, options)
-        for number, (name, runs) in enumerate(given, 1)
-        for training, run in enumerate(runs)
+    paths = (str, Path)
+    given: list[tuple[str, Any]] = [
+        (str(one) if isinstance(one, paths) else f"method {number}", [one]) for number, one in enumerate(evaluations, 1)
     ]
-    if not found:
-        raise UserError("there is nothing to compare: give at least one evaluation")
+    given += [(name, runs if isinstance(runs, list | tuple) else [runs]) for name, runs in methods.items()]
+    if not given or not all(runs for _, runs in given):
+        raise UserError("there is nothing to compare: give at least one evaluation of each method")
+    options: list[Row] = []
+    found = [_rows(run, name, training, options) for name, runs in given for training, run in enumerate(runs)]
     episodes = pd.concat(found, ignore_index=True)
     if (twice := episodes.duplicated(["method", "training", "seed"])).any():
         name, seed = episodes.loc[twice.idxmax(), ["method", "seed"]]
@@ -80,25 +80,36 @@ def compare(*evaluations: Evaluation, **methods: Sequence[Evaluation]) -> pd.Dat
 
 def _rows(run: Evaluation, name: str, training: int, options: list[Row]) -> pd.DataFrame:
     """The episodes of an evaluation: method, training, seed, success (bool), steps; a folder's `options` grow."""
-    if isinstance(run, str | Path) and Path(run).suffix not in READERS:
+    where = str(run) if isinstance(run, str | Path) else f"{name}, of {type(run).__name__},"
+    if isinstance(run, str | Path) and Path(run).suffix in READERS:
+        if not Path(run).is_file():
+            raise UserError(f"there is no table {run}")
+        with user_input(where=f"{run} is no table"):
+            found = READERS[Path(run).suffix](Path(run))
+    elif isinstance(run, str | Path):
         rows, theirs = _finished(Path(run))
         for mine in options[:1]:
             _check_same_scenes(mine, theirs, run)
         options.append(theirs)
         found = pd.DataFrame(rows)
     else:
-        with user_input(where=f"{run if isinstance(run, str | Path) else 'these rows'} is no evaluation"):
-            table: Any = run["per_episode"] if isinstance(run, Mapping) else run
-            found = READERS[Path(run).suffix](run) if isinstance(run, str | Path) else pd.DataFrame(table)
-            for seed in found["seed"]:
-                check_number("seed", seed, whole=True)
-            for outcome in found.get("outcome", ()):
-                check_choice("outcome", outcome, OUTCOMES)
-            for success in () if "outcome" in found else found["success"]:
-                check_choice("success", success, (True, False))
-    solved = found["outcome"] == "success" if "outcome" in found else found["success"].astype(bool)
-    labels = {key: value for key, value in (("method", name), ("training", training)) if key not in found}
-    return found.assign(success=solved, **labels)
+        with user_input(where=f"{where} is no evaluation"):
+            found = pd.DataFrame(run["per_episode"] if isinstance(run, Mapping) else list(run))
+    if "success" not in found and "outcome" in found and found["outcome"].isin(OUTCOMES).all():
+        found["success"] = found["outcome"] == "success"
+    found = found.assign(
+        **{key: value for key, value in {"method": name, "training": training}.items() if key not in found}
+    )
+    for column, kinds in {"seed": "iu", "success": "biuf", "method": "OU", "training": "iuOU", "steps": "iuf"}.items():
+        if column == "steps" and column not in found:
+            continue
+        if column not in found or found.empty:
+            raise UserError(f"{where} has no {column if len(found) else 'episode'}: a row has seed and success")
+        values = found[column]
+        fits = values.dtype.kind in kinds and values.map(lambda one: isinstance(one, str | Number)).all()
+        if not (fits and values.notna().all()) or (column == "success" and not values.isin([0, 1]).all()):
+            raise UserError(f"{where} has a {column} that cannot be: seeds are whole numbers, success is true or false")
+    return found[[name for name in COLUMNS if name in found]].astype({"success": bool})
 
 
 def _finished(folder: Path) -> tuple[list[Row], Row]:
@@ -112,6 +123,7 @@ def _finished(folder: Path) -> tuple[list[Row], Row]:
     except (ValueError, KeyError, TypeError, RecursionError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"{folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
     wrong = next(filter(None, map(violation, rows)), None) if isinstance(rows, list) else "no list of episodes"
+    wrong = wrong or (None if theirs else "no options")
     if wrong:
         raise UserError(f"{folder} holds damaged results ({wrong}): evaluate it again")
     return rows, theirs
@@ -144,9 +156,9 @@ def _test(reference: pd.DataFrame, own: pd.DataFrame, names: str) -> Row:
         raise UserError(f"{names} have no seed in common: evaluate both with the same seed=")
     alone = int((pairs["success"] & ~pairs["success_other"]).sum())
     other = int((pairs["success_other"] & ~pairs["success"]).sum())
-    shown = 280 * (alone + other) ** 0.5 / len(pairs)  # 1.96 + 0.84 standard errors of the difference
+    shown = min(100.0, 280 * (alone + other) ** 0.5 / len(pairs))  # 1.96 + 0.84 standard errors of the difference
     counts = {"pairs": len(pairs), "first alone": alone, "this alone": other, "p": mcnemar(alone, other)}
-    return {**counts, "detectable": f"{shown:.1f}"}
+    return {**counts, "detectable": f"{shown:.1f} points" if shown else "-"}
 
 
 def write_page(path: Path, table: pd.DataFrame) -> None:

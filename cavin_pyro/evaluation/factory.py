@@ -90,6 +90,8 @@ def make_env(
         UserError: an unknown task, layout or object, or a part of the world that lacks files.
     """
     config = compose("plan", **options) if config is None else config
+    if not isinstance(config, DictConfig):
+        raise UserError(f"make_env takes options by their names, such as task='crossing', not {config!r}")
     if (world := world_of(config)) is not None:
         pictures = render and type(world).render is not World.render
         world.render_mode = "rgb_array" if pictures else None

@@ -195,6 +195,8 @@ def rollout(
         with _refusals(seed, planner):
             left = env.maximum_steps - len(episode.transitions)
             plan = planner.plan(state, reward=goal, generators=[generator], observed=shown, steps_left=left)
+        if not isinstance(plan, Plan):
+            raise UserError(f"{type(planner).__name__}.plan must return a Plan, not {type(plan).__name__}")
         plan = apply(plan, lambda field: field.cpu())
         centers, mask = env.positions(observation)
         record = PlanRecord(
@@ -247,7 +249,8 @@ def rollout(
 @contextmanager
 def _refusals(seed: int, part: World | Planner) -> Iterator[None]:
     """What is wrong with a scene or a search, and whatever a part of the user's own raises, as a `UserError`."""
-    ours = type(part).__module__.startswith("cavin_pyro.")
+    own = [part, getattr(part, "optimizer", part), *getattr(part, "additions", ())]
+    ours = all(type(one).__module__.startswith("cavin_pyro.") for one in own)
     try:
         with nullcontext() if ours else user_input("env", "planner"):
             yield

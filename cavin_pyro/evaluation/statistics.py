@@ -107,6 +107,8 @@ def plan_summary(rows: Sequence[Mapping[str, Any]], config: DictConfig) -> str:
 
 
 def _advice(config: DictConfig) -> str:
+    if config.world.get("_target_"):
+        return f"the goal may lie beyond planner.horizon={config.planner.horizon} steps, or the model be untrained"
     others = "" if config.reward == "dense" else " or reward=dense"
     guided = "guidance" in [*(config.planner.get("additions") or ()), *(config.planner.get("add") or ())]
     what = "a longer one" if guided else "planner.add=[guidance], a longer one"

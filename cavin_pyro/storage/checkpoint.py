@@ -156,6 +156,9 @@ def save(
             part contradicts. Nothing is written then.
     """
     parts = {"model": model, "guide": guide, "geometry": geometry, **others}
+    for (name, part), kind in zip(parts.items(), (Model, Guide, *[nn.Module] * len(parts)), strict=False):
+        if part is not None and not isinstance(part, kind):
+            raise UserError(f"{name} must be a {kind.__name__}, not {type(part).__name__}")
     if all(part is None for part in parts.values()) or (guide is not None and model is None):
         raise UserError(f"save needs {'a part' if guide is None else 'the model of this guide'}: give model=")
     stored = dict(config or {})

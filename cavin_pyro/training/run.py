@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,7 +19,16 @@ from cavin_pyro.config.commands import DEFAULT_CHECKPOINT, TrainerConfig, Window
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED, configured, constructor_options, shown
-from cavin_pyro.config.parts import Config, amortized_guides, build_guide, build_model, check_sizes, construct, describe
+from cavin_pyro.config.parts import (
+    PARTS,
+    Config,
+    amortized_guides,
+    build_guide,
+    build_model,
+    check_sizes,
+    construct,
+    describe,
+)
 from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
@@ -159,7 +169,9 @@ def fit(
         if run.rows:
             _keep_best(run, path, keep)
             best.update({name: value for name, value in load_file(path).items() if name in programs.state_dict()})
-        run.run()
+        own = not all(type(one).__module__.startswith("cavin_pyro.") for one in (model, guide, objective))
+        with user_input(*PARTS) if own else nullcontext():
+            run.run()
         programs.load_state_dict(best)
         row = next(row for row in run.rows if row["step"] == run.best_step)
         write_json(folder / "metrics.json", {**record, "steps": run.step, "best": row})

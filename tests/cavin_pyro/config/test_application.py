@@ -201,7 +201,7 @@ def test_every_command_is_listed_and_declares_its_options(
     monkeypatch.setattr(sys, "argv", ["cavin_pyro"])
     listing.main()
     listed = re.findall(r"python -m cavin_pyro\.([a-z]+) +\S", capsys.readouterr().out)
-    assert sorted(listed) == sorted([*COMMANDS, "assets", "data"])
+    assert sorted(listed) == sorted([*COMMANDS, "assets", "compare", "data"])
     for words, said in (("plan a=1", "did you mean python -m cavin_pyro.plan a=1?"), ("pln", "the commands are ")):
         monkeypatch.setattr(sys, "argv", ["cavin_pyro", *words.split()])
         assert said in ended(listing._list, capsys)[1]
