@@ -137,13 +137,16 @@ def _check_same_scenes(mine: Row, theirs: Row, folder: object) -> None:
 
 def _rate(own: pd.DataFrame) -> Row:
     rate, trainings = wilson(int(own["success"].sum()), len(own)), own["training"].nunique()
-    low, high = hierarchical_interval(own["success"].to_numpy(), own["training"].to_numpy())
+    over = ""
+    if trainings > 1:
+        low, high = hierarchical_interval(own["success"].to_numpy(), own["training"].to_numpy())
+        over = f"{100 * low:.1f} to {100 * high:.1f}"
     return {
         "episodes": len(own),
         "trainings": trainings,
         "success": f"{100 * rate['rate']:.1f} %",
         "interval": f"{100 * rate['low']:.1f} to {100 * rate['high']:.1f}",
-        "over trainings": f"{100 * low:.1f} to {100 * high:.1f}" if trainings > 1 else "",
+        "over trainings": over,
         "solved at the start": f"{100 * (own['steps'] == 0).mean():.1f} %" if "steps" in own else "",
     }
 
