@@ -22,6 +22,11 @@ settings.register_profile("soak", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "cavin_pyro"))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, so that no worker is left with one at the end."""
+    items.sort(key=lambda item: "docs" not in item.path.parts)
+
+
 @pytest.fixture(autouse=True)
 def products_are_not_rounded() -> Iterator[None]:
     """Commands say what matrix products of their process round to; a test of one must not change the next.
