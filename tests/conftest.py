@@ -24,7 +24,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "cavin_pyro"))
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, so that no worker is left with one at the end."""
-    items.sort(key=lambda item: "docs" not in item.path.parts)
+    items.sort(key=lambda item: not {"docs", "notebooks"} & {*item.path.parts})
 
 
 @pytest.fixture(autouse=True)
