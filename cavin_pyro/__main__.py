@@ -11,19 +11,7 @@ from cavin_pyro import __version__
 from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
-ORDER: tuple[str, ...] = (
-    "plan",
-    "imagine",
-    "evaluate",
-    "compare",
-    "collect",
-    "data",
-    "pretrain",
-    "train",
-    "check",
-    "reproduce",
-)
-ORDER += ("assets",)
+ORDER = "plan imagine evaluate compare collect data pretrain train check reproduce assets".split()
 
 
 def main() -> None:
