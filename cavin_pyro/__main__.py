@@ -11,7 +11,19 @@ from cavin_pyro import __version__
 from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
-ORDER = "plan imagine evaluate compare collect data pretrain train check reproduce assets".split()
+ORDER = (
+    "plan",
+    "imagine",
+    "evaluate",
+    "compare",
+    "collect",
+    "data",
+    "pretrain",
+    "train",
+    "check",
+    "reproduce",
+    "assets",
+)
 
 
 def main() -> None:
