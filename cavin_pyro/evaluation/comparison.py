@@ -29,8 +29,9 @@ PAGE = """<!doctype html><meta charset="utf-8"><title>Comparison</title>
 th:first-child {{ text-align: left }} tr:nth-child(even) {{ background: #f2f2f2 }}</style>
 <h1>Success, scene by scene</h1>{table}
 <p>Intervals are at 95 %: Wilson's over episodes; over trainings the bootstrap of trainings first and of their episodes
-then. p: exact McNemar test of the pairs of episodes that only the first method or only this one solves, and with Holm's
-correction. Detectable: the difference that so many pairs would show with a probability of 80 %.</p>"""
+then. p: exact sign test of the scenes that the first method or this one solves more often over its trainings (with one
+training each McNemar's), and with Holm's correction. Detectable: the difference that so many scenes would show with a
+probability of 80 %.</p>"""
 
 Evaluation = str | Path | Mapping[str, Any] | Sequence[Mapping[str, Any]]
 """The folder of a finished evaluation, what `evaluate` has returned, its rows `per_episode`, or a table of episodes."""
@@ -49,7 +50,7 @@ def compare(*evaluations: Evaluation, **methods: Sequence[Evaluation]) -> pd.Dat
 
     Returns:
         `episodes`, `trainings`, `success` and its `interval` in per cent, that `over trainings`, the share `solved at
-        the start`; `pairs`, `first alone`, `this alone`, `p`, `p, Holm`, and the `detectable` difference.
+        the start`; `scenes` of both, `first better`, `this better`, `p`, `p, Holm`, and the `detectable` difference.
 
     Raises:
         UserError: an evaluation that cannot be read or has a scene twice, other scenes, or none in common.
@@ -152,15 +153,14 @@ def _rate(own: pd.DataFrame) -> Row:
 
 
 def _test(reference: pd.DataFrame, own: pd.DataFrame, names: str) -> Row:
-    """Pairs of episodes of the same scene, and of the same training where both methods have several."""
-    several = min(one["training"].nunique() for one in (reference, own)) > 1
-    pairs = reference.merge(own, on=["training", "seed"] if several else "seed", suffixes=("", "_other"))
-    if pairs.empty:
+    """Scenes of both, and which method solves each of them more often over its trainings: with one each, McNemar's."""
+    rates = pd.concat([one.groupby("seed")["success"].mean() for one in (reference, own)], axis=1, join="inner")
+    if rates.empty:
         raise UserError(f"{names} have no seed in common: evaluate both with the same seed=")
-    alone = int((pairs["success"] & ~pairs["success_other"]).sum())
-    other = int((pairs["success_other"] & ~pairs["success"]).sum())
-    shown = min(100.0, 280 * (alone + other) ** 0.5 / len(pairs))  # 1.96 + 0.84 standard errors of the difference
-    counts = {"pairs": len(pairs), "first alone": alone, "this alone": other, "p": mcnemar(alone, other)}
+    change = rates.iloc[:, 1] - rates.iloc[:, 0]
+    worse, better = int((change < 0).sum()), int((change > 0).sum())
+    shown = min(100.0, 280 * (worse + better) ** 0.5 / len(rates))  # 1.96 + 0.84 standard errors of the difference
+    counts = {"scenes": len(rates), "first better": worse, "this better": better, "p": mcnemar(worse, better)}
     return {**counts, "detectable": f"{shown:.1f} points" if shown else "-"}
 
 

@@ -18,7 +18,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.comparison import compare, write_page
 from cavin_pyro.evaluation.statistics import mcnemar, wilson
 
-COUNTS = ["pairs", "first alone", "this alone"]
+COUNTS = ["scenes", "first better", "this better"]
 
 
 def ended(successes: list[bool], first: int = 0) -> list[dict[str, Any]]:
@@ -56,12 +56,12 @@ def test_tables_of_other_programs_have_intervals_and_a_page(tmp_path: Path) -> N
     assert "<td>80.0 %</td>" in (tmp_path / "page.html").read_text()
 
 
-def test_trainings_that_differ_widen_the_interval_and_pair_one_by_one() -> None:
+def test_trainings_that_differ_widen_the_interval_and_scenes_count_once() -> None:
     good, bad = ([ended([True] * rate + [False] * (10 - rate)) for rate in rates] for rates in ((10, 9, 5), (3, 3, 3)))
     found = compare(good=good, bad=bad)
     ends = [[*map(float, found.loc["good", name].split(" to "))] for name in ("over trainings", "interval")]
     assert ends[0][1] - ends[0][0] > ends[1][1] - ends[1][0]
-    assert found.loc["bad", COUNTS].tolist() == [30, 15, 0]
+    assert found.loc["bad", COUNTS].tolist() == [10, 7, 0]
 
 
 @pytest.mark.parametrize(
