@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,15 +27,12 @@ class Shell(InteractiveShell):
 def shell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shell]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("IPYTHONDIR", str(tmp_path_factory.mktemp("ipython")))
+        patch.setitem(sys.modules, "__main__", sys.modules["__main__"])  # which IPython replaces
         yield Shell.instance()
     Shell.clear_instance()
 
 
 every_notebook = pytest.mark.parametrize("path", [pytest.param(path, id=path.stem) for path in NOTEBOOKS])
-
-
-def read(path: Path) -> Any:
-    return nbformat.read(path, as_version=4)
 
 
 def code_cells(notebook: Any) -> list[Any]:
@@ -43,7 +41,7 @@ def code_cells(notebook: Any) -> list[Any]:
 
 @every_notebook
 def test_a_notebook_is_stored_with_what_its_cells_show(path: Path) -> None:
-    notebook = read(path)
+    notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     assert notebook.metadata.kernelspec.name == "python3"
     cells = code_cells(notebook)
@@ -63,7 +61,7 @@ def test_a_notebook_runs_and_opens_on_a_picture(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     shell.reset(new_session=False)
     shown = []
-    for cell in code_cells(read(path)):
+    for cell in code_cells(nbformat.read(path, as_version=4)):
         with capture_output() as captured:
             result = shell.run_cell(cell.source)
         assert result.success, f"{cell.source}\n{captured.stdout}\n{captured.stderr}"
