@@ -12,24 +12,15 @@ from cavin_pyro.config.application import DictConfig, command
 def main(config: DictConfig) -> None:
     """Collect pushes by the heuristic policy into a dataset folder.
 
-    In another world than the tabletop, episodes of its own policy. Resumes an interrupted run.
+    In another world than the tabletop, episodes of its own policy. Resumes an interrupted run, and collects missing or
+    damaged files again.
     """
-    from cavin_pyro.config.errors import UserError
-    from cavin_pyro.data.collection import collect, repair
-    from cavin_pyro.data.dataset import iterate_shards
+    from cavin_pyro.data.collection import collect
     from cavin_pyro.storage.files import output_folder
 
     collection = _collection(config)
     with output_folder(config.output) as folder:
-        if config.repair:
-            print(f"{repair(collection, folder, workers=config.workers)} files collected again")
         metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
-        whole = sum(len(arrays["episode"]) for _, arrays in iterate_shards(folder, (), skip_corrupt=True))
-        if lost := metadata["episodes"] - whole:
-            raise UserError(
-                f"{lost} of {metadata['episodes']} episodes in {folder} are in files that are missing or corrupt: "
-                "run the same command with repair=true, which collects them again"
-            )
         print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
 
 

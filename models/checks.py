@@ -17,8 +17,8 @@ def check_number(
     """
     number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
     if not (number and low <= value <= high and abs(value) < math.inf) or (positive and value == 0):
-        least = "above 0" if positive else f"of at least {low:g}"
-        span = f"{least} and at most {high:g}" if high < math.inf else least
+        least = "above 0" if positive else f"of at least {low:.10g}"
+        span = f"{least} and at most {high:.10g}" if high < math.inf else least
         raise ValueError(f"{name} must be a {'whole ' if whole else ''}number {span}, not {value!r}")
 
 

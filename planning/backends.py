@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Protocol
 
@@ -85,7 +85,7 @@ class CudaGraphs:
     def __init__(self, fixed_shapes: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
         """`fixed_shapes`: opened while functions are captured, to tell models that shapes must not depend on values."""
         Distribution.set_default_validate_args(False)  # its checks branch on values, which no graph can
-        self._graphs: dict[Any, _Graph | None] = {}  # None runs eagerly; the one that was used last comes last
+        self._graphs: dict[Any, Graph | None] = {}  # None runs eagerly; the one that was used last comes last
         self._fixed_shapes = fixed_shapes
         self._stream: Any = None  # one for all captures: graphs of other streams would share no memory
         self._pool: Any = None
@@ -107,7 +107,7 @@ class CudaGraphs:
         self._graphs[kind] = graph = self._graphs.pop(kind)
         return function(*arguments) if graph is None else graph(tensors)
 
-    def _captured(self, function: Callable[..., Any], arguments: Any, tensors: list[Tensor]) -> _Graph | None:
+    def _captured(self, function: Callable[..., Any], arguments: Any, tensors: list[Tensor]) -> Graph | None:
         device = next((tensor.device for tensor in tensors if tensor.device.type == "cuda"), None)
         if device is None:
             raise ValueError(
@@ -118,7 +118,7 @@ class CudaGraphs:
             self._stream, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
         try:
             with self._fixed_shapes():
-                return _Graph(function, arguments, device, self._stream, self._pool)
+                return Graph(function, arguments, device, self._stream, self._pool)
         except RuntimeError as error:  # the base class of CUDA's errors
             why = (str(error).splitlines() or [repr(error)])[0]
             print(
@@ -127,7 +127,7 @@ class CudaGraphs:
             return None
 
 
-class _Graph:
+class Graph:
     """A function of tensors as a CUDA graph, for one kind of arguments, which is not checked again."""
 
     def __init__(
@@ -152,11 +152,15 @@ class _Graph:
         with torch.cuda.stream(here), torch.cuda.graph(self._graph, pool=pool, stream=stream):
             self._result = function(*own)
 
-    def __call__(self, tensors: list[Tensor]) -> Any:
+    def __call__(self, tensors: Sequence[Tensor]) -> Any:
+        return records.apply(self.replay(tensors), lambda one: one.clone() if isinstance(one, Tensor) else one)
+
+    def replay(self, tensors: Sequence[Tensor]) -> Any:
+        """The function's result in tensors that the next replay overwrites; `tensors`: those of its arguments."""
         for own, tensor in zip(self._inputs, tensors, strict=True):
             own.copy_(tensor, non_blocking=True)
         self._graph.replay()
-        return records.apply(self._result, lambda one: one.clone() if isinstance(one, Tensor) else one)
+        return self._result
 
 
 def _as_tensor(argument: Any) -> Any:

@@ -107,7 +107,6 @@ class CollectConfig(LaunchOptions, CollectionOptions):
     defaults: list[Any] = preset_defaults("env/ranges=paper world=tabletop")
     transitions: int = option(100_000, "pushes to collect, at least; whole files of episodes are written", minimum=1)
     output: str | None = option(None, "folder for the dataset, in which an unfinished one resumes; by default in data/")
-    repair: bool = option(False, "collect missing or corrupt files again")
     env: WorldConfig = field(default_factory=collection_world)
     world: Any = None
 
@@ -159,7 +158,6 @@ class TrainConfig(DeviceOptions):
     data: Any = option("data/pushes", DATA)
     output: str | None = option(None, FOLDER)
     pointnet: str = option(DEFAULT_CHECKPOINT, "for geometry=pointnet: a shipped checkpoint, or one from pretrain")
-    skip_corrupt: bool = option(False, "skip corrupt files of the dataset instead of stopping")
     initial: str | None = option(None, "checkpoint whose weights training starts from, by name or path")
     trained: list[str] = option([], "parts that change, [dynamics], while others stay as they are; by default all")
     model: Any = None

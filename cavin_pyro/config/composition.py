@@ -34,9 +34,8 @@ OUTPUT = {  # the folder of a run for which the user names none
     "reproduce": "runs/reproduce/{scale}",
 }
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
-SAME_RUN = {"output", "workers", "transitions", "repair", "sections", "video", "video_format", "episodes"}
+SAME_RUN = {"output", "workers", "transitions", "sections", "video", "video_format", "episodes"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
-VALUE = re.compile(r"""'(\\.|[^'\\])*'|"(\\.|[^"\\])*"|[^\s,:'"(){}\[\]=]([^,:'"(){}\[\]]*[^\s,:'"(){}\[\]])?""")
 PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "export", "models", "table", "env.assets")
 OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")
 
@@ -146,7 +145,7 @@ def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
 def of_sweep(overrides: Sequence[str]) -> tuple[set[str], list[str]]:
     """The options that vary in a sweep, and what Hydra is told about the folder of its runs."""
     parsed = [_parsed(word) for word in overrides]
-    folder = [_quoted(f"hydra.sweep.dir={one.value()}") for one in parsed if one.key_or_group == "output"]
+    folder = [f"hydra.sweep.dir={_word(str(one.value()))}" for one in parsed if one.key_or_group == "output"]
     return {one.get_key_element() for one in parsed if one.is_sweep_override()}, folder
 
 
@@ -175,15 +174,11 @@ def rewritten(overrides: Sequence[str], *, plans: bool = False) -> list[str]:
 
 
 def _quoted(word: str) -> str:
-    """An override in Hydra's grammar: what it lacks, such as letters outside of ASCII, is put into quotes."""
+    """An override in Hydra's grammar, which lacks letters of some paths: these are put into quotes."""
     key, sign, value = word.partition("=")
-    for one in reversed([*VALUE.finditer(value)]):
-        if not one[0].isascii() and one[0][0] not in "'\"":
-            quoted = QuotedString(one[0], Quote.single).with_quotes()
-            value = value[: one.start()] + quoted + value[one.end() :]
-    if key in PATHS:
+    if key in PATHS and not value.startswith("["):
         try:
-            OverridesParser.create().parse_override(key + sign + value)
+            OverridesParser.create().parse_override(word)
         except HydraException:
             value = QuotedString(value, Quote.single).with_quotes()
     return key + sign + value
@@ -213,8 +208,9 @@ def _of_other_world(overrides: Sequence[str], *, plans: bool) -> list[str]:
 
 
 def _composed(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    parsed = [*map(_parsed, words)]
     config = hydra.compose(name, overrides=list(words), return_hydra_config=True)
-    for one in map(_parsed, words):
+    for one in parsed:
         section = one.key_or_group.rpartition(".")[0]
         if re.match(r"hydra\.(?!(launcher|sweeper|searchpath)\b)", one.key_or_group):
             raise UserError(f"{one.input_line}: Hydra's folders and logs are not used here; choose output=DIR")

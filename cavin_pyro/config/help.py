@@ -35,7 +35,7 @@ EXAMPLES = {
 # --help lists the options that a user of the field changes, --help=all every one: those without a section, but
 RARE = {
     *("world", "env/ranges", "criterion", "push_decimals", "matmul_precision", "trust"),
-    *("intent_length", "perturbation_rate", "episodes_per_shard", "autoencoder", "skip_corrupt", "first_scene"),
+    *("intent_length", "perturbation_rate", "episodes_per_shard", "autoencoder", "first_scene"),
 }
 USUAL = {  # and of sections
     *("planner.samples", "planner.horizon", "planner.add", "planner.compile"),

@@ -11,6 +11,7 @@ the signature of its constructor.
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from types import UnionType
@@ -20,7 +21,8 @@ from hydra.utils import get_object
 from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, OmegaConf, StringNode, ValueNode
 from omegaconf.errors import OmegaConfBaseException
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.models.checks import check_number
 
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
@@ -43,7 +45,7 @@ class About:
     Attributes:
         help: one line. unit: of a number.
         choices: names, or the dotted path of a collection of them, which is imported on demand.
-        minimum, maximum: both allowed. positive: more than 0, and finite.
+        minimum, maximum: both allowed, of a number; without any, no check. positive: more than 0, below 1e30.
     """
 
     help: str
@@ -58,16 +60,6 @@ class About:
         """The choices, None if there is no list of them."""
         choices = get_object(self.choices) if isinstance(self.choices, str) else self.choices
         return None if choices is None else tuple(map(str, choices))
-
-    @property
-    def range(self) -> str:
-        """The numbers that are allowed, in words."""
-        unit = f" {self.unit}" if self.unit else ""
-        if self.positive:
-            return "a positive number below 1e30"  # torch counts in float32
-        if self.maximum is None:
-            return f"at least {self.minimum:g}{unit}"
-        return f"between {self.minimum:.10g} and {self.maximum:.10g}{unit}"
 
 
 def option(default: Any, help: str, **about: Any) -> Any:
@@ -133,10 +125,13 @@ def check_value(name: str, value: Any, about: About) -> None:
             if str(entry) not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")
         return
-    low, high = about.minimum, about.maximum
-    inside = (low is None or value >= low) and (high is None or value <= high)
-    if not (0 < value < 1e30 if about.positive else inside):
-        raise UserError(f"{name} must be {about.range}, not {shown(value)}")
+    if about.minimum is None and not about.positive:
+        return
+    most = 1e30 if about.positive else math.inf  # torch counts in float32
+    span = about.minimum or 0, about.maximum or most
+    with user_input():
+        place = f"{name} in {about.unit}" if about.unit else name
+        check_number(place, value, *span, whole=isinstance(value, int), positive=about.positive)
 
 
 def shown(value: Any) -> Any:

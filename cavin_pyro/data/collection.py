@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Generator, Iterable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -96,8 +95,9 @@ def collect(
 ) -> dict[str, Any]:
     """Collect whole shards until at least `transitions` pushes are on disk; resume an earlier run.
 
-    Shards are computed in parallel, but committed in order by this process alone: the metadata count a shard only
-    once its file is in place. A killed run therefore resumes after the last shard that counts.
+    Shards of it that are missing or corrupt are collected again. Shards are computed in parallel, but committed in
+    order by this process alone: the metadata count a shard only once its file is in place. A killed run therefore
+    resumes after the last shard that counts.
 
     Args:
         workers: processes.
@@ -110,12 +110,16 @@ def collect(
         WorkerError: a worker was killed.
     """
     metadata = _begin(config, folder)
+    damaged = [number for number in range(metadata["shards"]) if not _is_whole(folder, number, metadata)]
+    with closing(run_jobs(config.shard, damaged, workers)) as shards:
+        for place, arrays in shards:
+            dataset.write_shard(dataset.shard_path(folder, damaged[place]), arrays)
     with (
         progress_bar("collecting", total=transitions, initial=metadata["transitions"], unit="transition") as bar,
-        closing(_shards(config, itertools.count(metadata["shards"]), workers=workers)) as shards,
+        closing(run_jobs(config.shard, itertools.count(metadata["shards"]), workers, ordered=True)) as shards,
     ):
         while metadata["transitions"] < transitions:
-            arrays = next(shards)
+            _, arrays = next(shards)
             dataset.write_shard(dataset.shard_path(folder, metadata["shards"]), arrays)
             made = int(arrays["length"].sum())
             metadata["shards"] += 1
@@ -124,6 +128,15 @@ def collect(
             dataset.write_metadata(folder, metadata)
             bar.update(made)
     return metadata
+
+
+def _is_whole(folder: Path, number: int, metadata: dict[str, Any]) -> bool:
+    try:
+        dataset.read_shard(dataset.shard_path(folder, number), metadata=metadata)
+    except UserError:
+        print(f"collecting again: {dataset.shard_path(folder, number)}", flush=True)
+        return False
+    return True
 
 
 def collect_episode(scene: Scene, config: CollectionConfig, episode: int) -> Arrays:
@@ -212,17 +225,6 @@ def _scene(parts: str) -> Scene:
     return open_scene(CollectionConfig(**json.loads(parts)))
 
 
-def _collect_shard(job: tuple[Collection, int]) -> Arrays:
-    config, number = job
-    return config.shard(number)
-
-
-def _shards(config: Collection, numbers: Iterable[int], *, workers: int) -> Generator[Arrays, None, None]:
-    """The shards with these numbers, in their order."""
-    with closing(run_jobs(_collect_shard, ((config, number) for number in numbers), workers, ordered=True)) as made:
-        yield from (shard for _, shard in made)
-
-
 def _begin(config: Collection, folder: Path) -> dict[str, Any]:
     """Metadata of the dataset so far, checked against the requested configuration."""
     wanted = config.stored()
@@ -245,25 +247,3 @@ def _begin(config: Collection, folder: Path) -> dict[str, Any]:
                 "resume with the same options, or choose another output=DIR"
             )
     return metadata
-
-
-def repair(config: Collection, folder: Path, *, workers: int = 1) -> int:
-    """Collect again the shards that are missing or corrupt; returns how many there were.
-
-    Args:
-        workers: as in `collect`.
-
-    Raises:
-        UserError: as in `collect`.
-    """
-    metadata, damaged = _begin(config, folder), []
-    for number in range(metadata["shards"]):
-        try:
-            dataset.read_shard(dataset.shard_path(folder, number), metadata=metadata)
-        except dataset.CorruptShardError as error:
-            print(f"collecting again: {error.args[0]}", flush=True)
-            damaged.append(number)
-    with closing(_shards(config, damaged, workers=workers)) as shards:
-        for number, arrays in zip(damaged, shards, strict=True):
-            dataset.write_shard(dataset.shard_path(folder, number), arrays)
-    return len(damaged)

@@ -36,6 +36,7 @@ from cavin_pyro.storage.files import atomic_write, file_digest, read_json, write
 
 FORMAT = "cavin_pyro episodes"
 FORMAT_VERSION = 1
+COLLECT = "python -m cavin_pyro.collect"
 COUNTS = ("shards", "episodes", "transitions")
 FARTHEST = 100.0  # metres; the table ends before 1
 FINITE = 3e38  # the largest of float32, about
@@ -105,16 +106,6 @@ def check_tabletop(folders: Sequence[Path], what: str) -> None:
             raise UserError(f"{folder} has episodes of {made['world']['_target_']}, and {what}: choose another dataset")
 
 
-class CorruptShardError(UserError):
-    """A shard that is missing or corrupt; `args[0]` says so without what to do about it."""
-
-    def __str__(self) -> str:
-        return (
-            f"{self.args[0]}: run its python -m cavin_pyro.collect again with repair=true, "
-            "or train on the rest with skip_corrupt=true"
-        )
-
-
 def shard_path(folder: Path, number: int) -> Path:
     """The path of a shard."""
     return folder / f"episodes-{number:05d}.h5"
@@ -140,7 +131,7 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapp
         metadata: of the dataset, with which the numbers of episodes, pushes and objects must agree.
 
     Raises:
-        CorruptShardError: the file is missing, truncated, damaged or not a shard; it is named.
+        UserError: the file is missing, truncated, damaged or not a shard; it is named.
     """
     metadata = metadata or {}
     configuration, arrays, where = metadata.get("configuration", {}), Arrays(), ""
@@ -156,7 +147,7 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapp
         _check_agreement(arrays, metadata)
     except UNREADABLE as error:
         defect = f"{where}{str(error).splitlines()[0]}" if path.exists() else "it is missing"
-        raise CorruptShardError(f"shard {path} is missing or corrupt ({defect})") from error
+        raise UserError(f"shard {path} is missing or corrupt ({defect}): run its {COLLECT} again") from error
     return arrays
 
 
@@ -260,7 +251,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     """
     path = folder / "metadata.json"
     if not path.exists():
-        raise UserError(f"no dataset in {folder}: make one with python -m cavin_pyro.collect output={folder}")
+        raise UserError(f"no dataset in {folder}: make one with {COLLECT} output={folder}")
     metadata = read_json(path)
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise UserError(f"{path} does not describe a dataset of this program")
@@ -334,12 +325,12 @@ def shard_digest(path: Path) -> str:
     """The SHA-256 of a shard's bytes: hexadecimal digits. It takes 3 ms for 2 MB.
 
     Raises:
-        CorruptShardError: the file cannot be read.
+        UserError: the file cannot be read.
     """
     try:
         return file_digest(path)
     except OSError as error:
-        raise CorruptShardError(f"shard {path} is missing or corrupt ({error.strerror})") from error
+        raise UserError(f"shard {path} is missing or corrupt ({error.strerror}): run its {COLLECT} again") from error
 
 
 def check_distinct(folders: Sequence[Path]) -> None:
@@ -350,37 +341,24 @@ def check_distinct(folders: Sequence[Path]) -> None:
     """
     known: dict[str, Path] = {}
     for folder in folders:
-        path = shard_path(folder, 0)
-        content = file_digest(path) if path.exists() else str(path.resolve())
+        content = shard_digest(shard_path(folder, 0))
         if content in known:
             raise UserError(f"data names the same episodes twice, {known[content]} and {folder}: name them once")
         known[content] = folder
 
 
-def iterate_shards(folder: Path, names: Sequence[str], *, skip_corrupt: bool = False) -> Iterator[tuple[int, Arrays]]:
-    """Yield (number, arrays) of a dataset's shards in order.
-
-    Args:
-        names: arrays to read. skip_corrupt: skip corrupt shards with a message, instead of raising.
+def iterate_shards(folder: Path, names: Sequence[str]) -> Iterator[tuple[int, Arrays]]:
+    """Yield (number, arrays) of a dataset's shards in order. names: arrays to read.
 
     Raises:
-        UserError: no dataset, a corrupt shard, one that repeats an episode of another, or none that is whole.
+        UserError: no dataset, a corrupt shard, or one that repeats an episode of another.
     """
-    metadata, known, whole = read_metadata(folder), set[int](), 0
+    metadata, known = read_metadata(folder), set[int]()
     for number in range(metadata["shards"]):
         path = shard_path(folder, number)
-        try:
-            arrays = read_shard(path, ("episode", *names), metadata=metadata)
-        except CorruptShardError as error:
-            if not skip_corrupt:
-                raise
-            print(f"left out: {error.args[0]}", flush=True)
-            continue
+        arrays = read_shard(path, ("episode", *names), metadata=metadata)
         for episode in arrays["episode"].tolist():
             if episode in known:
-                raise UserError(f"shard {path} repeats episode {episode}: delete it and collect again with repair=true")
+                raise UserError(f"shard {path} repeats episode {episode}: delete it and run its {COLLECT} again")
             known.add(episode)
-        whole += 1
         yield number, arrays
-    if whole == 0:
-        raise UserError(f"dataset {folder} has no usable shard: collect it again, with the same options")

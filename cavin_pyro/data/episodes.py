@@ -107,28 +107,16 @@ def checked_episode(
 
     A `UserError` says what is not.
     """
-    motions = checked_actions(actions, None, space.actions)
+    motions = checked("actions", actions, torch.float32, (None, space.actions))
+    if (largest := float(motions.abs().max())) > 1:
+        raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
     places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
     others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
-    real = checked_mask(mask, places.shape[1])
+    real = checked("mask", mask, torch.bool, places.shape[1:2])
+    if not real.any():
+        raise UserError("mask has a state without an object: leave out its episode")
     made = {"centers": places, "features": others, "actions": motions, "mask": real}
     return {name: tensor.numpy() for name, tensor in made.items()}
-
-
-def checked_actions(actions: Any, *shape: int | None) -> Tensor:
-    """As `checked`; they must lie in the box."""
-    motions = checked("actions", actions, torch.float32, shape)
-    if motions.numel() and (largest := float(motions.abs().max())) > 1:
-        raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
-    return motions
-
-
-def checked_mask(mask: Any, *shape: int) -> Tensor:
-    """As `checked`; each state must have an object."""
-    real = checked("mask", mask, torch.bool, shape)
-    if not real.any(-1).all():
-        raise UserError("mask has a state without an object: leave out its window or episode")
-    return real
 
 
 def checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | None]) -> Tensor:

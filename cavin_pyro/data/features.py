@@ -60,7 +60,7 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
         fingerprint: see `geometry_fingerprint`.
 
     Raises:
-        CorruptShardError: the shard is corrupt.
+        UserError: the shard is corrupt.
     """
     shard, metadata = dataset.shard_path(folder, number), dataset.read_metadata(folder)
     path = folder / f"features-{fingerprint}" / shard.name

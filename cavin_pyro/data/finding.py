@@ -117,8 +117,6 @@ class WindowFinder:
         Raises:
             UserError: there is no window to train on, or none to validate with.
         """
-        if not self._stored:
-            raise UserError(f"dataset {self._where} has no usable shard: collect it again, with the same options")
         stored = {name: torch.from_numpy(array[: self._filled]) for name, array in self._stored.items()}
         windows = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in self._windows.items()}
         for name, own in (("training", ~windows["held_out"]), ("validation", windows["held_out"])):

@@ -7,10 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from cavin_pyro.config.commands import WindowConfig
 from cavin_pyro.config.device import send
@@ -18,7 +18,7 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.data.episodes import checked, checked_actions, checked_episode, checked_mask, packed
+from cavin_pyro.data.episodes import checked_episode, packed
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
 from cavin_pyro.data.finding import WindowFinder
 from cavin_pyro.models.checks import check_number
@@ -75,58 +75,6 @@ class WindowTable:
         self._objects = torch.cat([(part * slots).amax(-1) for part in states.mask.split(2**16)])
 
     @classmethod
-    @user_input()
-    def from_arrays(
-        cls,
-        *,
-        centers: ArrayLike,
-        features: ArrayLike,
-        actions: ArrayLike,
-        mask: ArrayLike | None = None,
-        transition_mask: ArrayLike | None = None,
-        sequence_mask: ArrayLike | None = None,
-        episodes: ArrayLike | None = None,
-        validation_fraction: float = 0.1,
-        seed: int = 0,
-    ) -> WindowTable:
-        """Windows from arrays or tensors of one's own, for `cavin_pyro.fit`.
-
-        windows = WindowTable.from_arrays(centers=centers, features=features, actions=actions)
-
-        Args:
-            centers: in the world's unit, `[W, T + 1, M, P]`. features: such as of unit length, `[W, T + 1, M, F]`.
-            actions: in [-1, 1], `[W, T, A]`.
-            mask: real objects, `[W, T + 1, M]` bool; by default all.
-            transition_mask: pushes that f learns from, `[W, T]` bool. sequence_mask: windows that h, g and the guide
-                learn from, `[W]` bool. By default all.
-            episodes: number of each window's episode, `[W]`; by default every window is one. Of the episodes, at least
-                one and about `validation_fraction` are for validation, which `seed` chooses.
-
-        Raises:
-            UserError: shapes that do not fit together, numbers that are not finite, or nothing to train on.
-        """
-        pushes = checked_actions(actions, None, None, None)
-        W, T = pushes.shape[:2]
-        places = checked("centers", centers, torch.float32, (W, T + 1, None, None))
-        real = checked_mask(mask, *places.shape[:3])
-        outlines = checked("features", features, torch.float32, (*places.shape[:3], None))
-        transitions = checked("transition_mask", transition_mask, torch.bool, (W, T))
-        sequences = checked("sequence_mask", sequence_mask, torch.bool, (W,))
-        if not (transitions.any() and sequences.any()):
-            raise UserError("transition_mask or sequence_mask is False everywhere: leave something to learn from")
-        numbers = checked("episodes", range(W) if episodes is None else episodes, torch.int64, (W,))
-        return cls(
-            State(places, outlines, real).map(lambda field: field.flatten(0, 1)),
-            functional.pad(pushes, (0, 0, 0, 1)).flatten(0, 1),  # after a window's last state there is no push
-            functional.pad(transitions, (0, 1)).flatten(),
-            starts=torch.arange(W) * (T + 1),
-            sequence_mask=sequences,
-            episodes=numbers,
-            held_out=_held_out(numbers, T, validation_fraction, seed),
-            segment_length=T,
-        )
-
-    @classmethod
     def from_episodes(
         cls,
         space: Space,
@@ -148,7 +96,8 @@ class WindowTable:
             space: of the world.
             centers, features, actions: of each episode of S steps, `[S + 1, M, P]`, `[S + 1, M, F]`, and `[S, A]` from
                 -1 to 1. mask: real objects, `[M]` of each; by default all.
-            negative_fraction: share that is kept of windows in which nothing moves. For the others see `from_arrays`.
+            segment_length: T. negative_fraction: share that is kept of windows in which nothing moves.
+            validation_fraction: share of the episodes, at least one, that is for validation, which `seed` chooses.
 
         Raises:
             UserError: shapes that do not fit, numbers that are not finite, an action out of its box, or no window.
@@ -168,7 +117,7 @@ class WindowTable:
                 M, F = episodes[0]["features"].shape[1:]
                 sizes = {"objects": M, "feature_dimension": F}
             longest = max((len(one["actions"]) for one in episodes), default=0)
-            held = _held_out(torch.arange(len(episodes)), longest, validation_fraction, seed).numpy()
+            held = _held_out(len(episodes), longest, validation_fraction, seed)
             together = packed(episodes, range(len(episodes)), longest)
         config = WindowConfig(negative_fraction=negative_fraction)
         states, slots = len(episodes) * (longest + 1), together["mask"].shape[1]
@@ -247,7 +196,6 @@ def load_windows(
     *,
     segment_length: int = SEGMENT_LENGTH,
     seed: int = 0,
-    skip_corrupt: bool = False,
     storage: Path | None = None,
 ) -> WindowTable:
     """Read one or more datasets, compute missing features, and find the windows.
@@ -280,26 +228,17 @@ def load_windows(
     with progress_bar("reading", total=sum(metadata["shards"] for metadata in every), unit="file") as bar:
         for folder, numbers, metadata in zip(folders, excluded, every, strict=True):
             made = 0
-            for number, arrays in dataset.iterate_shards(folder, names, skip_corrupt=skip_corrupt):
+            for number, arrays in dataset.iterate_shards(folder, names):
                 bar.update()
                 made += int(arrays["length"].sum())
-                if geometry is None:
-                    found.add(arrays)
-                    continue
-                try:
+                if geometry is not None:
                     arrays["features"] = shard_features(folder, number, geometry, fingerprint)
-                except dataset.CorruptShardError as error:  # its clouds, which are read here alone, are corrupt
-                    if not skip_corrupt:
-                        raise
-                    print(f"left out: {error.args[0]}", flush=True)
-                    continue
-                kept = ~held_out(arrays, numbers).any(axis=-1)
-                found.add({name: array[kept] for name, array in arrays.items()})
-            if made != metadata["transitions"] and not skip_corrupt:
+                    kept = ~held_out(arrays, numbers).any(axis=-1)
+                    arrays = {name: array[kept] for name, array in arrays.items()}
+                found.add(arrays)
+            if made != metadata["transitions"]:
                 said = f"{made} transitions, and its metadata say {metadata['transitions']}"
-                raise UserError(
-                    f"{folder} has {said}: collect it again, or train on what is there with skip_corrupt=true"
-                )
+                raise UserError(f"{folder} has {said}: collect it again")
     return WindowTable(**found.found())
 
 
@@ -321,13 +260,12 @@ def shared_space(folders: Sequence[Path]) -> Space | None:
     return dataset.space_of(every[0])
 
 
-def _held_out(numbers: Tensor, steps: int, fraction: float, seed: int) -> Tensor:
-    """Which of the windows or episodes, by the number of their episode, are for validation: at least of one episode."""
+def _held_out(episodes: int, steps: int, fraction: float, seed: int) -> NDArray[np.bool_]:
+    """Which episodes are for validation: at least one."""
     check_number("validation_fraction", fraction, high=0.99, positive=True)
     check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
-    distinct = numbers.unique()
-    if len(distinct) < 2 or steps == 0:
-        raise UserError(f"windows of {len(distinct)} episodes with {steps} pushes: give at least two and a push")
-    count = min(max(1, round(fraction * len(distinct))), len(distinct) - 1)
-    order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
-    return torch.isin(numbers, distinct[order[:count]])
+    if episodes < 2 or steps == 0:
+        raise UserError(f"windows of {episodes} episodes with {steps} pushes: give at least two and a push")
+    count = min(max(1, round(fraction * episodes)), episodes - 1)
+    order = torch.randperm(episodes, generator=torch.Generator().manual_seed(seed))
+    return np.isin(np.arange(episodes), order[:count].numpy())

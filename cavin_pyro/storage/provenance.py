@@ -5,16 +5,18 @@ from __future__ import annotations
 import datetime
 import hashlib
 import platform
-import re
 import shlex
 import subprocess
 import sys
+from contextlib import suppress
 from glob import glob
-from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from cavin_pyro import __version__
+
+PACKAGES = ("torch", "pyro-ppl", "numpy", "pybullet", "pybullet-arm64", "gymnasium")
 
 
 def provenance() -> dict[str, Any]:
@@ -25,7 +27,7 @@ def provenance() -> dict[str, Any]:
         "command": shlex.join(["python", *_program(), *sys.argv[1:]]),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in ("torch", "pyro-ppl", "numpy", *_pybullet(), "gymnasium")},
+        "packages": _packages(),
         "machine": f"{platform.system()} {platform.machine()}",
     }
 
@@ -45,24 +47,13 @@ def _program() -> list[str]:
     return ["-m", f"cavin_pyro.{script.stem.removeprefix('cavin-')}"] if ours else [script.name]
 
 
-def _pybullet() -> list[str]:
-    """The distribution whose module pybullet is imported: there are two, and if both are there its size tells."""
-    found = []
-    for name in ("pybullet", "pybullet-arm64"):
-        try:
-            home = distribution(name)
-            lines = re.findall(r"^(pybullet\.[^,/]*),.*,(\d+)$", home.read_text("RECORD") or "", re.MULTILINE)
-            found += [name for file, size in lines if Path(str(home.locate_file(file))).stat().st_size == int(size)]
-        except (PackageNotFoundError, OSError):
-            continue
+def _packages() -> dict[str, str]:
+    """The versions of those that are installed."""
+    found = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
     return found
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def _revision() -> str:

@@ -6,7 +6,6 @@ long as the GPU needs for them.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from cavin_pyro.models.networks.layers import fixed_shapes
 from cavin_pyro.models.state import Window
+from cavin_pyro.planning.backends import Graph
 from cavin_pyro.training.elbo import elbo_terms, latent_sites
 from cavin_pyro.training.objectives import Loss, Objective
 from cavin_pyro.training.resume import forked
@@ -53,7 +53,7 @@ class CapturedLoss:
     def __init__(self, loss: Loss) -> None:
         self._loss = loss
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
-        self._graphs: dict[torch.Size, tuple[Any, Window, Tensor, list[Tensor | None]]] = {}
+        self._graphs: dict[torch.Size, Graph] = {}
         self._stream: Any = None  # one for all graphs, which else would share no memory
 
     def __call__(self, window: Window) -> Tensor:
@@ -61,42 +61,16 @@ class CapturedLoss:
 
         Raises RuntimeError for a loss that waits for the GPU.
         """
-        shape = window.states.centers.shape
+        shape, device = window.states.centers.shape, window.actions.device
+        if self._stream is None:
+            self._stream, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
         if shape not in self._graphs:
-            self._graphs[shape] = self._capture(window)
-        graph, own, value, gradients = self._graphs[shape]
-        for mine, given in zip((*own.states, *own[1:]), (*window.states, *window[1:]), strict=True):
-            mine.copy_(given, non_blocking=True)
-        graph.replay()
+            with fixed_shapes():
+                self._graphs[shape] = Graph(self._gradients, (window,), device, self._stream, self._pool)
+        value, gradients = self._graphs[shape].replay((*window.states, *window[1:]))
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         return value
-
-    def _capture(self, window: Window) -> tuple[Any, Window, Tensor, list[Tensor | None]]:
-        """A graph, the window that it reads, and the loss and the gradients that each replay writes anew.
-
-        The loss is computed twice: once so that libraries allocate what they need, which no graph may do, and so that
-        an operation for which the host waits raises before the capture, which would leave the generator unusable.
-        """
-        device, own = window.actions.device, window.map(torch.clone)
-        here = torch.cuda.current_stream(device)
-        if self._stream is None:
-            self._stream, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
-        self._stream.wait_stream(here)
-        before = torch.cuda.get_sync_debug_mode()
-        try:
-            with warnings.catch_warnings(), torch.cuda.stream(self._stream), forked(device), fixed_shapes():
-                warnings.simplefilter("ignore")  # of torch, that this mode is a prototype
-                torch.cuda.set_sync_debug_mode("error")
-                self._gradients(own)
-        finally:
-            torch.cuda.set_sync_debug_mode(before)
-            here.wait_stream(self._stream)
-        graph = torch.cuda.CUDAGraph()
-        # Inside of `here`, which is then current again also if the capture fails.
-        with torch.cuda.stream(here), torch.cuda.graph(graph, pool=self._pool, stream=self._stream), fixed_shapes():
-            value, gradients = self._gradients(own)
-        return graph, own, value, gradients
 
     def _gradients(self, window: Window) -> tuple[Tensor, list[Tensor | None]]:
         loss = capturable_loss(self._loss, window) / len(window.sequence_mask)

@@ -69,9 +69,8 @@ def train(config: DictConfig) -> Trainer:
         check_same_run(folder, config, ignore=free(config.trainer.schedule))
         most = max(slots_of(read_metadata(one)) for one in data)
         check_fit(model, geometry, most, features=made["features"] if made else None)
-        options = {name: config[name] for name in ("seed", "skip_corrupt")}
-        length = config.model.segment_length
-        windows = load_windows(data, geometry, selection, segment_length=length, storage=folder, **options)
+        options = {"segment_length": config.model.segment_length, "seed": config.seed}
+        windows = load_windows(data, geometry, selection, storage=folder, **options)
         record = {"data": [content_record(one) for one in data], **origin}
         record |= {"training_windows": len(windows.training), "validation_windows": len(windows.validation)}
         return fit(
@@ -108,8 +107,7 @@ def fit(
     run = cavin_pyro.fit(model, guide, windows, steps=2000, learning_rate=1e-3, output="runs/mine")
 
     Args:
-        windows: of data (`cavin_pyro.data.windows.load_windows`) or of arrays (`WindowTable.from_arrays`, or
-            `from_episodes`).
+        windows: of data (`cavin_pyro.data.windows.load_windows`) or of arrays (`WindowTable.from_episodes`).
         objective: a bound of Pyro's or `cavin_pyro.training.objectives.Objective`, by default `Trace_ELBO`.
         geometry: what made the windows' features, for the checkpoint and for `reflect`.
         output: folder for `checkpoint.safetensors`, which `load` and the commands read, and for metrics; by default

@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import itemgetter
 from pathlib import Path
 
 import pyro
@@ -206,10 +207,9 @@ class Trainer:
         tensors: dict[str, Tensor] = {
             **random_states(self.windows.device),
             "batches": self._batches.get_state(),
-            "counters": torch.tensor([self.step, self.best, self.best_step, self.stale], dtype=torch.float64),
         }
         tensors |= self._programs.state_dict()
-        write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {})
+        write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {"rows": self.rows})
 
     @property
     def resume_path(self) -> Path:
@@ -233,25 +233,20 @@ class Trainer:
         )
 
     def resume(self) -> None:
-        """Take over the state in the resume file, if there is one; a damaged one, or its metrics, is a `UserError`."""
+        """Take over the state in the resume file, if there is one; a damaged one is a `UserError`."""
         if self.step or not self.resume_path.exists():
             return
-        with resuming(self.resume_path) as (tensors, _):
+        with resuming(self.resume_path) as (tensors, state):
             for part, module in self._programs.items():
                 module.load_state_dict(section(tensors, part))
             load_optimizer(self._optimizer, tensors)
-            step, best, best_step, stale = tensors["counters"].tolist()
-            if not (math.isfinite(best) and 1 <= best_step <= step and stale >= 0):
-                raise ValueError("its counters contradict one another")
-            self.step, self.best, self.best_step, self.stale = int(step), best, int(best_step), int(stale)
+            self.rows = [{name: float(value) for name, value in row.items()} for row in state["rows"]]
+            best = min(self.rows, key=itemgetter("validation_loss"))  # the first of equals
+            self.step, self.best = int(self.rows[-1]["step"]), best["validation_loss"]
+            self.best_step = int(best["step"])
+            self.stale = sum(row["step"] > self.best_step for row in self.rows)
             self._batches.set_state(tensors["batches"])
             restore_random_states(tensors, self.windows.device, self._seed + self.step)
-        self.rows = [row for row in read_rows(self.folder / "metrics.csv") if row["step"] <= step]
-        if not {self.step, self.best_step} <= {int(row["step"]) for row in self.rows}:
-            raise UserError(
-                f"{self.folder / 'metrics.csv'} lacks step {self.step} or {self.best_step} of {self.resume_path.name}: "
-                "delete both to start again, or choose another output=DIR"
-            )
 
 
 def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:
@@ -280,18 +275,3 @@ def unchecked_programs() -> Iterator[None]:
     """Disable Pyro's checks of sites, which take a twentieth of every step of a small model."""
     with pyro.settings.context(validate_infer=False, validate_poutine=False):
         yield
-
-
-def read_rows(path: Path) -> list[Row]:
-    """The metrics that a run has written so far; a `UserError` if there are none, or something else."""
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-        if not all({"step", "validation_loss"} <= set(row) and math.isfinite(row["step"]) for row in rows):
-            raise ValueError("a row has no step")
-        return rows
-    except (OSError, ValueError, TypeError, AttributeError, csv.Error) as error:
-        raise UserError(
-            f"{path} is missing or damaged ({' '.join(str(error).split())}): delete resume.safetensors beside it to "
-            "start again, or choose another output=DIR"
-        ) from error

@@ -5,10 +5,7 @@ Standard normal noise `[B, n, K, D]` determines codes and actions, so every opti
 
 from __future__ import annotations
 
-import inspect
-
 from cavin_pyro.models.checks import check_choice
-from cavin_pyro.planning.checks import OptimizerError
 from cavin_pyro.planning.optimizers.base import Optimizer, Shooting, samples_of_iteration
 from cavin_pyro.planning.optimizers.cem import CEM, ICEM
 from cavin_pyro.planning.optimizers.evolution import Evolution
@@ -40,8 +37,8 @@ OPTIMIZERS: dict[str, type[Optimizer]] = {
 def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer") -> Optimizer:
     """The optimizer of that name, with its defaults, or the given one; `argument` is what errors call it.
 
-    Raises ValueError, naming the valid ones, for an unknown name or for an object that is no optimizer; for a method
-    `optimize` that takes other arguments; and for fewer samples than iterations.
+    Raises ValueError, naming the valid ones, for an unknown name or an object that is no optimizer, and for fewer
+    samples than iterations.
     """
     if isinstance(optimizer, str):
         check_choice(argument, optimizer, OPTIMIZERS)
@@ -51,13 +48,6 @@ def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = 
             f"{argument} must be one of {', '.join(OPTIMIZERS)}, or an object with a method "
             f"optimize(problem, samples), not {optimizer!r}"
         )
-    taken = inspect.signature(optimizer.optimize)
-    try:
-        taken.bind("problem", "samples")
-    except TypeError as error:
-        raise OptimizerError(
-            f"optimizer {type(optimizer).__name__}: optimize must take the arguments (problem, samples), not {taken}"
-        ) from error
     if isinstance(optimizer, CEM | MPPI | Evolution):
         samples_of_iteration(samples, optimizer.iterations, 0)
     return optimizer

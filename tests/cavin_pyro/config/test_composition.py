@@ -41,7 +41,7 @@ def test_every_preset_is_composed_and_helps_with_whole_sentences(command: str, o
 
 
 def test_a_path_may_have_letters_outside_of_ascii() -> None:
-    config = compose("train", "data=[a/ü=ü,b ü/c]", "output='ü\\'s'")
+    config = compose("train", "output='ü\\'s'", data=["a/ü=ü", "b ü/c"])
     assert (config.data, config.output) == (["a/ü=ü", "b ü/c"], "ü's")
     assert [compose("plan", f"output={path}").output for path in ("a(b", "{x}", "a=b")] == ["a(b", "{x}", "a=b"]
 
@@ -110,7 +110,8 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("~task", "~task: an option cannot be removed"),
     ("hydra.run.dir=here", "hydra.run.dir=here: Hydra's folders and logs are not used here; choose output=DIR"),
     ("reproduce objects=[]", "objects must name at least one: choose from 1, 2, 3, 4, 5"),
-    ("seed", "seed: Error parsing override"),
+    ("seed", "seed: missing EQUAL at '<EOF>'; write name=value, or "),
+    ("train data=[ü]", "; write name=value, or 'name=\"value\"'"),
     ("seed=[1,", "seed=[1,: "),
     ("seed=1,2", "seed=1,2: Ambiguous value for argument 'seed=1,2'; several values need -m: "),
     ("reward=???", "reward=???: Missing mandatory value"),
@@ -125,10 +126,10 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("train windows.held_out_objects=[[]]", "windows.held_out_objects must be a plain list such as [a,b], not [[]]"),
     ("video=${oc.decode:'maybe'}", "'maybe' is not a valid bool"),
     (f"seed={'1' * 5000}", "value has 5000 digits"),
-    ("seed=${oc.decode:'-1'}", "seed must be between 0 and 4294967295, not -1"),
-    ("margin=inf", "margin must be between 0 and 0.075 metres, not inf"),
-    ("evaluate workers=0", "workers must be between 1 and 1024, not 0"),
-    ("train trainer.learning_rate=0", "trainer.learning_rate must be a positive number below 1e30, not 0"),
+    ("seed=${oc.decode:'-1'}", "seed must be a whole number of at least 0 and at most 4294967295, not -1"),
+    ("margin=inf", "margin in metres must be a number of at least 0 and at most 0.075, not inf"),
+    ("evaluate workers=0", "workers must be a whole number of at least 1 and at most 1024, not 0"),
+    ("train trainer.learning_rate=0", "trainer.learning_rate must be a number above 0 and at most 1e+30, not 0"),
     ("pln seed=0", "unknown command 'pln': choose from collect, "),
 ]
 

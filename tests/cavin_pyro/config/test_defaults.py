@@ -89,7 +89,7 @@ def test_a_stored_section_is_checked_as_a_commands_is() -> None:
     assert configured(WindowConfig, {"maximum_step": 0.3, "of_old": 1}, "windows") == WindowConfig(maximum_step=0.3)
     for values, said in (
         ({"maximum_step": "far"}, "windows.maximum_step: Value 'far'"),
-        ({"maximum_step": -1}, "windows.maximum_step must be a positive number below 1e30, not -1"),
+        ({"maximum_step": -1}, "windows.maximum_step in metres must be a number above 0 and at most 1e\\+30, not -1"),
     ):
         with pytest.raises(UserError, match=f"^{said}"):
             configured(WindowConfig, values, "windows")

@@ -17,7 +17,7 @@ import cavin_pyro
 from cavin_pyro.collect import _collection
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.data.collection import collect, repair
+from cavin_pyro.data.collection import collect
 from cavin_pyro.data.dataset import (
     WORLD_ARRAYS,
     Arrays,
@@ -61,7 +61,8 @@ def test_episodes_are_equal_for_every_number_of_workers_and_after_a_stop(walks: 
     collect(WALKS, tmp_path, transitions=250, workers=1)
     assert content(tmp_path) == content(walks)
     shard_path(tmp_path, 1).unlink()
-    assert repair(WALKS, tmp_path) == 1 and content(tmp_path) == content(walks)
+    collect(WALKS, tmp_path, transitions=250, workers=1)
+    assert content(tmp_path) == content(walks)
     with pytest.raises(UserError, match="holds a dataset with seed=3, not 4"):
         collect(replace(WALKS, seed=4), tmp_path, transitions=1, workers=1)
 
@@ -183,6 +184,11 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
         ({"actions": [given["actions"][0][1:], *given["actions"][1:]]}, r"^episode 0: centers has shape \[\d+, 1, 2\]"),
         ({"features": [*given["features"][:9], given["features"][9].repeat(2, 2)]}, "^episode 9: features has shape"),
         ({"mask": [[False]] * 10}, "^episode 0: mask has a state without an object"),
+        ({"mask": [[np.nan]] * 10}, "^episode 0: mask has float64 numbers, which are no bool$"),
+        ({"features": [None] * 10}, "^episode 0: features must be an array of numbers: "),
+        ({"actions": [[[0.0], [0.0, 0.0]]] * 10}, "^episode 0: actions must be an array of numbers: "),
+        ({"actions": [np.zeros((0, 2))] * 10}, r"must have \[any, 2\], none of them 0$"),
+        ({"validation_fraction": 1}, "^validation_fraction must be a number above 0 and at most 0.99, not 1$"),
         ({"mask": [[True]]}, "^give a Space, and as many .* not Space and 10, 10, 10, 1$"),
         ({"space": {}}, "^give a Space, .*, not dict and "),
         ({"features": [2 * one for one in given["features"]]}, "has features that are not of length 1"),

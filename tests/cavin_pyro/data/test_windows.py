@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -135,6 +134,9 @@ def test_a_batch_holds_what_the_arrays_hold_from_a_file_without_a_name(tmp_path:
             features = pointnet(torch.from_numpy(arrays["clouds"][episode, ahead]).float())
         torch.testing.assert_close(window.states.features[row], features, rtol=0, atol=1e-6)
     assert table.batch(torch.tensor([12])).states.objects == 1  # without padding that no window needs
+    for there_are_none in ([-1], [0, 36], []):
+        with pytest.raises(ValueError, match="^a batch needs numbers of windows from 0 to 35, at least one$"):
+            table.batch(torch.tensor(there_are_none))
     bucket = table.sample(64, torch.Generator().manual_seed(0), bucketed=True)
     assert len(set(table.batch(bucket).states.mask.sum(-1).flatten().tolist())) == 1
 
@@ -175,21 +177,6 @@ def test_lengths_that_contradict_the_metadata_are_refused(tmp_path: Path) -> Non
         load_windows([folder], PointNet(), EVERY)
 
 
-def test_intact_shards_of_a_damaged_dataset_are_used_with_skip_corrupt(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = write_dataset(tmp_path / "data", *(made_up_episodes(12, first) for first in (3, 15, 27)))
-    (folder / "episodes-00000.h5").write_bytes(b"nothing")
-    content = (folder / "episodes-00001.h5").read_bytes()
-    middle = len(content) // 2  # among the clouds, most of the file
-    (folder / "episodes-00001.h5").write_bytes(content[:middle] + bytes(8) + content[middle + 8 :])
-    with pytest.raises(UserError, match=r"episodes-00000\.h5"):
-        load_windows([folder], PointNet(), EVERY)
-    table = load_windows([folder], PointNet(), EVERY, skip_corrupt=True)
-    assert len(table.starts) == 36
-    assert capsys.readouterr().out.count("left out: shard") == 2
-
-
 def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
     arrays = made_up_episodes(60)
     arrays["shape"] = np.random.default_rng(0).integers(3, size=(60, OBJECTS), dtype=np.int8)
@@ -203,51 +190,3 @@ def test_episodes_with_a_held_out_object_do_not_count(tmp_path: Path) -> None:
     said = "^unknown object 'fork' in windows.held_out_objects: choose from can, mug, which are in "
     with pytest.raises(UserError, match=said):
         load_windows([tmp_path / "data"], PointNet(), WindowConfig(held_out_objects=["fork"]))
-
-
-def arrays_of_windows(W: int = 6, T: int = 2, M: int = 3) -> dict[str, np.ndarray]:
-    generator = np.random.default_rng(0)
-    centers, features = generator.random((W, T + 1, M, 3)), generator.random((W, T + 1, M, 64))
-    return {"centers": centers, "features": features, "actions": generator.random((W, T, 4))}
-
-
-def test_windows_of_ones_own_arrays_are_batched_and_split_by_episode() -> None:
-    arrays, mask = arrays_of_windows(), np.ones((6, 3, 3), dtype=bool)
-    mask[:3, :, 2] = False
-    table = WindowTable.from_arrays(**arrays, mask=mask, episodes=[7, 7, 8, 8, 9, 9], validation_fraction=0.3)
-    batch = table.batch(torch.tensor([4, 1]))
-    for name, found in (("centers", batch.states.centers), ("features", batch.states.features)):
-        np.testing.assert_allclose(found, arrays[name][[4, 1]], rtol=1e-6)
-    np.testing.assert_allclose(batch.actions, arrays["actions"][[4, 1]], rtol=1e-6)
-    assert batch.states.mask.tolist() == mask[[4, 1]].tolist()
-    assert batch.transition_mask.all() and batch.sequence_mask.all()
-    assert table.batch(torch.tensor([1])).states.objects == 2
-    held_out = set(table.episodes[table.validation].tolist())
-    assert len(held_out) == 1 and not held_out & set(table.episodes[table.training].tolist())
-    assert sorted([*table.training.tolist(), *table.validation.tolist()]) == list(range(6))
-    for there_are_none in ([-1], [0, 6], []):
-        with pytest.raises(ValueError, match="^a batch needs numbers of windows from 0 to 5, at least one$"):
-            table.batch(torch.tensor(there_are_none))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"actions": np.zeros((6, 3, 4))}, r"^centers has shape \[6, 3, 3, 3\], and must have \[6, 4, any, any\]$"),
-        ({"mask": np.ones((6, 3))}, r"^mask has shape \[6, 3\], and must have \[6, 3, 3\]$"),
-        ({"features": np.full((6, 3, 3, 64), np.nan)}, "^features has numbers that are not finite"),
-        ({"episodes": [1] * 6}, "^windows of 1 episodes"),
-        ({"actions": np.full((6, 2, 4), 5.0)}, "^actions has numbers as large as 5, out of the box"),
-        ({"mask": np.zeros((6, 3, 3))}, "^mask has a state without an object"),
-        ({"mask": np.full((6, 3, 3), np.nan)}, "^mask has float64 numbers, which are no bool$"),
-        ({"episodes": np.arange(6) / 2}, "^episodes has float64 numbers, which are no int64$"),
-        ({"features": None}, "^features must be an array of numbers: "),
-        ({"actions": [[[0.0]], [[0.0], [0.0]]]}, "^actions must be an array of numbers: "),
-        ({"actions": np.zeros((6, 2, 0))}, r"must have \[any, any, any\], none of them 0$"),
-        ({"sequence_mask": np.zeros(6)}, "^transition_mask or sequence_mask is False everywhere"),
-        ({"validation_fraction": 1}, "^validation_fraction must be a number above 0 and at most 0.99, not 1$"),
-    ],
-)
-def test_arrays_that_are_no_windows_are_refused_in_one_line(wrong: dict[str, Any], said: str) -> None:
-    with pytest.raises(UserError, match=said):
-        WindowTable.from_arrays(**{**arrays_of_windows(), **wrong})

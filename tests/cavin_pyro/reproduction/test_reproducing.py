@@ -61,7 +61,7 @@ def test_a_failed_stage_is_told_with_its_command_and_its_last_line(
 ) -> None:
     monkeypatch.setattr(sys, "argv", [])
     stage = Stage("train", ("data=nowhere", "trainer.steps=0"), tmp_path / "train")
-    expected = r"train data=nowhere trainer.steps=0 output=.* failed: trainer.steps must be at least 1.* \(.*log.txt\)"
+    expected = r"train data=nowhere trainer.steps=0 output=.* failed: trainer.steps must be a whole .* \(.*log.txt\)"
     with pytest.raises(UserError, match=expected):
         run_stages([stage], 1)
 

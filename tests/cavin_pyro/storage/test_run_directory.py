@@ -104,20 +104,6 @@ def test_provenance_names_command_versions_and_time(monkeypatch: pytest.MonkeyPa
     assert provenance()["command"] == "python study.py 3"
 
 
-def test_provenance_names_the_distribution_whose_pybullet_is_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "pybullet.so").write_bytes(b"four")
-    for name, size in (("pybullet", 3), ("pybullet_arm64", 4)):  # the second replaced the file of the first
-        folder = tmp_path / f"{name}-9.dist-info"
-        folder.mkdir()
-        (folder / "METADATA").write_text(f"Name: {name.replace('_', '-')}\nVersion: 9\n")
-        (folder / "RECORD").write_text(f"pybullet.so,,{size}\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert "pybullet" not in provenance()["packages"]
-    assert provenance()["packages"]["pybullet-arm64"] == "9"
-
-
 def test_a_pointnet_out_of_a_whole_checkpoint_keeps_its_own_record(tmp_path: Path) -> None:
     path = tmp_path / "pointnet.safetensors"
     for record in ({"command": "pretrain"}, {"command": "train", "pointnet": {"command": "pretrain"}}):

@@ -169,7 +169,7 @@ def windows_by_hand(seed: int = 0) -> WindowTable:
     centers, features = torch.rand(20, 4, 2, 3, generator=generator), torch.randn(20, 4, 2, 64, generator=generator)
     actions = 2 * torch.rand(20, 3, 4, generator=generator) - 1
     features /= features.norm(dim=-1, keepdim=True)
-    return WindowTable.from_arrays(centers=centers, features=features, actions=actions)
+    return WindowTable.from_episodes(SPACE, centers=centers, features=features, actions=actions, negative_fraction=1.0)
 
 
 def test_programs_fitted_in_python_have_the_best_weights_and_resume_as_a_checkpoint(tmp_path: Path) -> None:
