@@ -12,17 +12,9 @@ from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
 ORDER = (
-    "plan",
-    "imagine",
-    "evaluate",
-    "compare",
-    "collect",
-    "data",
-    "pretrain",
-    "train",
-    "check",
-    "reproduce",
-    "assets",
+    *("plan", "imagine", "evaluate", "compare"),
+    *("collect", "data", "pretrain", "train", "check"),
+    *("reproduce", "assets"),
 )
 
 

@@ -8,8 +8,6 @@ from cavin_pyro.config.application import DictConfig, command
 @command("check")
 def main(config: DictConfig) -> None:
     """Check a trained model and its guide on held-out windows, and write a report; resumes an interrupted run."""
-    from functools import partial
-
     import pyro
 
     from cavin_pyro.config.errors import user_input
@@ -27,10 +25,11 @@ def main(config: DictConfig) -> None:
         names = choose_sections(config.sections, config.sizes)
         export = check_export(config.export)
         check_sizes("sizes.export", config.sizes.export)
-        accept = partial(check_objects, objects=config.sizes.subgoals.objects) if "subgoals" in names else None
     with output_folder(config.output) as folder:
         check_same_run(folder, config, ignore=("output", "sections", "export"))
-        context, about = load_context(config, accept)
+        context, about = load_context(config)
+        if "subgoals" in names:
+            check_objects(context.model, config.sizes.subgoals.objects)
         write_config(folder, config)
         if export:
             sizes = config.sizes.export

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cavin_pyro.envs.world import Goal, World
+from cavin_pyro.envs.world import Goal, World, finite_numbers
 from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -99,9 +99,7 @@ class Maze(World):
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """Push ten times, or until the goal is reached; an action that is not two finite numbers is a ValueError."""
-        force = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
-        if force.shape != (2,) or not np.isfinite(force).all():
-            raise ValueError(f"action must be 2 finite numbers, not {action}")
+        force = np.clip(finite_numbers("action", action, 2), -1.0, 1.0)
         for _ in range(REPEAT):
             seen = self._simulator.step(force)[0]["observation"]
             success = bool(np.linalg.norm(seen[:2] - self.place) < REACHED)

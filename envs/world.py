@@ -25,6 +25,14 @@ Geometry = Callable[[Tensor], Tensor]
 """What makes a feature of each object's point cloud: `[..., points, 3]` -> `[..., F]`."""
 
 
+def finite_numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
+    """Values of one of these lengths, such as an action; a ValueError if they are others, or one is not finite."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
+    return array
+
+
 class Policy(Protocol):
     """What chooses the actions of collected episodes."""
 

@@ -10,11 +10,10 @@ from pyro import poutine
 from torch import Tensor
 
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.windows import seeded
+from cavin_pyro.criticism.windows import WINDOWS_AT_ONCE, seeded
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, latent_sites, substitute, window_terms
 
-ROWS = 4096  # particles times windows at once: some 100 MB with five objects
 NO_CODES = "The model has no codes, so there is nothing to check here."
 SYMBOLS = {"effect_code": "c", "motion_code": "z"}  # the paper's symbols
 Codes = dict[str, Tensor]
@@ -33,7 +32,7 @@ def log_weights(
         `[K, B]`, float64.
     """
     pieces = []
-    step = max(1, ROWS // max(1, len(window.actions)))
+    step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
     for start in range(0, particles, step):
         here = {name: value[start : start + step] for name, value in (fixed or {}).items()}
         terms = window_terms(model, guide, window, particles=min(step, particles - start), fixed=here)
@@ -45,7 +44,7 @@ def log_weights(
 def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
     """Codes `[samples, B, D]` of each window `[B]` from the guide; from the prior, if the model takes its place."""
     pieces: dict[str, list[Tensor]] = {}
-    step = max(1, ROWS // max(1, len(window.actions)))
+    step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
     for start in range(0, samples, step):
         with pyro.plate("particles", min(step, samples - start), dim=-2):
             trace = poutine.trace(guide).get_trace(window)
@@ -55,17 +54,10 @@ def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
 
 
 @torch.no_grad()
-def sample_prior(model: Program, window: Window) -> Codes:
-    """Codes `[B, D]` from the model's prior at the first state of each window `[B]`, the second given the first."""
-    codes = latent_sites(poutine.trace(model).get_trace(window))
-    return {name: site["value"] for name, site in codes.items()}
-
-
-@torch.no_grad()
 def guide_density(guide: Program, window: Window, values: Codes, site: str) -> Tensor:
     """log q(value | window) at one site for `values: [K, B, D]` of all sites: `[K, B]` float64."""
     particles, pieces = len(values[site]), []
-    step = max(1, ROWS // max(1, len(window.actions)))
+    step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
     for start in range(0, particles, step):
         here = {name: value[start : start + step] for name, value in values.items()}
         with pyro.plate("particles", len(here[site]), dim=-2):

@@ -28,6 +28,7 @@ LABELS = {
 TOTAL = "-ELBO"
 SMALL_LOSS, LARGE_LOSS = 5.0, 20.0  # nats per window
 ACTIVE = 0.01  # variance of the posterior mean, of codes whose prior has a variance of about one
+BATCH = 256  # windows that are computed at once, which bounds the memory
 SAMPLES_FOR_MEANS = 64  # of each window's codes, to find the active dimensions
 
 EXPLANATION = (
@@ -39,7 +40,7 @@ EXPLANATION = (
 )
 
 
-def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4, batch: int = 256) -> Section:
+def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4) -> Section:
     """Each term of -ELBO, per window, on training and on held-out windows; and how many dimensions of codes are in use.
 
     f sums next_centers and next_features over the T transitions of a window; sites without a label of ours (of a
@@ -48,13 +49,11 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
     Args:
         windows: training windows, and as many held-out ones, at most.
         samples: samples of the guide for each window.
-        batch: windows that are computed at once, which bounds the memory.
     """
     parts = {"training": context.trained_on(windows), "validation": context.held_out(windows)}
     with seeded(context.seed):
         terms = {
-            name: terms_by_window(context.model, context.guide, part, samples, batch)
-            for name, (part, _) in parts.items()
+            name: terms_by_window(context.model, context.guide, part, samples) for name, (part, _) in parts.items()
         }
         active = active_dimensions(context, parts["validation"][0])
     means = {
@@ -94,11 +93,11 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4,
 
 
 @torch.no_grad()
-def terms_by_window(model: Program, guide: Program, window: Window, samples: int, batch: int) -> dict[str, Tensor]:
+def terms_by_window(model: Program, guide: Program, window: Window, samples: int) -> dict[str, Tensor]:
     """Terms of -ELBO by label, and their sum, for each window: `[B]` float64."""
     pieces: dict[str, list[Tensor]] = {}
-    for start in range(0, len(window.actions), batch):
-        part = window.map(lambda field, rows=slice(start, start + batch): field[rows])  # type: ignore[misc]
+    for start in range(0, len(window.actions), BATCH):
+        part = window.map(lambda field, rows=slice(start, start + BATCH): field[rows])  # type: ignore[misc]
         terms: dict[str, Tensor] = {}
         for name, term in window_terms(model, guide, part, particles=samples).items():
             label = LABELS.get(name, name)

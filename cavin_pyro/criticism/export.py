@@ -44,17 +44,14 @@ def check_export(file: str | None) -> Path | None:
     """The option `export`, before anything is computed.
 
     Raises:
-        UserError: not a .nc file, or a folder that cannot be made.
+        UserError: not a .nc file. OSError: its folder cannot be made.
     """
     if file is None:
         return None
     path = Path(file)
     if path.suffix != ".nc" or path.is_dir():
         raise UserError(f"export={file} must name a netCDF file: give it the ending .nc")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"export={file} cannot be written ({error.strerror}): choose another file") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
@@ -96,27 +93,27 @@ def sample_groups(context: CheckContext, *, windows: int, samples: int) -> dict[
     with seeded(context.seed):
         generated = Predictive(model.generate, **options)(window)
         groups["prior"] = {name: generated[name] for name in context.codes}
-        groups["prior_predictive"] = predictions(generated, window.first.mask)
+        groups["prior_predictive"] = predictions(generated, real)
         if context.codes:
             codes = Predictive(guide, return_sites=context.codes, **options)(window)
             generated = Predictive(model.generate, posterior_samples=codes, parallel=True)(window)
             groups["posterior"] = codes
-            groups["posterior_predictive"] = predictions(generated, window.first.mask)
+            groups["posterior_predictive"] = predictions(generated, real)
             groups["sample_stats"] = {"log_weight": log_weights(model, guide, window, samples, fixed=codes)}
     groups = {name: {key: value.unsqueeze(0) for key, value in group.items()} for name, group in groups.items()}
     observed = {"subgoal_centers": window.last.centers, "actions": window.actions, "next_centers": after.centers}
     kept = {name: observed[name] for name in groups["prior_predictive"]}
-    groups["observed_data"] = predictions(kept, real[:, -1], real[:, 1:])
+    groups["observed_data"] = predictions(kept, real)
     first = without_padding(window.first.centers, window.first.mask)
     groups["constant_data"] = {"first_centers": first, "mask": window.first.mask}
     return {name: group for name, group in groups.items() if group}
 
 
-def predictions(values: Mapping[str, Tensor], mask: Tensor, steps: Tensor | None = None) -> dict[str, Tensor]:
-    """The predicted variables among `values`; `mask: [B, M]`, `steps: [B, T, M]` for each push where that varies."""
+def predictions(values: Mapping[str, Tensor], mask: Tensor) -> dict[str, Tensor]:
+    """The predicted variables among `values`; `mask: [B, T + 1, M]`, of the observed states."""
     if "next_centers" not in values:
         values = {**values, "next_centers": all_pushes(values, "next_centers")}
-    masks = {"subgoal_centers": mask, "next_centers": mask.unsqueeze(-2) if steps is None else steps}
+    masks = {"subgoal_centers": mask[:, -1], "next_centers": mask[:, 1:]}
     predicted = {name: values[name] for name in PREDICTED if name in values}
     return {name: without_padding(value, masks[name]) if name in masks else value for name, value in predicted.items()}
 

@@ -18,7 +18,7 @@ from cavin_pyro.criticism.estimates import covered, draw_ranks, rank, ratio_inte
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import length_text
 from cavin_pyro.criticism.section import Section, conclude, within, worst
-from cavin_pyro.criticism.windows import repeated, sampled_values, seeded
+from cavin_pyro.criticism.windows import replicated, sampled_values, seeded
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State, Window
@@ -162,15 +162,12 @@ def sample_sites(
     model: Model, window: Window, samples: int, sites: tuple[str, ...], guide: Guide | None
 ) -> dict[str, Tensor]:
     """What the program generates at some sites for windows `[B]`, with codes from the guide or prior: `[S, B, ...]`."""
-    parts: dict[str, list[Tensor]] = {site: [] for site in sites}
-    for count, copies in repeated(window, samples):
-        program: Any = model.generate
-        if guide is not None:
-            program = poutine.replay(model.generate, trace=poutine.trace(guide).get_trace(copies))
-        values = sampled_values(program, copies)
-        for site in sites:
-            parts[site].append(values[site].unflatten(0, (count, -1)))
-    return {site: torch.cat(values) for site, values in parts.items()}
+
+    def made(copies: Window) -> dict[str, Tensor]:
+        values = sampled_values(model.generate, copies, guide)
+        return {site: values[site] for site in sites}
+
+    return replicated(window, samples, made)
 
 
 def score(prediction: Prediction, ranks: Tensor, episodes: Tensor) -> dict[str, Any]:

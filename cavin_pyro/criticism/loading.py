@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,10 +36,13 @@ from cavin_pyro.storage.provenance import provenance
 from cavin_pyro.training.compatibility import check_compatibility
 from cavin_pyro.training.run import data_folders
 
+TRAINED_ON = {
+    None: "the checkpoint does not say what it was trained on",
+    True: "the model was trained on these",
+    False: "the model was trained on other data, on none of these episodes",
+}
 # Options of `windows` that every checkpoint has. Those that were added later may lack: all was as by default before.
 ALWAYS_STORED = ("validation_fraction", "maximum_step", "minimum_move", "maximum_move", "negative_fraction")
-
-Accept = Callable[[Model], None]
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ class CheckContext:
         return windows.map(lambda field: field[order]), (torch.arange(count) if episodes is None else episodes)[order]
 
 
-def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[CheckContext, dict[str, Any]]:
+def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
     Windows are chosen and held out with the checkpoint's own configuration and seed, so that the held-out episodes are
@@ -109,7 +112,7 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
     world, on_table = world_of(config), collecting_world(config.env)
-    checkpoint, selection, table, folders = load_trained(config, accept)
+    checkpoint, selection, table, folders = load_trained(config)
     if world is not None:
         check_space(checkpoint, world)
     path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
@@ -151,16 +154,13 @@ def load_context(config: DictConfig, accept: Accept | None = None) -> tuple[Chec
 
 
 @user_input("checkpoint", "data")
-def load_trained(
-    config: DictConfig, accept: Accept | None = None
-) -> tuple[Checkpoint, WindowConfig, WindowTable, list[Path]]:
+def load_trained(config: DictConfig) -> tuple[Checkpoint, WindowConfig, WindowTable, list[Path]]:
     """The checkpoint that the options name, with its programs, and the windows of `data` as its training split them.
 
-    `accept` raises a UserError for a model that cannot be used, before the data are read. Others: see `load_context`.
+    Raises:
+        UserError: see `load_context`.
     """
     checkpoint = load(config.checkpoint, trust=list(config.trust))
-    if accept is not None:
-        accept(checkpoint.model)
     check_fit(checkpoint.model, checkpoint.geometry)
     selection, segment_length, split = trained_windows(checkpoint)
     folders = data_folders(config.data)
@@ -190,19 +190,14 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     record, entries = content_record(folder), trained.get("data")
     entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
     known = {entry["fingerprint"] for entry in entries if "fingerprint" in entry}
-    if not known:
-        same, verdict = None, "the checkpoint does not say what it was trained on"
-    elif record["fingerprint"] in known:
-        same, verdict = True, "the model was trained on these"
-    else:
-        same, verdict = False, "the model was trained on other data, on none of these episodes"
+    same = record["fingerprint"] in known if known else None
     return {
         "folder": str(folder),
         "transitions": read_metadata(folder)["transitions"],
         "seed": str(record["configuration"].get("seed")),
         "fingerprint": record["fingerprint"],
         "same": same,
-        "verdict": verdict,
+        "verdict": TRAINED_ON[same],
     }
 
 

@@ -17,7 +17,7 @@ from cavin_pyro.criticism.estimates import Interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import Nearness, Statistic, length_text, statistics_of
 from cavin_pyro.criticism.section import Section, conclude, within, worst
-from cavin_pyro.criticism.windows import generated, observed, repeated, seeded
+from cavin_pyro.criticism.windows import generated, observed, replicated, seeded
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
@@ -58,7 +58,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     window, episodes = context.held_out(windows)
     nearness = Nearness.of(observed(context.training), context.space)
     sources = [name for name in SOURCES if context.codes or name.startswith("prior")]
-    replicated: dict[str, dict[str, Tensor]] = {}
+    drawn: dict[str, dict[str, Tensor]] = {}
     with seeded(context.seed):
         outcome = generated(context.model, window)
         missing = {"h": outcome.subgoal is None, "g": not outcome.chosen}
@@ -68,19 +68,15 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         for source in sources:
             guide = context.guide if source.startswith("guide") else None
             means = context.codes if source.endswith("means") else None
-            replicated[source] = replicate(
+            drawn[source] = replicate(
                 context.model, window, statistics, replicates=replicates, guide=guide, means=means
             )
     real = {statistic.name: statistic.function(observed(window)) for statistic in statistics}
     compared = {
-        statistic.name: {
-            source: compare(replicated[source][statistic.name], real[statistic.name]) for source in sources
-        }
+        statistic.name: {source: compare(drawn[source][statistic.name], real[statistic.name]) for source in sources}
         for statistic in statistics
     }
-    effects = {
-        one.name: effect_size(replicated["prior_means"][one.name], real[one.name], episodes) for one in statistics
-    }
+    effects = {one.name: effect_size(drawn["prior_means"][one.name], real[one.name], episodes) for one in statistics}
     # A statistic that is the same in all real windows has no scale to compare with.
     sizes = {name: effect for name, effect in effects.items() if effect.mean == effect.mean}
     largest = max(sizes, key=lambda name: abs(sizes[name].mean), default=None)
@@ -117,7 +113,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
         },
         f"{labels[largest]}, as planned minus observed (standard deviations)" if largest else "",
         sizes[largest] if largest else None,
-        figure=draw_statistics(statistics, real, replicated),
+        figure=draw_statistics(statistics, real, drawn),
         caption="Distribution of each statistic in observed windows (grey) and generated ones.",
     )
 
@@ -135,12 +131,12 @@ def replicate(
 
     `guide` and `means` are those of `windows.generated`.
     """
-    parts: dict[str, list[Tensor]] = {statistic.name: [] for statistic in statistics}
-    for count, copies in repeated(window, replicates):
+
+    def made(copies: Window) -> dict[str, Tensor]:
         outcome = generated(model, copies, guide=guide, means=means)
-        for statistic in statistics:
-            parts[statistic.name].append(statistic.function(outcome).unflatten(0, (count, -1)))
-    return {name: torch.cat(values) for name, values in parts.items()}
+        return {statistic.name: statistic.function(outcome) for statistic in statistics}
+
+    return replicated(window, replicates, made)
 
 
 def compare(values: Tensor, real: Tensor) -> dict[str, float]:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from pyro import poutine
 from torch import Tensor, nn
 
-from cavin_pyro.criticism.codes import Codes, sample_guide, sample_prior, unsuitable_codes
+from cavin_pyro.criticism.codes import Codes, sample_guide, unsuitable_codes
 from cavin_pyro.criticism.estimates import Interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
@@ -61,9 +61,9 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
     if len(episodes.unique()) < 2:
         return not_applicable(NAME, TITLE, "All held-out windows are of one episode: collect more transitions.")
     with seeded(context.seed):
-        codes = {"guide": {name: value[0] for name, value in sample_guide(context.guide, window, 1).items()}}
-        prior = sample_prior(context.model, window)
-        codes["prior"] = {name: prior[name] for name in codes["guide"]}
+        inferred, prior = (sample_guide(program, window, 1) for program in (context.guide, context.model))
+        codes = {"guide": {name: value[0] for name, value in inferred.items()}}
+        codes["prior"] = {name: prior[name][0] for name in inferred}
         elsewhere = other_episodes(episodes)
         codes["control"] = {name: value[elsewhere] for name, value in codes["prior"].items()}
         rows = {source: describe(context.model, window, values) for source, values in codes.items()}

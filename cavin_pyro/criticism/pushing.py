@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cavin_pyro.criticism.windows import GeneratedWindow
-from cavin_pyro.envs.tabletop.workspace import SPACE, push_endpoints
+from cavin_pyro.envs.tabletop.workspace import SPACE, distance_to_path, push_endpoints
 from cavin_pyro.models.space import Space
 
+Floats = NDArray[np.float64]
 CLOSE_PAIR_SHARE = 0.01  # of the real windows with two objects or more
 
 
@@ -124,22 +127,18 @@ def pair_distances(centers: Tensor, mask: Tensor) -> Tensor:
     return distances.masked_fill(~real, torch.inf)
 
 
-def _endpoints(actions: Tensor) -> tuple[Tensor, Tensor]:
-    start, end = push_endpoints(actions.numpy())
-    return torch.from_numpy(start).to(actions), torch.from_numpy(end).to(actions)
-
-
 def path_distances(outcome: GeneratedWindow) -> Tensor:
     """From each push's path to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
-    start, end = (point.unsqueeze(-2) for point in _endpoints(outcome.actions))
-    line, offset = end - start, _before(outcome)[..., :2] - start
-    along = (offset * line).sum(-1) / line.square().sum(-1).clamp_min(1e-12)
-    distances = (offset - along.clamp(0.0, 1.0).unsqueeze(-1) * line).norm(dim=-1)
-    return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
+    return _distances(outcome, *push_endpoints(outcome.actions.numpy()))
 
 
 def start_distances(outcome: GeneratedWindow) -> Tensor:
     """From each push's start to each centre before it, in the plane: `[B, T, M]` metres; infinite for padding."""
-    start, _ = _endpoints(outcome.actions)
-    distances = (_before(outcome)[..., :2] - start.unsqueeze(-2)).norm(dim=-1)
-    return distances.masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)
+    start, _ = push_endpoints(outcome.actions.numpy())
+    return _distances(outcome, start, start)
+
+
+def _distances(outcome: GeneratedWindow, start: Floats, end: Floats) -> Tensor:
+    points = _before(outcome)[..., :2].numpy()
+    distances = torch.from_numpy(distance_to_path(points, start[..., None, :], end[..., None, :]))
+    return distances.to(outcome.actions).masked_fill(~outcome.first.mask.unsqueeze(1), torch.inf)

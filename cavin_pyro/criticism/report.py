@@ -21,6 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from cavin_pyro.criticism.estimates import Interval
 from cavin_pyro.criticism.section import Section
 from cavin_pyro.storage.files import atomic_write, write_json
 
@@ -35,7 +36,7 @@ def render(section: Section) -> Part:
     """Turn the figure into an image and numbers into plain ones, so that a section can be stored on disk."""
     return {name: value for name, value in vars(section).items() if name != "figure"} | {
         "verdict": asdict(section.verdict),
-        "number": plain(section.number and section.number._asdict()),
+        "number": plain(section.number),
         "findings": list(section.findings),
         "values": plain(section.values),
         "image": image(section.figure) if section.figure else None,
@@ -64,11 +65,13 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Numbers, arrays and mappings as JSON knows them; what is not finite becomes None.
+    """Numbers, arrays, mappings and intervals as JSON knows them; what is not finite becomes None.
 
     Raises:
         TypeError: there is something else in it.
     """
+    if isinstance(value, Interval):
+        value = value._asdict()
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -44,7 +44,7 @@ class Section:
         name: key in report.json. title: the question. explanation: the measurement, its data, and how to read it.
         verdict: good, inspect or bad, by which rule, and what to do next.
         findings: of this run, a sentence each, derived from the values.
-        values: for report.json: numbers, strings, lists and dictionaries of them; intervals become dictionaries.
+        values: for report.json: numbers, strings, intervals, lists and dictionaries of them.
         measure: what `number` is, with its unit. number: the estimate that answers the question.
         figure, caption: drawn in the report.
     """
@@ -59,15 +59,6 @@ class Section:
     number: Interval | None = None
     figure: Figure | None = None
     caption: str = ""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", _as_dictionaries(self.values))
-
-
-def _as_dictionaries(value: Any) -> Any:
-    if isinstance(value, Interval):
-        return value._asdict()
-    return {key: _as_dictionaries(one) for key, one in value.items()} if isinstance(value, Mapping) else value
 
 
 def not_applicable(name: str, title: str, reason: str) -> Section:

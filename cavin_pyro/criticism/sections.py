@@ -80,10 +80,7 @@ def print_findings(parts: Sequence[Part]) -> None:
 
 def _finished(path: Path, fingerprint: str) -> Part | None:
     try:
-        content = read_json(path) if path.exists() else None
-    except UserError:
-        return None  # damaged: run it again
-    if not isinstance(content, dict) or content.get("fingerprint") != fingerprint:
-        return None
-    part = content.get("part")
-    return part if isinstance(part, dict) else None
+        kept: dict[str, Any] = read_json(path)
+        return kept["part"] if kept["fingerprint"] == fingerprint else None
+    except (UserError, KeyError, TypeError):
+        return None  # absent, or damaged: run it again

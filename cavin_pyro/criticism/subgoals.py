@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS
-from cavin_pyro.criticism.estimates import UNKNOWN, Interval, ratio_interval
+from cavin_pyro.criticism.estimates import UNKNOWN, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import length_text
-from cavin_pyro.criticism.section import FEW, GOOD, Section, Verdict, grade, not_applicable
+from cavin_pyro.criticism.section import NONE, Section, Verdict, conclude, grade, not_applicable
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation
@@ -44,7 +44,6 @@ Floats = NDArray[np.floating]
 NAME, TITLE = "subgoals", "Do motions reach their subgoals in the simulator?"
 MOVING = 2.0  # scales of centres; objects that a subgoal moves less are not among those that it wants moved
 NEAR, FAR = 0.35, 0.65  # of the way to the subgoal that is left
-FEWEST = 50  # scenes
 COLORS = ("#D55E00", "#0072B2")
 
 EXPLANATION = (
@@ -100,7 +99,15 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
         TITLE,
         EXPLANATION.format(scenes=scenes, samples=samples, moving=length_text(MOVING * space.center_scale, space))
         + (PUSHES.format(objects=objects) if table else ""),
-        _verdict(left, best, scenes),
+        Verdict(NONE, "The model has no subgoals.")
+        if left is None
+        else conclude(
+            grade(left.low, left.high, good=NEAR, bad=FAR),
+            f"The part of the way to the subgoal that is left ({best}): good if its 95 % interval over scenes ends "
+            f"below {NEAR:.0%}, bad if it begins above {FAR:.0%}.",
+            "If f predicted less to be left, f is too optimistic: use perturbed rollouts or more perturbed data.",
+            torch.arange(scenes),
+        ),
         [_finding(name, numbers, space) for name, numbers in measured.items()],
         {"scenes": scenes, **({"objects": objects} if table else {}), "samples": samples, "motions": measured},
         f"part of the way to the subgoal that is left ({best})" if left else "",
@@ -185,47 +192,42 @@ def execute(world: World, actions: Floats, *, to_the_end: bool = False) -> tuple
     return np.stack(path), over
 
 
-def _rollout_in_world(context: CheckContext, world: World, number: int, motion: str, samples: int) -> SubgoalRollout:
-    """In an episode of another world than the tabletop; places of padding are zeros."""
-    seed = [context.seed, number]
-    observation, _ = world.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]))
-    before, mask = world.positions(observation)
-    plan = plan_segment(context.model, world.state(observation).expand_plans(1), motion, seed, samples)
-    path, ended = execute(world, plan.actions)
-    reached, real = path[-1], mask[:, None]
+def _rollout(
+    context: CheckContext, simulator: Scene | World, number: int, motion: str, objects: int, samples: int
+) -> SubgoalRollout:
+    """In one scene, or in one episode of another world than the tabletop; places of padding are zeros."""
+    seed, reports = [context.seed, number], []
+    if isinstance(simulator, World):
+        observation, _ = simulator.reset(seed=_number(seed))
+        before, mask = simulator.positions(observation)
+        state = simulator.state(observation)
+    else:
+        assert context.geometry is not None and isinstance(context.world, CollectionConfig)
+        first = sample_scene(simulator, context.world.ranges, context.seed, number, objects)
+        before, mask = first.centers[:objects], first.mask[:objects]
+        state = state_of(vars(first), context.geometry)
+    plan = plan_segment(context.model, state.expand_plans(1), motion, seed, samples)
+    if isinstance(simulator, World):
+        path, lost = execute(simulator, plan.actions)
+        reached = path[-1]
+    else:
+        for action in plan.actions:
+            reports.append(simulator.push(np.clip(action, -1.0, 1.0)))
+            if reports[-1].fallen:
+                break
+        last = simulator.observe()
+        reached = last.centers[:objects]
+        lost = bool(reports[-1].fallen or not last.visible[:objects].all())
+    real = mask[:, None]
     subgoal = None if plan.subgoal is None else plan.subgoal * real
     return SubgoalRollout(
         motion,
         plan=SegmentPlan(plan.actions, subgoal, plan.predicted * real),
         before=before * real,
         reached=reached * real,
-        lost=ended,
-    )
-
-
-def _rollout(
-    context: CheckContext, scene: Scene | World, number: int, motion: str, objects: int, samples: int
-) -> SubgoalRollout:
-    if isinstance(scene, World):
-        return _rollout_in_world(context, scene, number, motion, samples)
-    assert context.geometry is not None and isinstance(context.world, CollectionConfig)
-    first = sample_scene(scene, context.world.ranges, context.seed, number, objects)
-    state = state_of(vars(first), context.geometry).expand_plans(1)
-    plan = plan_segment(context.model, state, motion, [context.seed, number], samples)
-    reports = []
-    for action in plan.actions:
-        reports.append(scene.push(np.clip(action, -1.0, 1.0)))
-        if reports[-1].fallen:
-            break
-    last = scene.observe()
-    return SubgoalRollout(
-        motion,
-        plan=plan,
-        before=first.centers[:objects],
-        reached=last.centers[:objects],
         unsafe=sum(report.unsafe for report in reports),
         ineffective=sum(report.ineffective and not report.unsafe for report in reports),
-        lost=bool(reports[-1].fallen or not last.visible[:objects].all()),
+        lost=lost,
     )
 
 
@@ -256,8 +258,12 @@ def plan_segment(model: Model, state: State, motion: str, seed: list[int], sampl
     return SegmentPlan(actions[0, best].numpy(), subgoal.centers[0, 0].numpy(), ends.centers[0, best].numpy())
 
 
+def _number(seed: list[int]) -> int:
+    return int(np.random.SeedSequence(seed).generate_state(1)[0])
+
+
 def _generator(seed: list[int]) -> torch.Generator:
-    return torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    return torch.Generator().manual_seed(_number(seed))
 
 
 def measure(
@@ -320,20 +326,6 @@ def _lengths(vectors: Floats) -> Floats:
 
 def _mean(values: Floats) -> float:
     return float(values.mean()) if values.size else math.nan
-
-
-def _verdict(left: Interval | None, name: str, scenes: int) -> Verdict:
-    if left is None:
-        return not_applicable(NAME, TITLE, "The model has no subgoals.").verdict
-    rule = (
-        f"The part of the way to the subgoal that is left ({name}): good if its 95 % interval over scenes ends below "
-        f"{NEAR:.0%}, bad if it begins above {FAR:.0%}."
-    )
-    if scenes < FEWEST:
-        return Verdict(FEW, f"Only {scenes} scenes: a conclusion needs at least {FEWEST}. ({rule})", "More scenes.")
-    level = grade(left.low, left.high, good=NEAR, bad=FAR)
-    advice = "If f predicted less to be left, f is too optimistic: use perturbed rollouts or more perturbed data."
-    return Verdict(level, rule, advice if level != GOOD else "")
 
 
 def _finding(name: str, numbers: Mapping[str, Any], space: Space) -> str:

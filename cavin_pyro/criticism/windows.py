@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -61,11 +60,9 @@ def generated(
         codes: `[B, D]` by name, in place of samples.
     """
     program: Any = substitute(model.generate, codes or {})
-    if guide is not None:
-        program = poutine.replay(model.generate, trace=poutine.trace(guide).get_trace(window))
     if means is not None:
         program = _Means(means)(program)
-    values = sampled_values(program, window)
+    values = sampled_values(program, window, guide)
     return GeneratedWindow(
         first=window.first,
         actions=values.get("actions", window.actions),
@@ -75,8 +72,10 @@ def generated(
     )
 
 
-def sampled_values(program: Any, window: Window) -> dict[str, Tensor]:
-    """The value of every site that one run of a program has sampled or observed."""
+def sampled_values(program: Any, window: Window, guide: Guide | None = None) -> dict[str, Tensor]:
+    """The value of every site that one run of a program has sampled or observed, with the codes of a guide if given."""
+    if guide is not None:
+        program = poutine.replay(program, trace=poutine.trace(guide).get_trace(window))
     sites = sampled_sites(poutine.trace(program).get_trace(window))
     return {name: site["value"] for name, site in sites.items()}
 
@@ -87,17 +86,17 @@ def all_pushes(values: Mapping[str, Tensor], site: str) -> Tensor:
     return torch.stack(steps, -3)
 
 
-def repeated(window: Window, copies: int) -> Iterator[tuple[int, Window]]:
-    """Copies of windows `[B]`, one after the other: `(n, [n * B])` until there were `copies`."""
+def replicated(window: Window, copies: int, make: Callable[[Window], Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """What `make` makes, by name, of copies of windows `[B]`, in batches of some copies: `[copies, B, ...]`."""
     # Longer batches instead of a further dimension: they suit every model, and cost the same.
     each = max(1, min(copies, WINDOWS_AT_ONCE // len(window.actions)))
+    parts: dict[str, list[Tensor]] = {}
     for made in range(0, copies, each):
         count = min(each, copies - made)
-        yield count, window.map(partial(_tile, count))
-
-
-def _tile(count: int, field: Tensor) -> Tensor:
-    return field.repeat(count, *[1] * (field.dim() - 1))
+        batch = window.map(lambda field, count=count: field.repeat(count, *[1] * (field.dim() - 1)))  # type: ignore[misc]
+        for name, values in make(batch).items():
+            parts.setdefault(name, []).append(values.unflatten(0, (count, -1)))
+    return {name: torch.cat(values) for name, values in parts.items()}
 
 
 class _Means(Messenger):

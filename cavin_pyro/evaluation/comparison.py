@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from numbers import Number
 from pathlib import Path
@@ -13,11 +12,11 @@ from omegaconf.errors import OmegaConfBaseException
 from statsmodels.stats.multitest import multipletests
 from yaml import YAMLError
 
-from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.evaluation.rollout import OUTCOMES
 from cavin_pyro.evaluation.rows import Row, violation
 from cavin_pyro.evaluation.statistics import hierarchical_interval, mcnemar, wilson
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.storage.files import atomic_write, read_json
 from cavin_pyro.storage.run_directory import stored_options
 
 # Options, or sections of them.
@@ -116,13 +115,9 @@ def _rows(run: Evaluation, name: str, training: int, options: list[Row]) -> pd.D
 def _finished(folder: Path) -> tuple[list[Row], Row]:
     """The rows and the options of a finished evaluation."""
     try:
-        rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["per_episode"]
-        theirs = stored_options(folder / "config.yaml")
-    except OSError as error:
-        name = Path(error.filename or folder).name
-        raise UserError(f"{folder} is no finished evaluation: {name}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, RecursionError, OmegaConfBaseException, YAMLError) as error:
-        raise UserError(f"{folder} holds no results of evaluate, or damaged ones: evaluate it again") from error
+        rows, theirs = read_json(folder / "results.json")["per_episode"], stored_options(folder / "config.yaml")
+    except (UserError, OSError, ValueError, KeyError, TypeError, OmegaConfBaseException, YAMLError) as error:
+        raise UserError(f"{folder} holds no finished evaluation, or a damaged one: {one_line(error)}") from error
     wrong = next(filter(None, map(violation, rows)), None) if isinstance(rows, list) else "no list of episodes"
     wrong = wrong or (None if theirs else "no options")
     if wrong:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from cavin_pyro.storage.run_directory import check_same_run, write_config
 
 Job = tuple[DictConfig, int]  # the configuration of an evaluation, and the seed of one of its episodes
 EPISODES_FILE = "episodes.jsonl"
+ROUND = 5  # episodes of one evaluation before the next one's turn
 NOT_COMPARED = ("output", "episodes", "shard", "workers")  # may differ between runs of one evaluation
 
 
@@ -59,7 +61,8 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
         seeds_of(config)
         check_same_run(folder, config, ignore=NOT_COMPARED)
         write_config(folder, config)
-        results = summarize(run_missing(config, folder))
+        (rows,) = run_missing([config], config.workers)
+        results = summarize(rows)
         scene = runner.env.name
         if not config.world.get("_target_"):
             scene += f", layout {config.layout}, {config.reward} reward, {config.objects} objects"
@@ -70,26 +73,39 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
     return results
 
 
-def run_missing(config: DictConfig, folder: Path) -> list[Row]:
-    """Run the episodes that `episodes.jsonl` does not hold yet; returns all rows in the order of their seeds.
+def run_missing(evaluations: Sequence[DictConfig], workers: int) -> list[list[Row]]:
+    """Run the episodes that are not in the folders of evaluations yet; returns the rows of each in the order of seeds.
 
-    Each finished episode is one line of that file. Rerun the same command to resume a killed evaluation; an incomplete
-    last line is dropped and its episode run again.
+    Each finished episode is one line of its folder's `episodes.jsonl`. Run it again to resume what was killed; an
+    incomplete last line is dropped and its episode run again. All episodes are one queue, so that no worker waits for
+    an evaluation's end; it goes in rounds over them, so that an interrupted run has about as many episodes of each.
     """
-    rows, seeds = begin(folder), seeds_of(config)
-    missing = missing_seeds(seeds, rows)
+    seeds = [seeds_of(config) for config in evaluations]
+    files = [Path(config.output) / EPISODES_FILE for config in evaluations]
+    rows = [finished_episodes(file) for file in files]
+    for file, known in zip(files, rows, strict=True):  # lines that were cut off leave it
+        with atomic_write(file) as temporary:
+            temporary.write_text("".join(f"{json.dumps(row)}\n" for row in known.values()), encoding="utf-8")
+    missing = sorted(
+        ((seed - config.seed) // ROUND, place, seed)
+        for place, config in enumerate(evaluations)
+        for seed in seeds[place]
+        if seed not in rows[place]
+    )
+    total, outcomes = sum(map(len, seeds)), Counter(row["outcome"] for known in rows for row in known.values())
     with (
-        closing(run_episodes([(config, seed) for seed in missing], config.workers)) as finished,
-        progress_bar("evaluating", total=len(seeds), initial=len(seeds) - len(missing), unit="episode") as bar,
+        closing(run_episodes([(evaluations[place], seed) for _, place, seed in missing], workers)) as finished,
+        progress_bar("evaluating", total=total, initial=total - len(missing), unit="episode") as bar,
     ):
-        successes = sum(row["outcome"] == "success" for row in rows.values())
-        for _, row in finished:
-            rows[row["seed"]] = row
-            append(folder, row)
+        for number, row in finished:
+            _, place, seed = missing[number]
+            rows[place][seed] = row
+            with open(files[place], "a", encoding="utf-8") as growing:
+                growing.write(json.dumps(row) + "\n")
             bar.update()
-            successes += row["outcome"] == "success"
-            bar.set_postfix(success=f"{100 * successes / len(rows):.0f} %")
-    return [rows[seed] for seed in seeds]
+            outcomes[row["outcome"]] += 1
+            bar.set_postfix(success=f"{100 * outcomes['success'] / outcomes.total():.0f} %")
+    return [[known[seed] for seed in own] for known, own in zip(rows, seeds, strict=True)]
 
 
 def seeds_of(config: DictConfig) -> Sequence[int]:
@@ -100,25 +116,6 @@ def seeds_of(config: DictConfig) -> Sequence[int]:
     if not seeds:
         raise UserError(f"shard={config.shard} has none of {config.episodes} episodes: choose a smaller n")
     return seeds
-
-
-def begin(folder: Path) -> dict[int, Row]:
-    """The finished episodes of an evaluation by their seeds; lines that were cut off leave its file."""
-    rows = finished_episodes(folder / EPISODES_FILE)
-    with atomic_write(folder / EPISODES_FILE) as temporary:
-        temporary.write_text("".join(f"{json.dumps(row)}\n" for row in rows.values()), encoding="utf-8")
-    return rows
-
-
-def append(folder: Path, row: Row) -> None:
-    """Add a finished episode to an evaluation's file."""
-    with open(folder / EPISODES_FILE, "a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
-
-
-def missing_seeds(seeds: Iterable[int], rows: Mapping[int, Row]) -> list[int]:
-    """Of the episodes with these seeds, those that are still to be run."""
-    return [seed for seed in seeds if seed not in rows]
 
 
 def episode_row(episode: Episode) -> Row:

@@ -57,15 +57,6 @@ class EpisodeRunner:
         return rollout(self.env, self.planner, seed=seed, **(usual | options))
 
 
-def check_options(config: DictConfig, device: torch.device) -> None:
-    """Check the options that need neither a checkpoint nor the simulator; `device`: as the option `device` chose it."""
-    part_of("robot", config.env.robot, config.env.assets)
-    check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
-    unread = [name for name, usual in asdict(GeneratedLayouts()).items() if config.generated[name] != usual]
-    if unread and config.layout != GENERATED:
-        raise UserError(f"generated.{unread[0]} is an option of layout=generated: give that, or leave it out")
-
-
 def planner_name(config: DictConfig) -> str:
     """The planner's class, and its optimizer's where it has one: "CavinPlanner, Shooting"."""
     parts = (config.planner, config.planner.get("optimizer") or {})
@@ -179,7 +170,10 @@ def _with_pushes(config: DictConfig, planner: Planner) -> Planner:
 def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     """Build an environment and a planner, and run episodes with them; a layout without room is a `UserError`."""
     device = choose_device(config.device)
-    check_options(config, device)
+    check_sizes("planner", config.planner, minimum=-math.inf)  # its class knows the least numbers
+    unread = [name for name, usual in asdict(GeneratedLayouts()).items() if config.generated[name] != usual]
+    if unread and config.layout != GENERATED:
+        raise UserError(f"generated.{unread[0]} is an option of layout=generated: give that, or leave it out")
     set_matmul_precision(config.matmul_precision)
     keep_freed_memory()
     env = make_env(config, render=render)

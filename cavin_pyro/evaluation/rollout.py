@@ -32,8 +32,7 @@ class PlanRecord:
 
     Attributes:
         step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
-        milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for, and the
-            observation that it shows.
+        milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
     """
 
     step: int
@@ -42,7 +41,6 @@ class PlanRecord:
     plan: Plan
     milliseconds: float
     photograph: Any = None
-    observation: Any = None
 
     @property
     def share_reaching_goal(self) -> float | None:
@@ -88,14 +86,13 @@ class Transition:
 
 @dataclass
 class Episode:
-    """One episode. outcome: one of `OUTCOMES`. photograph, observation: as in `PlanRecord`, after the last push."""
+    """One episode. outcome: one of `OUTCOMES`. photograph: as in `PlanRecord`, after the last push."""
 
     seed: int
     outcome: str = "timeout"
     plan_records: list[PlanRecord] = field(default_factory=list)
     transitions: list[Transition] = field(default_factory=list)
     photograph: Any = None
-    observation: Any = None
 
     @property
     def total_reward(self) -> float:
@@ -206,7 +203,6 @@ def rollout(
             plan=plan,
             milliseconds=1e3 * (time.perf_counter() - began),
             photograph=env.render() if photograph else None,
-            observation=observation if photograph else None,
         )
         episode.plan_records.append(record)
         for callback in callbacks:
@@ -240,7 +236,7 @@ def rollout(
                 episode.outcome = _end(ends) or "timeout"
                 break
     if photograph:
-        episode.photograph, episode.observation = env.render(), observation
+        episode.photograph = env.render()
     for callback in callbacks:
         callback.on_end(episode)
     return episode

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,50 +13,22 @@ from cavin_pyro.evaluation.rollout import OUTCOMES
 Row = dict[str, Any]
 
 
-def _count(value: Any) -> bool:
-    return type(value) is int and value >= 0
-
-
-def _number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
-
-
-def _outcome(value: Any) -> bool:
-    return value in OUTCOMES
-
-
-def _shares(value: Any) -> bool:
-    return isinstance(value, list) and all(one is None or (_number(one) and 0.0 <= one <= 1.0) for one in value)
-
-
-FIELDS: dict[str, Callable[[Any], bool]] = {
-    "seed": _count,
-    "outcome": _outcome,
-    "steps": _count,
-    "return": _number,
-    "strict_outcome": _outcome,
-    "strict_steps": _count,
-    "strict_return": _number,
-    "unsafe": _count,
-    "ineffective": _count,
-    "plans": _count,
-    "plans_reaching_goal": _count,
-    "shares_reaching_goal": _shares,
-    "subgoal_distance": lambda value: value is None or _number(value),
-    "planning_ms": lambda value: isinstance(value, list) and all(_number(one) for one in value),
+FIELDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("seed", "steps", "strict_steps", "unsafe", "ineffective", "plans", "plans_reaching_goal"), (int,)),
+    **dict.fromkeys(("outcome", "strict_outcome"), (str,)),
+    **dict.fromkeys(("return", "strict_return"), (int, float)),
+    **dict.fromkeys(("shares_reaching_goal", "planning_ms"), (list,)),
+    "subgoal_distance": (int, float, type(None)),
 }
 
 
 def violation(row: Any) -> str | None:
     """What makes a value no row of an episode; None if it is one."""
-    if not isinstance(row, Mapping):
-        return "it is no section"
-    if unknown := sorted(set(row) - set(FIELDS)):
-        return f"{unknown[0]!r} is unknown"
-    if missing := [name for name in FIELDS if name not in row]:
-        return f"{missing[0]!r} is missing"
-    wrong = next((name for name, fits in FIELDS.items() if not fits(row[name])), None)
-    return None if wrong is None else f"{wrong} cannot be {json.dumps(row[wrong])[:40]}"
+    if not isinstance(row, Mapping) or set(row) != set(FIELDS):
+        return f"its keys must be {', '.join(FIELDS)}"
+    wrong = [name for name, kinds in FIELDS.items() if not isinstance(row[name], kinds)]
+    wrong += [name for name in ("outcome", "strict_outcome") if row[name] not in OUTCOMES]
+    return f"{wrong[0]} cannot be {json.dumps(row[wrong[0]])[:40]}" if wrong else None
 
 
 def finished_episodes(path: Path) -> dict[int, Row]:

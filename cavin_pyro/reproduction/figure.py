@@ -11,8 +11,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cavin_pyro.reproduction.cells import REWARDS, TOP_ROW_OBJECTS
 from cavin_pyro.reproduction.methods import METHODS, Method
-from cavin_pyro.reproduction.sizes import REWARDS, TOP_ROW_OBJECTS
 from cavin_pyro.storage.files import atomic_write
 
 DOTS_PER_INCH = 120
@@ -25,7 +25,7 @@ def draw_figure(path: Path, rates: pd.DataFrame, *, planner: str, criterion: str
     """Both rows of the paper's figure, for one kind of planner and one criterion.
 
     Args:
-        rates: as in `cavin_pyro.reproduction.statistics.rates`. Bars and lines are rates of success, whiskers the wider
+        rates: as in `cavin_pyro.reproduction.table.rates`. Bars and lines are rates of success, whiskers the wider
             of the two intervals on each side.
     """
     own = rates[(rates["planner"] == planner) & (rates["criterion"] == criterion)]

@@ -17,17 +17,15 @@ from omegaconf import DictConfig
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import set_matmul_precision
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.evaluation.evaluation import append, begin, missing_seeds, run_episodes, seeds_of
+from cavin_pyro.evaluation.evaluation import run_missing
 from cavin_pyro.launching.workers import of_shard, run_jobs
-from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Cell, cells
+from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, SIZES, Cell, Size, cells
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.sizes import SIZES, Size
 from cavin_pyro.reproduction.table import TABLE, as_table, episode_row, write_table
 from cavin_pyro.storage.files import clear_abandoned
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.storage.run_directory import write_config
 
-ROUND = 5  # episodes of one evaluation before the next one's turn
 SHARED = ("reward=sparse", "criterion=published", "env.segmentation=clusters")  # options of every evaluation
 RESULTS = {"pretrain": "metrics.json", "train": "training.png"}  # written last; collect itself knows a whole dataset
 
@@ -55,9 +53,16 @@ def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> pd.Data
     size = chosen_size(config)
     if not config.models:
         run_stages(preparation(size, home, config.methods, workers=config.workers, device=device), 1)
-        own = chosen_trainings(size, config)
-        run_stages([training(size, home, *one, device=device) for one in own], config.workers)
-    table = _evaluate(list(_evaluations(size, config, home, device)), config.workers)
+        trainings = [training(size, home, *one, device=device) for one in chosen_trainings(size, config)]
+        run_stages(trainings, config.workers)
+    evaluations = dict(_evaluations(size, config, home, device))
+    for own in evaluations.values():
+        folder = Path(own.output)
+        folder.mkdir(parents=True, exist_ok=True)
+        clear_abandoned(folder)
+        write_config(folder, own)
+    found = run_missing(list(evaluations.values()), config.workers)
+    table = as_table(episode_row(cell, row) for cell, rows in zip(evaluations, found, strict=True) for row in rows)
     write_table(home / TABLE, table)
     return table
 
@@ -173,38 +178,3 @@ def _evaluations(size: Size, config: DictConfig, home: Path, device: str) -> Ite
         own.checkpoint = str(checkpoint_of(cell, home, config.models))
         own.output = str(home / "evaluate" / cell.name)
         yield cell, own
-
-
-def _evaluate(evaluations: Sequence[tuple[Cell, DictConfig]], workers: int) -> pd.DataFrame:
-    """The table of all evaluations, whose episodes are one queue, so that no worker waits for a cell's end.
-
-    The queue goes in rounds over the cells, so that an interrupted run has about as many episodes of each.
-    """
-    rows = []
-    for _, config in evaluations:
-        folder = Path(config.output)
-        folder.mkdir(parents=True, exist_ok=True)
-        clear_abandoned(folder)
-        write_config(folder, config)
-        rows.append(begin(folder))
-    missing = [
-        ((seed - cell.seed) // ROUND, place, seed)
-        for place, (cell, config) in enumerate(evaluations)
-        for seed in missing_seeds(seeds_of(config), rows[place])
-    ]
-    queue = [(place, evaluations[place][1], seed) for _, place, seed in sorted(missing)]
-    total = sum(cell.episodes for cell, _ in evaluations)
-    with (
-        closing(run_episodes([(config, seed) for _, config, seed in queue], workers)) as finished,
-        progress_bar("evaluating", total=total, initial=total - len(queue), unit="episode") as bar,
-    ):
-        for number, row in finished:
-            place, config, seed = queue[number]
-            rows[place][seed] = row
-            append(Path(config.output), row)
-            bar.update()
-    return as_table(
-        episode_row(cell, found[seed])
-        for (cell, config), found in zip(evaluations, rows, strict=True)
-        for seed in seeds_of(config)
-    )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.world import World
@@ -25,10 +25,10 @@ SAID = {  # of a push, for people
     "unsafe": "unsafe",
     "ineffective": "moved nothing",
 }
-PLAN_COLUMNS = (
-    *("subgoal_distance_m", "planning_ms", "share_reaching_goal"),
-    *("log_z", "temperature", "effective_samples"),
-)
+STEP_COLUMNS = [
+    *("step", "x", "y", "dx", "dy", "reward", *SAID, "subgoal_distance_m"),
+    *("planning_ms", "share_reaching_goal", "log_z", "temperature", "effective_samples"),
+]
 
 
 class EpisodeProgress(EpisodeCallback):
@@ -89,24 +89,20 @@ def write_steps(path: Path, episode: Episode) -> None:
     A plan by inference (`planner.optimizer=smc`) also has its estimate of log Z, its temperature, and the fewest
     effective samples after any segment; see `cavin_pyro.planning.protocol.Evidence`.
     """
-    planned = {record.step: record for record in episode.plan_records}
-    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("step", "x", "y", "dx", "dy", "reward", *SAID, *PLAN_COLUMNS))
-        for one in episode.transitions:
-            row = [one.step, *(f"{value:.4f}" for value in one.action), one.reward]
-            row += [int(getattr(one, flag)) for flag in SAID]
-            row.append("" if np.isnan(one.subgoal_distance) else f"{one.subgoal_distance:.4f}")
-            writer.writerow(row + _about_plan(planned.get(one.step - 1)))
-
-
-def _about_plan(record: PlanRecord | None) -> list[str]:
-    """The columns about the plan that a push began."""
-    if record is None:
-        return [""] * (len(PLAN_COLUMNS) - 1)
-    share, found = record.share_reaching_goal, record.plan.evidence
-    columns = [f"{record.milliseconds:.1f}", "" if share is None else f"{share:.4f}"]
-    if found is None:
-        return [*columns, "", "", ""]
-    fewest = found.effective_samples[0].min()
-    return [*columns, f"{found.log_evidence[0]:.4f}", f"{found.temperature[0]:.4g}", f"{fewest:.1f}"]
+    planned, rows = {record.step: record for record in episode.plan_records}, []
+    for one in episode.transitions:
+        row: dict[str, Any] = {"step": one.step, "reward": one.reward}
+        row |= {name: f"{value:.4f}" for name, value in zip(("x", "y", "dx", "dy"), one.action, strict=True)}
+        row |= {flag: int(getattr(one, flag)) for flag in SAID}
+        if not np.isnan(one.subgoal_distance):
+            row["subgoal_distance_m"] = f"{one.subgoal_distance:.4f}"
+        if (record := planned.get(one.step - 1)) is not None:
+            row["planning_ms"] = f"{record.milliseconds:.1f}"
+            if (share := record.share_reaching_goal) is not None:
+                row["share_reaching_goal"] = f"{share:.4f}"
+            if (found := record.plan.evidence) is not None:
+                row |= {"log_z": f"{found.log_evidence[0]:.4f}", "temperature": f"{found.temperature[0]:.4g}"}
+                row["effective_samples"] = f"{found.effective_samples[0].min():.1f}"
+        rows.append(row)
+    with atomic_write(path) as temporary:
+        pd.DataFrame(rows, columns=STEP_COLUMNS).to_csv(temporary, index=False)

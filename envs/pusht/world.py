@@ -29,7 +29,7 @@ from cavin_pyro.envs.pusht.policy import (
     rotation,
 )
 from cavin_pyro.envs.randomness import named_stream
-from cavin_pyro.envs.world import Goal, NoRoomError, World
+from cavin_pyro.envs.world import Goal, NoRoomError, World, finite_numbers
 from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -179,9 +179,9 @@ class PushT(World):
         if self.criterion == "pose" and self.ahead and not {"state", "goal"} & set(given):
             state, self.pose, excluded = self._pair(generator)
         else:
-            state = _numbers("state", given["state"], 5, 7) if "state" in given else self._sample(generator)
+            state = finite_numbers("state", given["state"], 5, 7) if "state" in given else self._sample(generator)
             if "goal" in given:
-                self.pose = _numbers("goal", given["goal"], 5)
+                self.pose = finite_numbers("goal", given["goal"], 5)
             else:
                 fixed = self.criterion != "pose"
                 self.pose = np.array(FIXED_GOAL) if fixed else self._sample(named_stream(generator, _GOAL))
@@ -199,7 +199,7 @@ class PushT(World):
         if self._steps < 0:
             raise RuntimeError("call reset() before step()")
         simulator, agent = self._simulator, self._simulator.agent
-        displacement = REACH * np.clip(_numbers("action", action, 2), -1.0, 1.0)
+        displacement = REACH * np.clip(finite_numbers("action", action, 2), -1.0, 1.0)
         x, y = np.clip(np.array(agent.position) + displacement, 0.0, SIZE).tolist()
         for done in range(1, REPEAT + 1):  # noqa: B007 -- says when the step ended
             if self.on_frame is not None:
@@ -336,10 +336,3 @@ class PushT(World):
             apart = height > 0 and float(np.linalg.norm(outline[nearest] - agent)) > RADIUS + SPACING
             if (outline > WALLS[0]).all() and (outline < WALLS[1]).all() and apart:
                 return np.concatenate([agent, pose])
-
-
-def _numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
-    return array

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.robots.robot import STICK_RADIUS
-from cavin_pyro.envs.tabletop.workspace import normalised_push, push_endpoints
+from cavin_pyro.envs.tabletop.workspace import distance_to_path, normalised_push, push_endpoints
 
 CANDIDATES = 2048  # pushes sampled at once
 SPREAD = np.radians(45.0)  # radians; how far a push may turn from the base angle, either way
@@ -96,12 +96,12 @@ class HeuristicPushingPolicy:
         extent = np.linalg.norm(cloud - center, axis=-1).max()
         reach = STICK_RADIUS + NEAR
         central = generator.random() < CENTRAL_FRACTION
-        close = clear & (_distance_to_path(center, start, end) <= (CENTRAL if central else extent + reach))
+        close = clear & (distance_to_path(center, start, end) <= (CENTRAL if central else extent + reach))
         scene = observation.clouds[observation.mask][:, ::4, :2].reshape(-1, 2)
         wanted, travels = int(generator.integers(1, COMPARED + 1)), {}
         for candidate in np.flatnonzero(close):  # in the order of sampling, so that the first valid ones are unbiased
             path = start[None, candidate], end[None, candidate]
-            touches = _distance_to_path(cloud[:, None], *path).min() <= reach
+            touches = distance_to_path(cloud[:, None], *path).min() <= reach
             safe = np.linalg.norm(scene - start[candidate], axis=-1).min() >= STICK_RADIUS + CLOUD_CLEARANCE
             if touches and safe:
                 travels[candidate] = _travel_after_contact(cloud, start[candidate], end[candidate])
@@ -118,13 +118,3 @@ def _travel_after_contact(cloud: NDArray[np.floating], start: NDArray[np.float64
     across = np.abs((cloud - start) @ np.array([-line[1], line[0]]) / length)
     met = along[(across <= STICK_RADIUS) & (along >= 0.0)]
     return max(0.0, length - float(met.min())) if len(met) else 0.0
-
-
-def _distance_to_path(
-    points: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Planar metres from points [..., 2] to the straight lines from start [..., 2] to end [..., 2]."""
-    line = end - start
-    length = np.maximum((line**2).sum(axis=-1), 1e-12)
-    along = np.clip(((points - start) * line).sum(axis=-1) / length, 0.0, 1.0)
-    return np.linalg.norm(points - (start + along[..., None] * line), axis=-1)

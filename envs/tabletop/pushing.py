@@ -207,7 +207,8 @@ class PushingEnv(Uncopied, World):
         """
         if self._observation is None:
             raise RuntimeError("call reset() before step()")
-        report = self.scene.push(np.asarray(action))
+        self.scene.on_frame = self.on_frame
+        report = self.scene.push(action)
         observation = self.scene.observe()
         outcome = _judged(self.reward, self._observation, observation, fallen=report.fallen)
         strict = _judged(self._strict_reward, self._observation, observation, fallen=report.fallen)
@@ -286,15 +287,6 @@ class PushingEnv(Uncopied, World):
         if key not in known:
             known[key] = TaskReward(self.task, reward=self._rules[0], margin=self.margin, device=device)
         return known[key]
-
-    @property
-    def on_frame(self) -> Callable[[], None] | None:
-        """Called a few times during every push, to film it."""
-        return self.scene.on_frame
-
-    @on_frame.setter
-    def on_frame(self, function: Callable[[], None] | None) -> None:
-        self.scene.on_frame = function
 
     def close(self) -> None:
         """Free the simulator."""

@@ -27,7 +27,7 @@ from cavin_pyro.envs.tabletop.segmentation import Pixels, SegmenterFactory, segm
 from cavin_pyro.envs.tabletop.sensors import DepthImage, DepthSensor, sensor_of
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, push_endpoints
-from cavin_pyro.envs.world import NoRoomError
+from cavin_pyro.envs.world import NoRoomError, finite_numbers
 
 MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians
@@ -70,7 +70,6 @@ class Scene(Uncopied):
         camera: the depth camera: a name in `CAMERAS`, the pose of one without errors, or any sensor.
         segmentation: a name in `cavin_pyro.envs.tabletop.segmentation.SEGMENTERS`, or a factory of segmenters.
         object_set: the set of the objects' names.
-        on_frame: called a few times during every push, to film it.
         robot: one of `ROBOTS`, or a factory of robots. assets: folder of the files that some robots need.
         slots: M, the objects that observations have room for.
 
@@ -84,7 +83,6 @@ class Scene(Uncopied):
         camera: str | Camera | DepthSensor = "ideal",
         segmentation: str | SegmenterFactory = "mask",
         object_set: ObjectSet = BUILTIN,
-        on_frame: Callable[[], None] | None = None,
         robot: str | RobotFactory = "stick",
         assets: str | Path | None = None,
         slots: int = OBJECT_SLOTS,
@@ -94,7 +92,7 @@ class Scene(Uncopied):
         self.slots = slots
         self.object_set = object_set
         self._make_robot = robot_factory(robot, assets)
-        self.on_frame = on_frame
+        self.on_frame: Callable[[], None] | None = None  # called a few times during every push, to film it
         self.world = PhysicsWorld()
         self.markings: Sequence[TileGroup] = ()  # tiles that photographs show on the table
         self.places: Sequence[Place] = ()  # of the objects in their order, which photographs show as well
@@ -162,11 +160,8 @@ class Scene(Uncopied):
         Raises:
             ValueError: the action is not four finite numbers.
         """
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (4,) or not np.isfinite(action).all():
-            raise ValueError(f"an action is four finite numbers (x, y, dx, dy), not {action.tolist()}")
+        start, end = push_endpoints(finite_numbers("action", action, 4))
         before = self.ground_truth()
-        start, end = push_endpoints(action)
         steps = count()
         self.world.on_step = None if self.on_frame is None else lambda: self._film(next(steps))
         try:

@@ -79,3 +79,13 @@ def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -
     low, high = np.array(REACH_LOW), np.array(REACH_HIGH)
     position = 2.0 * (np.asarray(start, dtype=np.float64) - low) / (high - low) - 1.0
     return np.concatenate([position, np.asarray(motion, dtype=np.float64) / MAXIMUM_MOTION], axis=-1)
+
+
+def distance_to_path(
+    points: NDArray[np.floating], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Planar metres from points [..., 2] to the straight lines from start [..., 2] to end [..., 2]."""
+    line = end - start
+    length = np.maximum((line**2).sum(axis=-1), 1e-12)
+    along = np.clip(((points - start) * line).sum(axis=-1) / length, 0.0, 1.0)
+    return np.linalg.norm(points - (start + along[..., None] * line), axis=-1)

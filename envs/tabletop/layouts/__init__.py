@@ -125,8 +125,8 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
         raise ValueError(f"layout {path} is for task {declared}: run it with task={declared}")
     overrides = {name: value for name, value in (tiles or {}).items() if value is not None}
     where = f"layout {path} with overrides" if overrides else f"layout {path}"
-    made = parse_task(kind, content | overrides, where=where)
     try:
+        made = parse_task(kind, content | overrides)
         if kind in TASKS.values():  # a user's task may need more than one object
             check_reach(made)
     except ValueError as error:
@@ -134,24 +134,19 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
     return made
 
 
-def parse_task(task: str | type[Task], content: Mapping[str, Any], *, where: str = "layout") -> Task:
+def parse_task(task: str | type[Task], content: Mapping[str, Any]) -> Task:
     """A task in the layout that `content`, lists of tiles by field, describes.
 
     Raises:
-        ValueError: a key is unknown or missing, or tiles contradict the task; the message begins with `where`.
+        ValueError: a key is unknown or missing, or tiles contradict the task.
     """
     kind = task_class(task)
     keys = kind.layout_keys()
-    unknown = sorted(set(content) - set(keys), key=str)
-    if unknown:
-        raise ValueError(f"{where}: unknown key {unknown[0]!r}, valid keys are {', '.join(('task', *keys))}")
-    missing = [name for name, required in keys.items() if required and name not in content]
-    if missing:
-        raise ValueError(f"{where}: the key {missing[0]!r} is missing")
-    try:
-        return kind(**content)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+    if unknown := sorted(set(content) - set(keys), key=str):
+        raise ValueError(f"unknown key {unknown[0]!r}, valid keys are {', '.join(('task', *keys))}")
+    if missing := [name for name, required in keys.items() if required and name not in content]:
+        raise ValueError(f"the key {missing[0]!r} is missing")
+    return kind(**content)
 
 
 def _path(kind: type[Task], layout: int | str | Path) -> Path:

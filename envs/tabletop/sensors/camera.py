@@ -6,7 +6,7 @@ each side by default, with about a hundred pixels for a 57 mm cube.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,10 +58,6 @@ class Camera:
     def axes(self) -> NDArray[np.float64]:
         """The image's right, down and ahead as rows [3, 3], unit vectors in the base frame."""
         return _OVERHEAD @ Rotation.from_rotvec(self.rotation).as_matrix().T
-
-    def resized(self, width: int, height: int) -> Camera:
-        """The same view with another number of pixels."""
-        return replace(self, width=width, height=height)
 
     def rays(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
         """Rays of pixels, in the image's axes: [P, 3] (right, down, 1), metres at a distance of one metre.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,6 @@ class Rearrange(Task):
 
     markings = (Marking("region", "region of places", "#F2C200", 0.12),)
     about = "all"
-    goal_varies = True
     goal_is_shared = False
 
     region: TileSet
@@ -48,15 +46,12 @@ class Rearrange(Task):
 
     def check(self) -> None:
         """The places are on the table."""
-        object.__setattr__(self, "places", _places(self.places))
-        check_number("clearance", self.clearance)  # metres
-
-    @cached_property
-    def _padded(self) -> Tensor:
-        """The places, padded: [MAXIMUM_OBJECTS, 2] metres."""
+        places = _places(self.places)
         padded = torch.zeros(MAXIMUM_OBJECTS, 2, dtype=torch.float64)
-        padded[: len(self.places)] = torch.tensor(self.places, dtype=torch.float64).reshape(-1, 2)
-        return padded
+        padded[: len(places)] = torch.tensor(places, dtype=torch.float64).reshape(-1, 2)
+        object.__setattr__(self, "places", places)
+        object.__setattr__(self, "_padded", padded)  # which `to` moves
+        check_number("clearance", self.clearance)  # metres
 
     def of_episode(self, observation: Observation, generator: np.random.Generator) -> Task:
         """This task with the places of an episode.
@@ -72,18 +67,14 @@ class Rearrange(Task):
             raise ValueError(f"task.places: number of places is {count}, of objects {objects}: use objects={count}")
         return self
 
-    def to(self, device: torch.device) -> Rearrange:
-        """As of `Task`, the places included."""
-        _ = self._padded
-        return super().to(device)
-
     def object_places(self) -> tuple[Place, ...]:
         """The places, in the order of objects."""
         return tuple(self.places)
 
     def distances(self, positions: Tensor) -> Tensor:
         """Metres from each object at `positions: [..., M, 2]` to its place: [..., M]."""
-        return (positions - self._padded[: positions.shape[-2]].to(positions)).norm(dim=-1)
+        padded: Tensor = vars(self)["_padded"]
+        return (positions - padded[: positions.shape[-2]].to(positions)).norm(dim=-1)
 
     def success(self, step: Step) -> Tensor:
         """Every object is within the tolerance of its place: [...] bool."""

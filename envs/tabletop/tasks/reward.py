@@ -7,7 +7,7 @@ and appendix "Task Details"). Pure functions on tensors with any leading dimensi
 from __future__ import annotations
 
 import math
-from functools import cached_property, reduce
+from functools import reduce
 from operator import add
 from typing import NamedTuple
 
@@ -96,6 +96,8 @@ class TaskReward:
         ValueError: unknown kind of reward, unknown criterion, or a negative margin.
     """
 
+    reads_features = False
+
     def __init__(
         self,
         task: Task,
@@ -110,7 +112,8 @@ class TaskReward:
         check_number("margin", margin)
         self.device = torch.device(device)
         self.task, self.dense, self.margin = task.to(self.device), reward == "dense", margin
-        self.criterion = criterion
+        self.criterion, self.about = criterion, task.about
+        self._distance: DistanceToGoal | None = None
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
         """Evaluate one step: [...].
@@ -121,18 +124,15 @@ class TaskReward:
             fallen: whether an object has left the table according to the simulator.
         """
         states = torch.stack(torch.broadcast_tensors(previous, centers), -3)
-        return self._judge(states, mask, fallen).step(0)
+        return self.along(states, mask, fallen=fallen).step(0)
 
-    def along(self, states: Tensor, mask: Tensor) -> Outcome:
+    def along(self, states: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
         """Evaluate all T steps of paths, equal to one call per step, but faster: [..., T].
 
         Args:
             states: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target.
-            mask: [..., M] bool, True for real objects.
+            mask: [..., M] bool, True for real objects. fallen: as for one step.
         """
-        return self._judge(states, mask, False)
-
-    def _judge(self, states: Tensor, mask: Tensor, fallen: bool) -> Outcome:
         step = Step(states[..., :2], mask.unsqueeze(-2), self.margin)
         fall = step.any_enters(lambda points: -table_distance(points))
         if fallen:
@@ -147,23 +147,10 @@ class TaskReward:
         reward = reduce(add, terms.values())
         return Outcome(reward.to(states.dtype), terms, success, violation, fall)
 
-    @property
-    def reads_features(self) -> bool:
-        """Whether it reads features beside centres: never."""
-        return False
-
-    @property
-    def about(self) -> str:
-        """The objects that the goal is about: the `target` (object 0), or `all`."""
-        return self.task.about
-
     def distance_to_goal(self) -> DistanceToGoal:
         """The remaining distance to the goal, for planners, with the margin. Computing it takes about 0.1 s, once."""
-        return self._distance_to_goal
-
-    @cached_property
-    def _distance_to_goal(self) -> DistanceToGoal:
-        return DistanceToGoal(self)
+        self._distance = self._distance or DistanceToGoal(self)
+        return self._distance
 
     @property
     def maximum_return(self) -> float:

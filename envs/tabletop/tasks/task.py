@@ -130,7 +130,6 @@ class Task(ABC):
             guidance follows their way, and for `all` the planner may track the first push.
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
         goal_is_shared: whether one place is as good for each object as for another; else guidance follows `potential`.
-        goal_varies: whether `of_episode` returns another task in every episode, which planners must not compile.
         target_start, obstacle_start: tiles on which objects start.
 
     Raises:
@@ -141,7 +140,6 @@ class Task(ABC):
     markings: ClassVar[tuple[Marking, ...]] = ()
     about: ClassVar[Literal["target", "all"]] = "target"
     maximum_return: ClassVar[float] = GOAL_REWARD + TIME_REWARD
-    goal_varies: ClassVar[bool] = False
     goal_is_shared: ClassVar[bool] = True
 
     target_start: TileSet
@@ -219,7 +217,7 @@ class Task(ABC):
         """The task of one episode: this one, or a copy with the goal of that episode.
 
         The environment calls it with every scene that may become an episode, and the planner's reward is that of the
-        returned task. A task that returns a copy sets `goal_varies`.
+        returned task.
 
         Args:
             observation: the episode's first. generator: for the goal alone, so that scenes do not depend on the task.

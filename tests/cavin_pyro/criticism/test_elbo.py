@@ -32,9 +32,9 @@ def test_terms_of_windows_sum_to_those_of_the_batch_with_and_without_particles(c
 
 
 def test_minus_elbo_is_the_sum_of_the_terms(cascade: CheckContext) -> None:
-    section = assess_elbo(cascade, samples=3, batch=5)
+    section = assess_elbo(cascade, samples=3)
     for part in ("training", "validation", "difference"):
-        terms = {name: value["mean"] for name, value in section.values[part].items()}
+        terms = {name: value.mean for name, value in section.values[part].items()}
         assert terms.pop(TOTAL) == pytest.approx(sum(terms.values()))
         assert len(terms) == 6
     assert section.values["windows"] == {"training": 12, "validation": 14}
@@ -72,9 +72,9 @@ def test_dimensions_in_use_and_their_cost_are_told(scenes: SimpleNamespace, righ
     used = assess_elbo(scenes.context(scenes.guide()))
     assert used.values["active"]["z"] == {"active": 4, "dimensions": 4}
     cost = used.values["validation"]["KL of z"]  # all of it is information, half a logarithm for each dimension
-    assert cost["low"] < 2 * math.log(1 + 3 * scenes.precision) < cost["high"]
+    assert cost.low < 2 * math.log(1 + 3 * scenes.precision) < cost.high
     collapsed = assess_elbo(scenes.context(scenes.guide(blind=True)))
-    assert collapsed.values["validation"]["KL of c"]["mean"] == pytest.approx(0.0, abs=1e-6)
+    assert collapsed.values["validation"]["KL of c"].mean == pytest.approx(0.0, abs=1e-6)
     assert set(assess_elbo(right.dynamics).values["training"]) == {"f: next states", TOTAL}
 
 

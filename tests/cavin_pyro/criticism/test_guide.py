@@ -22,8 +22,8 @@ def test_the_posterior_is_calibrated_and_contracts_as_theory_says(scenes: Simple
     assert found["effect_code"]["contraction"] == pytest.approx([0.8] * 3, abs=0.03)  # 1 - 1 / (1 + 4)
     assert found["motion_code"]["contraction"] == pytest.approx([12 / 13] * 4, abs=0.03)
     for one in (section.values["joint"], *(code["all"] for code in found.values())):
-        assert one["mean"] == pytest.approx(0.9, abs=0.05)
-    assert section.values["importance"]["unreliable"]["mean"] == 0
+        assert one.mean == pytest.approx(0.9, abs=0.05)
+    assert section.values["importance"]["unreliable"].mean == 0
 
 
 @pytest.mark.parametrize("stretch", [0.5, 2.0])
@@ -32,7 +32,7 @@ def test_a_guide_too_narrow_or_too_wide_is_found(stretch: float, scenes: SimpleN
     assert section.verdict.level == "bad"
     expected = math.erf(1.645 * stretch / math.sqrt(2))
     for code in section.values["codes"].values():
-        assert code["all"]["mean"] == pytest.approx(expected, abs=0.04)
+        assert code["all"].mean == pytest.approx(expected, abs=0.04)
 
 
 def test_weights_of_a_guide_that_misses_the_posterior_are_unreliable(scenes: SimpleNamespace) -> None:

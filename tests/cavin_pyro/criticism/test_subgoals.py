@@ -110,7 +110,7 @@ def test_a_model_whose_subgoals_are_what_physics_does_is_consistent(oracle: Orac
     for numbers in found.values():
         assert numbers["wanted"] > 0.03
         assert numbers["from_subgoal"] < 0.004  # the camera's points are sampled anew
-        assert numbers["left"]["mean"] < 0.08 and numbers["predicted_from_subgoal"] == 0
+        assert numbers["left"].mean < 0.08 and numbers["predicted_from_subgoal"] == 0
         assert numbers["from_prediction"] == pytest.approx(numbers["from_subgoal"])
         assert numbers["error"] < 0.08 * numbers["moved"]
 
@@ -118,7 +118,7 @@ def test_a_model_whose_subgoals_are_what_physics_does_is_consistent(oracle: Orac
 def test_a_model_whose_subgoals_oppose_its_pushes_is_found(oracle: Oracle) -> None:
     wrong = assess(Oracle(wish=lambda before, after: 2 * before - after)).values["motions"]
     for right, numbers in zip(assess(oracle).values["motions"].values(), wrong.values(), strict=True):
-        assert numbers["left"]["mean"] == pytest.approx(2.0, abs=0.1)
+        assert numbers["left"].mean == pytest.approx(2.0, abs=0.1)
         assert numbers["error"] == right["error"]  # its f is as good
 
 
@@ -127,7 +127,7 @@ def test_models_of_one_code_have_no_motion_to_choose(oracle: Oracle) -> None:
     effects = SimpleNamespace(**parts, subgoal=oracle.subgoal, codes=("effect_code",), effect_prior=standard)
     found = assess(effects).values["motions"]
     assert list(found) == ["motion given by the effect"]
-    assert all(numbers["left"]["mean"] < 0.08 for numbers in found.values())
+    assert all(numbers["left"].mean < 0.08 for numbers in found.values())
     motions = SimpleNamespace(**parts, codes=("motion_code",), motion_prior=standard)
     section = assess(motions)  # without subgoals
     assert section.verdict.level == "none" and section.number is None

@@ -203,21 +203,22 @@ def test_subgoal_distances_are_between_subgoals_and_observed_centres(env: Pushin
 
 def test_an_evaluation_runs_only_what_is_missing(configure: Any, tmp_path: Path) -> None:
     config = configure("planner=random", "seed=10")
-    first = run_missing(config, tmp_path)
+    config.output = str(tmp_path)
+    (first,) = run_missing([config], 1)
     assert [row["seed"] for row in first] == [10, 11, 12]
     lines = (tmp_path / "episodes.jsonl").read_text().splitlines(keepends=True)
     assert [json.loads(line) for line in lines] == first
-    assert run_missing(config, tmp_path) == first
+    assert run_missing([config], 1) == [first]
     # As after a kill: the second line is missing, and the last one was cut short.
     (tmp_path / "episodes.jsonl").write_text(lines[0] + lines[2][:-9])
     config.episodes = 4
-    again = run_missing(config, tmp_path)
+    (again,) = run_missing([config], 1)
     assert [row["seed"] for row in again] == [10, 11, 12, 13]
     assert again[0] == first[0]
     for row, earlier in zip(again, first, strict=False):
         assert {**row, "planning_ms": 0} == {**earlier, "planning_ms": 0}
     config.episodes = 2
-    assert run_missing(config, tmp_path) == again[:2]
+    assert run_missing([config], 1) == [again[:2]]
 
 
 def parts(runner: EpisodeRunner) -> SimpleNamespace:

@@ -21,7 +21,7 @@ def run(folder: Path, *overrides: str) -> list[dict[str, Any]]:
     folder.mkdir(exist_ok=True)
     config = compose("evaluate", *SHORT, *overrides, f"output={folder}")
     write_config(folder, config)
-    rows = run_missing(config, folder)
+    (rows,) = run_missing([config], 1)
     assert sorted(map(json.dumps, rows)) == sorted((folder / "episodes.jsonl").read_text().splitlines())
     return without_times(rows)
 

@@ -173,27 +173,6 @@ def test_an_object_off_the_table_ends_the_episode_with_a_fall(make: Make, put: C
     assert observed["centers"][1, 1] > 0.4  # its latest cloud stays
 
 
-def test_the_same_seed_and_actions_give_the_same_episode(make: Make) -> None:
-    policy = HeuristicPushingPolicy(np.random.default_rng(0))
-    one, other = make(objects=4), make(objects=4)
-    past, _ = other.reset(seed=9)
-    other.step(policy.act(observation(past)).astype(np.float32))
-    first, second = one.reset(seed=3), other.reset(seed=3)
-    assert_equal(first[0], second[0])
-    assert not np.array_equal(first[0]["centers"], past["centers"])
-    moved = False
-    for _ in range(4):  # in turns, so that they could disturb each other
-        action = policy.act(observation(first[0])).astype(np.float32)
-        first, second = one.step(action), other.step(action)
-        assert_equal(first[0], second[0])
-        assert first[1:] == second[1:]
-        moved |= not first[-1]["ineffective"]
-        ours, theirs = (env.scene.ground_truth() for env in (one, other))
-        np.testing.assert_array_equal(ours.positions, theirs.positions)
-        np.testing.assert_array_equal(ours.orientations, theirs.orientations)
-    assert moved  # else anything would be equal
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -232,7 +211,7 @@ def test_any_four_numbers_are_carried_out_in_the_reach_or_refused(crowded: Pushi
     env = crowded
     action, steps, before = np.array(numbers, dtype=np.float32), env._steps, env.scene.ground_truth().positions
     if not np.isfinite(action).all():
-        with pytest.raises(ValueError, match="four finite numbers"):
+        with pytest.raises(ValueError, match="4 finite numbers"):
             env.step(action)
         np.testing.assert_array_equal(env.scene.ground_truth().positions, before)
         assert env._steps == steps

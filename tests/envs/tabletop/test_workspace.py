@@ -35,12 +35,6 @@ def test_pushes_start_and_end_within_reach(actions: np.ndarray) -> None:
         assert (point >= REACH_LOW).all() and (point <= REACH_HIGH).all()
 
 
-def test_the_corners_of_the_action_are_the_corners_of_the_reach() -> None:
-    start, end = push_endpoints(np.array([[-1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 0.5, -1.0]]))
-    np.testing.assert_allclose(start, [REACH_LOW, REACH_HIGH, (0.55, 0.0)])
-    np.testing.assert_allclose(end, [REACH_LOW, REACH_HIGH, (0.60, -0.1)])  # the first two are clipped to the box
-
-
 @settings(deadline=None)
 @given(ACTIONS)
 def test_an_executed_push_differs_by_less_than_a_third_of_a_millimetre(actions: np.ndarray) -> None:
