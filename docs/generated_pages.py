@@ -51,8 +51,8 @@ def _rows(schema: type) -> list[str]:
     for one in options(schema):
         unit = f", in {one.about.unit}" if one.about.unit else ""
         choices = f"; one of {', '.join(one.about.names)}" if one.about.names else ""
-        default = one.default if isinstance(one.default, list | str) else shown(one.default)
-        if str(default).startswith("${"):  # it follows another option; the meaning says which
+        default = shown(one.default)
+        if default.startswith("${"):  # it follows another option; the meaning says which
             default = "..."
         meaning = f"{one.about.help}{unit}{choices}".replace("|", "\\|")
         rows.append(f"| `{one.name}` | `{default}` | {meaning} |")

@@ -8,7 +8,7 @@ from typing import Any
 import pyro
 import torch
 from pyro import poutine
-from torch import nn
+from torch import Tensor, nn
 
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
@@ -26,6 +26,7 @@ class AutomaticGuide(Guide):
 
     fits = ("cascaded", "single_latent", "flat")
     amortized = False
+    fixed_actions: Tensor | None
 
     def __init__(self, model: Model, *, autoguide: Callable[[Model], nn.Module]) -> None:
         """Pyro's guide of the model.
@@ -43,29 +44,22 @@ class AutomaticGuide(Guide):
             raise ValueError(f"guide.autoguide makes a {type(self.automatic).__name__}, which is no torch module")
         self.register_buffer("fixed_actions", None)
 
-    def fix(self, window: Window) -> None:
-        """Make the parameters for `window: [B]`. The first call of the guide does so too.
-
-        Raises `ValueError` if a window does not count (`sequence_mask`), because Pyro's automatic guides know no masks.
-        """
-        if not bool(window.sequence_mask.all()):
-            raise ValueError("an automatic guide takes windows that all count: see sequence_mask")
-        with torch.no_grad():
-            self.automatic(window)
-        self.fixed_actions = window.actions.clone()
-
     def forward(self, window: Window) -> Any:
-        """`window: [B]`, those of the first call. Raises `ValueError` for others."""
+        """`window: [B]`, those of the first call, which makes the parameters. Raises `ValueError` for others.
+
+        So it does if one of the first does not count (`sequence_mask`): Pyro's automatic guides know no masks.
+        """
         if self.fixed_actions is None:
-            self.fix(window)
+            if not bool(window.sequence_mask.all()):
+                raise ValueError("an automatic guide takes windows that all count: see sequence_mask")
+            with torch.no_grad():
+                self.automatic(window)
+            self.fixed_actions = window.actions.clone()
         elif not torch.equal(self.fixed_actions, window.actions):
             raise ValueError(
                 f"this automatic guide has parameters for {len(self.fixed_actions)} windows, and these are others: "
                 "make one for each set of windows, or choose a guide that infers any window"
             )
-        with poutine.block(hide_fn=_is_observed):  # `AutoMessenger` runs the model, whose observations are no guide's
+        # `AutoMessenger` runs the model, whose observations are no guide's.
+        with poutine.block(hide_fn=lambda site: site["type"] == "sample" and site["is_observed"]):
             return self.automatic(window)
-
-
-def _is_observed(site: Any) -> bool:
-    return site["type"] == "sample" and site["is_observed"]

@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,13 +21,7 @@ from cavin_pyro.planning import records
 
 GRAPHS = "cuda_graphs"  # value of `compile`
 MOST_GRAPHS = 64  # each keeps its results in the GPU's memory
-
-
-class Backend(Protocol):
-    """Runs functions: `eager`, `Compiled` or `CudaGraphs`."""
-
-    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """`function(*arguments)`."""
+Backend = Callable[..., Any]  # eager, Compiled or CudaGraphs: a function and its arguments -> what it returns
 
 
 def eager(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -53,7 +53,7 @@ def _word(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{','.join(map(_word, value))}]"
     if value is None or isinstance(value, bool | int | float):
-        return str(shown(value) if value is None or isinstance(value, bool) else value)
+        return shown(value) if value is None or isinstance(value, bool) else str(value)
     plain = re.fullmatch(r"(?!(null|true|false|nan|inf)$)[a-z_][\w./-]*", str(value), re.IGNORECASE)
     return str(value) if plain else QuotedString(str(value), Quote.single).with_quotes()
 

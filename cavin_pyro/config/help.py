@@ -90,7 +90,7 @@ def option_entries(name: str, config: DictConfig, choices: Mapping[str, str]) ->
         section = one.name.rpartition(".")[0]
         unit = f", in {one.about.unit}" if one.about.unit else ""
         names = f"; one of {', '.join(one.about.names)}" if one.about.names else ""
-        option = f"{one.name}={_text(OmegaConf.select(config, one.name))}"
+        option = f"{one.name}={shown(OmegaConf.select(config, one.name))}"
         heading = f"Options of {section}" if section else "Options"
         entries.setdefault(heading, []).append((option, f"{one.about.help}{unit}{names}"))
     for group in own:
@@ -114,9 +114,9 @@ def _part_entries(prefix: str, section: Any, meaning: str = "") -> Iterator[tupl
             yield from _part_entries(f"{prefix}.{name}", value, said)
         elif name == "_target_":
             default = f"null takes that of {prefix.rpartition('.')[2]}=; " if value is None else ""
-            yield f"{prefix}._target_={_text(value)}", f"the {kind}; {default}name one of your own to take its place"
+            yield f"{prefix}._target_={shown(value)}", f"the {kind}; {default}name one of your own to take its place"
         elif name not in FACTS_OF_PRESETS and not name.startswith("_"):  # such as Hydra's _partial_
-            yield f"{prefix}.{name}={_text(value)}", said
+            yield f"{prefix}.{name}={shown(value)}", said
 
 
 def _meanings(found: Any, section: Mapping[str, Any]) -> Mapping[str, str]:
@@ -142,12 +142,6 @@ def _meanings(found: Any, section: Mapping[str, Any]) -> Mapping[str, str]:
             for name in names.replace("`", "").split(", "):
                 meanings.setdefault(name, sentence)
     return meanings
-
-
-def _text(value: Any) -> str:
-    if OmegaConf.is_list(value) or isinstance(value, list):
-        return f"[{','.join(_text(entry) for entry in value)}]"
-    return str(shown(value))
 
 
 def _entry(option: str, meaning: str) -> list[str]:

@@ -18,7 +18,7 @@ from types import UnionType
 from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
-from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, OmegaConf, StringNode, ValueNode
+from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, ListConfig, OmegaConf, StringNode, ValueNode
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError, user_input
@@ -134,11 +134,13 @@ def check_value(name: str, value: Any, about: About) -> None:
         check_number(place, value, *span, whole=isinstance(value, int), positive=about.positive)
 
 
-def shown(value: Any) -> Any:
+def shown(value: Any) -> str:
     """A value in the user's notation."""
+    if isinstance(value, list | ListConfig):
+        return f"[{','.join(map(shown, value))}]"
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
-    return f"{value:.10g}" if isinstance(value, float) else value if value != "" else "''"
+    return f"{value:.10g}" if isinstance(value, float) else str(value) if value != "" else "''"
 
 
 def configured(schema: type[T], values: Mapping[str, Any], section: str) -> T:

@@ -26,7 +26,7 @@ from cavin_pyro.models.part import Part
 PARTS = ("model", "guide", "prior", "geometry", "dynamics", "scales", "objective")  # sections of a training
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "cavin_pyro.models.priors.standard.StandardPrior"
-MAY_BE_ZERO = ("_weight", "_margin", "unit_features", "frequencies")  # ends of names
+MAY_BE_ZERO = ("_weight", "_margin", "warm_up_steps", "unit_features", "frequencies")  # ends of names
 LARGEST_SIZE = 10**6  # more would fill the memory until the system kills the process, or take minutes to begin
 FIXED_SCALES = {"_target_": "cavin_pyro.models.likelihoods.LikelihoodScales"}
 PAPER_DYNAMICS = {"_target_": "cavin_pyro.models.networks.dynamics.Dynamics"}

@@ -15,19 +15,6 @@ def main() -> None:
 
 
 def _run() -> None:
-    arguments = _parser().parse_args()
-    if arguments.action == "import":
-        from cavin_pyro.data.importing import import_minari
-
-        metadata = import_minari(arguments.dataset, arguments.to, arguments.env)
-        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
-    else:
-        from cavin_pyro.data.export import export
-
-        print(f"{export(Path(arguments.dataset), arguments.to)} episodes in {arguments.to}")
-
-
-def _parser() -> Parser:
     parser = Parser(prog="python -m cavin_pyro.data", description=main.__doc__)
     parser.add_argument("--version", action="version", version=f"cavin_pyro {__version__}")
     actions = parser.add_subparsers(dest="action", required=True, metavar="export|import")
@@ -41,7 +28,16 @@ def _parser() -> Parser:
         action.add_argument("--to", type=Path, required=True, metavar="DIR", help=where)
     world = "the world, and its options: --env pusht, or --env my.World size=3"
     action.add_argument("--env", nargs="+", required=True, metavar="WORLD", help=world)
-    return parser
+    arguments = parser.parse_args()
+    if arguments.action == "import":
+        from cavin_pyro.data.importing import import_minari
+
+        metadata = import_minari(arguments.dataset, arguments.to, arguments.env)
+        print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {arguments.to}")
+    else:
+        from cavin_pyro.data.export import export
+
+        print(f"{export(Path(arguments.dataset), arguments.to)} episodes in {arguments.to}")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from cavin_pyro.config.errors import UserError, one_line, user_input
@@ -60,7 +59,7 @@ def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
     """One episode by the world's policy, of at most `steps`; it ends where the world ends it.
 
     Raises:
-        UserError: an action of the policy leaves the box, or as `recorded`.
+        UserError: an action of the policy leaves the box, or as `of_states`.
     """
     scene, choices = collection_streams(seed, number)
     policy, world.maximum_steps = world.policy(choices), steps  # an episode of data is no attempt at a goal
@@ -71,21 +70,16 @@ def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
         observation, _, terminated, truncated, _ = world.step(actions[-1])
         states.append(world.state(observation))
         ended = terminated or truncated
-    return _of_states(world, states, actions)
+    return of_states(world, states, actions)
 
 
-@user_input("env")
-def recorded(world: World, observations: Sequence[Any], actions: ArrayLike) -> Arrays:
-    """An episode of S `actions` `[S, A]` as the world reads its S + 1 observations.
+def of_states(world: World, states: Sequence[Any], actions: Any) -> Arrays:
+    """An episode of S `actions` `[S, A]` between S + 1 states of a world.
 
     Raises:
-        UserError: the world cannot read one, a state or an action has another shape than the world says, numbers that
-            are not finite, or an action out of the box.
+        ValueError: a state or an action has another shape than the world says, numbers that are not finite, or an
+            action is out of the box.
     """
-    return _of_states(world, [world.state(one) for one in observations], actions)
-
-
-def _of_states(world: World, states: Sequence[Any], actions: Any) -> Arrays:
     centers, features, masks = (torch.stack(parts) for parts in zip(*states, strict=True))
     if (masks != masks[0]).any():
         raise ValueError("its state's mask changes within an episode: pad objects that are not there from the start")

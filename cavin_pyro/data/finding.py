@@ -65,7 +65,8 @@ class WindowFinder:
         made = np.arange(positions - 1)[None] < length[:, None]
         if self._space is None:
             visible: NDArray[np.bool_] = np.all(episodes["visible"] | ~mask[:, None], axis=-1)  # [E, S+1]
-            counts = made & _transitions_that_count(episodes, visible, config.maximum_step)
+            counts = made & (_moves(episodes["centers"], mask, 1) < config.maximum_step)
+            counts &= ~episodes["fallen"] & visible[:, :-1] & visible[:, 1:]
             moved = _moves(episodes["centers"], mask, T)
             flawed = episodes["unsafe"] | episodes["fallen"]
             informative = ~np.lib.stride_tricks.sliding_window_view(flawed, T, axis=1).any(axis=-1)
@@ -137,12 +138,6 @@ def _mapped(folder: Path | None, shape: tuple[int, ...], dtype: np.dtype[Any]) -
         # A full disk is an error here; of a mapped file it would be a signal that ends the process.
         os.posix_fallocate(file.fileno(), 0, max(1, dtype.itemsize * math.prod(shape)))
         return np.memmap(file, dtype, mode="r+", shape=shape)
-
-
-def _transitions_that_count(episodes: Arrays, visible: NDArray[np.bool_], maximum_step: float) -> NDArray[np.bool_]:
-    """Which pushes [E, S] the dynamics f learns from, if they were made."""
-    small = _moves(episodes["centers"], episodes["mask"], 1) < maximum_step
-    return small & ~episodes["fallen"] & visible[:, :-1] & visible[:, 1:]
 
 
 def _moves(values: NDArray[np.float32], mask: NDArray[np.bool_], steps: int) -> NDArray[np.float32]:

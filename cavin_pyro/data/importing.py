@@ -19,7 +19,7 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.world import world_of
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
-from cavin_pyro.data.episodes import described, packed, recorded
+from cavin_pyro.data.episodes import described, of_states, packed
 from cavin_pyro.storage.files import file_digest, output_folder
 from cavin_pyro.storage.progress import progress_bar
 
@@ -59,8 +59,8 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
     with progress_bar("importing", total=int(source.total_episodes), unit="episode") as bar:
         for number, one in enumerate(source.iterate_episodes()):
             with user_input(where=f"episode {number} of minari:{identity}"):
-                states = [_at(one.observations, step) for step in range(len(one) + 1)]
-                episodes.append(recorded(world, states, one.actions))
+                states = [world.state(_at(one.observations, step)) for step in range(len(one) + 1)]
+                episodes.append(of_states(world, states, one.actions))
             bar.update()
     steps = max((len(one["actions"]) for one in episodes), default=0)
     if not 1 <= steps <= dataset.LARGEST["S"]:

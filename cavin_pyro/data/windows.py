@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from cavin_pyro.config.commands import WindowConfig
@@ -105,6 +105,8 @@ class WindowTable:
         with user_input():
             check_number("segment_length", segment_length, 1, whole=True)
             check_number("negative_fraction", negative_fraction, high=1)
+            check_number("validation_fraction", validation_fraction, high=0.99, positive=True)
+            check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
             parts = [centers, features, actions, [None] * len(actions) if mask is None else mask]
             if not isinstance(space, Space) or len({*map(len, parts)}) > 1:
                 given = f"{type(space).__name__} and {', '.join(str(len(part)) for part in parts)}"
@@ -117,7 +119,11 @@ class WindowTable:
                 M, F = episodes[0]["features"].shape[1:]
                 sizes = {"objects": M, "feature_dimension": F}
             longest = max((len(one["actions"]) for one in episodes), default=0)
-            held = _held_out(len(episodes), longest, validation_fraction, seed)
+            if len(episodes) < 2:
+                raise UserError(f"{len(episodes)} episodes: give at least two, since one is for validation")
+            count = min(max(1, round(validation_fraction * len(episodes))), len(episodes) - 1)
+            order = torch.randperm(len(episodes), generator=torch.Generator().manual_seed(seed))
+            held = np.isin(np.arange(len(episodes)), order[:count].numpy())
             together = packed(episodes, range(len(episodes)), longest)
         config = WindowConfig(negative_fraction=negative_fraction)
         states, slots = len(episodes) * (longest + 1), together["mask"].shape[1]
@@ -258,14 +264,3 @@ def shared_space(folders: Sequence[Path]) -> Space | None:
                     "train on datasets of one world"
                 )
     return dataset.space_of(every[0])
-
-
-def _held_out(episodes: int, steps: int, fraction: float, seed: int) -> NDArray[np.bool_]:
-    """Which episodes are for validation: at least one."""
-    check_number("validation_fraction", fraction, high=0.99, positive=True)
-    check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
-    if episodes < 2 or steps == 0:
-        raise UserError(f"windows of {episodes} episodes with {steps} pushes: give at least two and a push")
-    count = min(max(1, round(fraction * episodes)), episodes - 1)
-    order = torch.randperm(episodes, generator=torch.Generator().manual_seed(seed))
-    return np.isin(np.arange(episodes), order[:count].numpy())

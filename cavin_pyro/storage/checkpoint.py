@@ -179,17 +179,12 @@ def save(
     with user_input(where="config does not describe the parts to save"), torch.random.fork_rng(devices=[]):
         for name, part in (("model", model), ("guide", inferring), ("geometry", geometry)):
             _ = part is None or getattr(made, name)
+    about = {"config": stored, "provenance": of_this_process() if provenance is None else provenance}
     with user_input():
-        content = checkpoint_bytes(tensors, stored, of_this_process() if provenance is None else provenance)
-    with atomic_write(Path(path)) as temporary:
-        temporary.write_bytes(content)
-
-
-def checkpoint_bytes(tensors: Mapping[str, Tensor], config: Mapping[str, Any], provenance: Mapping[str, Any]) -> bytes:
-    """A checkpoint's file; the header has a digest of the weights as well."""
-    header = {"format": FORMAT, "version": str(FORMAT_VERSION), "sha256": tensors_digest(tensors)}
-    header |= {"config": json.dumps(config), "provenance": json.dumps(provenance)}
-    return safetensors.torch.save(dict(tensors), metadata=header)  # `save_file` would hide the error of a full disk
+        header = {name: json.dumps(part) for name, part in about.items()}
+    header |= {"format": FORMAT, "version": str(FORMAT_VERSION), "sha256": tensors_digest(tensors)}
+    with atomic_write(Path(path)) as temporary:  # `save_file` would hide the error of a full disk
+        temporary.write_bytes(safetensors.torch.save(tensors, metadata=header))
 
 
 def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:

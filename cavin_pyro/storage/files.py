@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import time
 import uuid
 from collections.abc import Iterator
@@ -75,9 +74,7 @@ def output_folder(path: str | Path) -> Iterator[Path]:
             folder.mkdir(parents=True, exist_ok=True)
             held.callback(_delete_empty, made)
             held.enter_context(folder_lock(folder))
-            probe = folder / f".probe{OURS}{'0' * 8}{PARTIAL}"
-            probe.touch()
-            clear_abandoned(folder)  # with the probe, and with that of a run that was killed here
+            clear_abandoned(folder)
         except OSError as error:
             raise UserError(
                 f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
@@ -101,16 +98,10 @@ def clear_abandoned(folder: Path, *, older_than: float = 0.0) -> None:
     Args:
         older_than: seconds; leave younger files, for a folder that others may write into.
     """
-    for path in filter(_is_ours, folder.glob(f".*{OURS}*{PARTIAL}*")):
+    for path in folder.glob(f".*{OURS}{'[0-9a-f]' * 8}{PARTIAL}*"):  # users' own partial downloads may lie there too
         with suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime >= older_than:
+            if path.is_file() and time.time() - path.stat().st_mtime >= older_than:
                 path.unlink()
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether `atomic_write` made a file: users' own partial downloads may lie in the same folder."""
-    name = re.fullmatch(rf"\..+{re.escape(OURS)}[0-9a-f]{{8}}{re.escape(PARTIAL)}(\.[^.]+)?", path.name)
-    return name is not None and path.is_file() and not path.is_symlink()
 
 
 def _delete_empty(folders: list[Path]) -> None:

@@ -7,7 +7,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -32,8 +32,11 @@ def folder_lock(folder: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
+        holder = ""
+        with suppress(OSError, ValueError):
+            holder = path.read_text(encoding="utf-8").strip()
         raise UserError(
-            f"{folder} is being written by {_holder(path)}: "
+            f"{folder} is being written by {holder or 'another process'}: "
             "wait until it ends, stop it, or choose another folder with output=DIR"
         ) from None
     except OSError as error:
@@ -52,10 +55,3 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 def _sign(descriptor: int) -> None:
     os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
-
-
-def _holder(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8").strip() or "another process"
-    except (OSError, ValueError):
-        return "another process"

@@ -25,8 +25,7 @@ from cavin_pyro.config.parts import (
     amortized_guides,
     build_guide,
     build_model,
-    check_sizes,
-    construct,
+    build_part,
     describe,
 )
 from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
@@ -212,7 +211,7 @@ def data_folders(data: str | Sequence[str]) -> list[Path]:
     folders = [data] if isinstance(data, str) else data
     listed = isinstance(folders, Sequence | ListConfig) and all(isinstance(one, str) and one for one in folders)
     if not listed or not folders:
-        raise UserError(f"data must be a dataset folder from collect, or a list of them, not {shown(data)!r}")
+        raise UserError(f"data must be a dataset folder from collect, or a list of them, not {shown(data)}")
     return [Path(folder) for folder in folders]
 
 
@@ -237,10 +236,8 @@ def of_world(config: DictConfig, folders: Sequence[Path]) -> dict[str, Any] | No
 
 def build_objective(config: Config, model: Model, guide: Guide | None = None) -> Objective:
     """The objective, from the section `objective`; one that model or guide cannot have is a `UserError`."""
-    section = config["objective"]
-    check_sizes("objective", {name: value for name, value in section.items() if name != "warm_up_steps"})
     with user_input("objective"):
-        objective = as_objective(construct(section))
+        objective = as_objective(build_part("objective", config["objective"]))
         objective.check(model, guide)
     return objective
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -51,16 +51,12 @@ class ObjectMixturePrior(LearnedPrior):
         real = state.mask.repeat_interleave(self.components, -1).expand(score.shape[:-1])
         # The smallest finite number, not -inf: a scene without objects must not give NaN.
         score = score.squeeze(-1).masked_fill(~real, torch.finfo(score.dtype).min)
-        return GaussianMixture(score, mean, scale, positive=_positive)
+        return GaussianMixture(score, mean, scale)
 
 
 def _positive(values: Tensor) -> Tensor:
     # Softplus is ten times slower on tensors that are not contiguous.
     return functional.softplus(values.contiguous()) + SCALE_FLOOR
-
-
-def _unchanged(values: Tensor) -> Tensor:
-    return values
 
 
 class GaussianMixture(TorchDistribution):
@@ -75,22 +71,13 @@ class GaussianMixture(TorchDistribution):
     support = constraints.real_vector
     has_rsample = False
 
-    def __init__(
-        self,
-        score: Tensor,
-        mean: Tensor,
-        scale: Tensor,
-        *,
-        positive: Callable[[Tensor], Tensor] = _unchanged,
-        validate_args: bool | None = None,
-    ) -> None:
+    def __init__(self, score: Tensor, mean: Tensor, scale: Tensor, validate_args: bool | None = None) -> None:
         """`score: [..., K]` logarithms of weights up to a constant; `mean, scale: [..., K, D]`.
 
-        `positive` makes a scale of each number of `scale`: a sample needs the chosen component's alone.
+        Softplus makes a scale of each number of `scale`: a sample needs the chosen component's alone.
         """
         self.log_weights = score.log_softmax(-1)
-        self.mean_of_each = mean
-        self._scale, self._positive = scale, positive
+        self.mean_of_each, self._scale = mean, scale
         super().__init__(score.shape[:-1], mean.shape[-1:], validate_args=validate_args)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> GaussianMixture:
@@ -99,14 +86,13 @@ class GaussianMixture(TorchDistribution):
             self.log_weights.expand(shape + self.log_weights.shape[-1:]),
             self.mean_of_each.expand(shape + self.mean_of_each.shape[-2:]),
             self._scale.expand(shape + self._scale.shape[-2:]),
-            positive=self._positive,
             validate_args=self._validate_args,
         )
 
     @property
     def scale_of_each(self) -> Tensor:
         """`[..., K, D]`."""
-        return self._positive(self._scale)
+        return _positive(self._scale)
 
     @property
     def mean(self) -> Tensor:
@@ -147,7 +133,7 @@ class GaussianMixture(TorchDistribution):
         share = self.log_weights.exp().expand(*component.shape[:-1], -1).gather(-1, component)
         within = ((quantile - (end - share)) / share).clamp(LEAST_QUANTILE, 1 - LEAST_QUANTILE)
         normal = torch.cat((math.sqrt(2) * (2 * within - 1).erfinv(), noise[..., 1:]), -1)
-        return self._of(self.mean_of_each, component) + self._positive(self._of(self._scale, component)) * normal
+        return self._of(self.mean_of_each, component) + _positive(self._of(self._scale, component)) * normal
 
     def _of(self, values: Tensor, component: Tensor) -> Tensor:
         """The chosen component's row of `values: [..., K, D]`, for `component: [..., 1]` -> `[..., D]`."""

@@ -18,9 +18,8 @@ from typing import Any
 import pytest
 
 from cavin_pyro.config.errors import UserError, WorkerError
-from cavin_pyro.data.collection import collect
 from cavin_pyro.launching.workers import of_shard, run_jobs
-from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT, contents
+from tests.cavin_pyro.conftest import ENVIRONMENT, ROOT
 from tests.cavin_pyro.launching.work import act
 
 
@@ -50,13 +49,6 @@ def test_a_bug_in_a_job_is_raised_as_it_is() -> None:
         list(run_jobs(act, [("fail", 0.0)], 2))
     assert 'raise ZeroDivisionError("a bug")' in str(caught.value.__cause__)
     assert not multiprocessing.active_children()
-
-
-def test_collected_bytes_do_not_depend_on_where(pushes: Path, small: Any, tmp_path: Path) -> None:
-    collect(small.pushes, tmp_path, transitions=60, workers=2)
-    ours, theirs = contents(tmp_path), contents(pushes)
-    names = {"metadata.json", *(f"episodes-{number:05d}.h5" for number in range(3))}
-    assert {name: ours[name] for name in names} == {name: theirs[name] for name in names}
 
 
 def test_a_killed_worker_is_one_line_after_what_was_finished() -> None:

@@ -45,7 +45,7 @@ def test_a_run_resumes_with_the_same_configuration(tmp_path: Path) -> None:
     [
         ({"seed": 4, "name": "a-3"}, "a run with seed=3, not 4"),
         ({"trainer": {"steps": 20, "rates": [0.1, 0.2]}}, "a run with trainer.steps=10, not 20"),
-        ({"trainer": {"steps": 10, "rates": [0.1, 0.3]}}, r"trainer.rates=\[0.1, 0.2\], not \[0.1, 0.3\]"),
+        ({"trainer": {"steps": 10, "rates": [0.1, 0.3]}}, r"trainer.rates=\[0.1,0.2\], not \[0.1,0.3\]"),
         ({"extra": 1}, "a run with extra=null, not 1"),
     ],
 )

@@ -30,7 +30,6 @@ def clouds(count: int = 60) -> NDArray[np.float32]:
 def pretrained(
     folder: Path,
     *,
-    seed: int = 0,
     steps: int = 60,
     rate: float = 3e-3,
     points: NDArray[np.float32] | None = None,
@@ -38,7 +37,7 @@ def pretrained(
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     autoencoder = PointNetAutoencoder(feature_dimension=16, width=32, points=32)
-    options = {"steps": steps, "batch_size": 16, "learning_rate": rate, "seed": seed, "log": folder / "metrics.csv"}
+    options = {"steps": steps, "batch_size": 16, "learning_rate": rate, "seed": 0, "log": folder / "metrics.csv"}
     options["resume"] = folder / "resume.safetensors"
     losses = pretrain(autoencoder, clouds() if points is None else points, **options)
     return autoencoder.encoder, losses
@@ -54,13 +53,6 @@ def test_reconstructions_become_better_than_one_average_shape(tmp_path: Path) ->
     with torch.no_grad():
         features = encoder(torch.from_numpy(clouds(10)))
     assert (features[0] - features[1:]).norm(dim=-1).min() > 1e-3  # shapes are told apart
-
-
-def test_equal_seeds_pretrain_equal_features(tmp_path: Path) -> None:
-    found = [
-        weights(pretrained(tmp_path / name, seed=seed, steps=5)[0]) for name, seed in zip("abc", (0, 0, 1), strict=True)
-    ]
-    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 
 def test_training_clouds_are_turned_about_the_vertical_and_scaled_a_little() -> None:
